@@ -17,9 +17,11 @@ HELP = "perspective, cylindrical or equirectangular image from any camera's imag
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("image", metavar="IMAGE|FOLDER", help="as the camera took it, or a folder of them")
     parser.add_argument(
-        "image2", metavar="IMAGE2|FOLDER2", nargs="?", help="taken at once by another camera of the rig: stereo"
+        "image", metavar="IMAGE|FOLDER|VIDEO", help="as the camera took it, a folder of them, or a video"
+    )
+    parser.add_argument(
+        "image2", metavar="IMAGE2|FOLDER2|VIDEO2", nargs="?", help="taken at once by another camera of the rig: stereo"
     )
     parser.add_argument("--camera", metavar="CALIB", help="the camera's calibration.json")
     parser.add_argument(
@@ -60,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
-    from rigkit.workflows.rectify import RectifyOptions, rectify_image, rectify_stereo_images
+    from rigkit.workflows.rectify import RectifyOptions, holds_several, rectify_image, rectify_stereo_images
 
     options = RectifyOptions(
         output=Path(args.output),
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("rectify: --camera is missing; give the camera's calibration.json")
         done = rectify_image(args.image, args.camera, options, progress=progress_on_stderr())
         found = [_summary(one, args.projection) for one in done.images]
-        result = {"images": found} if Path(args.image).is_dir() else found[0]
+        result = {"images": found} if holds_several(args.image) else found[0]
     elif args.rig is None or (args.image2 is None and not Path(args.image).is_dir()):
         raise InputError("rectify: a stereo pair needs two images, or a folder of both cameras', and --rig RIG.json")
     else:

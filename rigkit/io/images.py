@@ -132,13 +132,17 @@ def read_image_of(path: str | Path, size_px: tuple[int, int], calibration: str |
     """Return an image of a camera; raises InputError also where it is of another size than `calibration`, the file that
     the camera is from, says."""
     image = read_image(path)
-    height, width = image.shape[:2]
-    if (width, height) != size_px:
-        raise InputError(
-            f"image '{path}' is {width}x{height} px, but '{calibration}' is of a camera of {size_px[0]}x{size_px[1]}; "
-            "give images of that size, or calibrate at this one"
-        )
+    require_size((image.shape[1], image.shape[0]), f"image '{path}'", size_px, calibration)
     return image
+
+
+def require_size(given_px: tuple[int, int], what: str, size_px: tuple[int, int], calibration: str | Path) -> None:
+    """Raise InputError where `what` is of another size than `calibration`, the file that the camera is from, says."""
+    if given_px != size_px:
+        raise InputError(
+            f"{what} is {given_px[0]}x{given_px[1]} px, but '{calibration}' is of a camera of "
+            f"{size_px[0]}x{size_px[1]}; give images of that size, or calibrate at this one"
+        )
 
 
 @contextmanager

@@ -47,11 +47,13 @@ class Video:
     source : as it was named.
     count : frames announced, 0 where that is not known.
     live : whether it is a camera, which has no end.
+    size_px : width and height of its frames.
     next_number : of the frame that comes next, from 0.
     """
 
-    def __init__(self, source: str | Path) -> None:
-        """Open `source`; raises InputError where it cannot be."""
+    def __init__(self, source: str | Path, *, colour: bool = False) -> None:
+        """Open `source`, whose frames are to be grey or in `colour` (RGB); raises InputError where it cannot be."""
+        self._colour = colour
         self.source = Path(source)
         number = LIVE_CAMERA.fullmatch(self.source.name)
         self.live = number is not None
@@ -65,8 +67,9 @@ class Video:
             )
             raise InputError(f"{'camera' if self.live else 'video'} '{source}' {what}")
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
-        size_px = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
-        require_pixels((size_px[0], size_px[1]), f"video '{source}'")
+        width, height = (int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        self.size_px = width, height
+        require_pixels(self.size_px, f"video '{source}'")
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = 0 if self.live or not np.isfinite(count) else max(int(count), 0)
         self.next_number = 0
@@ -78,7 +81,7 @@ class Video:
         self._capture.release()
 
     def frame(self, number: int) -> Image | None:
-        """Return frame `number`, counted from 0, grey; None at the end. Frames are asked for in rising order.
+        """Return frame `number`, counted from 0; None at the end. Frames are asked for in rising order.
 
         Raises InputError for a frame that is past already.
         """
@@ -98,8 +101,19 @@ class Video:
             return None
         self.next_number += 1
         # Decoders of sequences keep grey files grey.
-        grey = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY)
-        return cast(Image, grey)
+        if picture.ndim == 3:
+            picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB if self._colour else cv2.COLOR_BGR2GRAY)
+        return cast(Image, picture)
+
+    def passed_over(self) -> int:
+        """Return how many frames there are from the next to the last, and pass over them: what is announced may be
+        wrong."""
+        first = self.next_number
+        with quiet_opencv():
+            while self._capture.grab():
+                self.next_number += 1
+        self._tell_of_the_rest()
+        return self.next_number - first
 
     def _tell_of_the_rest(self) -> None:
         """Say once that the video ends before the frames that it announces do."""

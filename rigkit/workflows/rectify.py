@@ -1,9 +1,11 @@
-"""Images as an ideal camera would have taken them: one or a folder, or two of a rig whose rows correspond."""
+"""Images as an ideal camera would have taken them: one, a folder or a video, or two of a rig whose rows correspond."""
 
 from __future__ import annotations
 
 import io
+import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +18,10 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import IMAGE_ENDINGS, Image, quiet_opencv, read_image_of, require_pixels
+from rigkit.io.images import IMAGE_ENDINGS, Image, quiet_opencv, read_image_of, require_pixels, require_size
 from rigkit.io.reading import about
 from rigkit.io.rig_session import frames_of_images
+from rigkit.io.video import Video, is_video
 from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
@@ -26,8 +29,26 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.camera_files import import_camera, import_rig
 from rigkit.workflows.folder_session import cameras_in
 
-Jobs = list[tuple[list[tuple[Path, Path]], RectifyMap]]
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Frame:
+    """A frame of a video, for an image's file."""
+
+    video: Video
+    number: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.number:06d}.png"
+
+    def __str__(self) -> str:
+        return f"{self.video.source}, frame {self.number}"
+
+
+Jobs = list[tuple[list[tuple[Path | _Frame, Path]], RectifyMap]]
 """Of each map: the images, and where they go."""
+_log = logging.getLogger(__name__)
+
 EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 
@@ -37,7 +58,7 @@ class RectifyOptions:
 
     output: Path
     """Image to write (of a pair, NAME-1 and NAME-2 beside it), or, without an ending, the folder to write into: images
-    keep their names, those of a rig have a folder a camera there."""
+    keep their names (frames of a video are 000000.png and so on), those of a rig have a folder a camera there."""
     projection: Literal["perspective", "cylindrical", "equirectangular"] = "perspective"
     """Of the view."""
     hfov_deg: float | None = None
@@ -81,32 +102,38 @@ class RectificationResult:
 def rectify_image(
     image: str | Path, camera: str | Path, options: RectifyOptions, *, progress: Progress = silent
 ) -> RectificationResult:
-    """Write an image, or all of a folder, as an ideal camera would have taken them; `camera` is the calibration's file.
+    """Write an image, or all of a folder or a video, as an ideal camera would have taken them; `camera` is the
+    calibration's file.
 
     An image that cannot be read, or has another size, is among the failures and does not end the rest; its error is
     raised where there is no other. Raises InputError for a view that the camera does not have, a damaged calibration,
     or a file that cannot be written.
     """
-    sources = _images(Path(image)) if Path(image).is_dir() else [Path(image)]
-    if Path(image).is_dir() and options.output.suffix:
-        raise InputError(f"rectify: '{image}' is a folder, so -o must name one too, not '{options.output.name}'")
-    jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(Path(image), options.output)]
-    _ensure_all([out for _, out in jobs], options, (*(source for source, _ in jobs), camera))
-    source = import_camera(camera)
-    hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
-    if len(jobs) == 1:
-        # Before its map, which takes as long as the image is large.
-        read_image_of(jobs[0][0], source.size_px, camera)
-    with about(camera):
-        target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
-        rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
-        remap = rectify_map(source, target, target_from_cam=rotation)
-        if options.crop:
-            (remap,) = cropped([remap])
-        covered = _coverage([(jobs, remap)])
-    done = _write([(jobs, remap)], covered, camera, options, progress)
+    if holds_several(image) and options.output.suffix:
+        what = "folder" if Path(image).is_dir() else "video"
+        raise InputError(f"rectify: '{image}' is a {what}, so -o must name a folder, not '{options.output.name}'")
+    with ExitStack() as stack:
+        sources = _sources(Path(image), stack)
+        jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(sources[0], options.output)]
+        _ensure_all([out for _, out in jobs], options, (*map(_file, sources), camera))
+        source = import_camera(camera)
+        hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
+        _require_sizes(sources, source.size_px, camera)
+        with about(camera):
+            target = target_camera(source, options.projection, hfov_rad=hfov_rad, size_px=options.size_px)
+            rotation = rotation_from_view_angles(*np.radians(options.angles_deg))
+            remap = rectify_map(source, target, target_from_cam=rotation)
+            if options.crop:
+                (remap,) = cropped([remap])
+            covered = _coverage([(jobs, remap)])
+        done = _write([(jobs, remap)], covered, camera, options, progress)
     _write_maps([remap], None, options)
     return RectificationResult(*done)
+
+
+def holds_several(source: str | Path) -> bool:
+    """Say whether it is a folder or a video, not an image."""
+    return Path(source).is_dir() or is_video(source)
 
 
 def rectify_stereo_images(
@@ -119,7 +146,8 @@ def rectify_stereo_images(
 ) -> RectificationResult:
     """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
     same row in both; or two folders of such images, or one folder of both cameras' (left01, right01, or folders left
-    and right), of which those of one name or number belong together, as for `calibrate_folders`.
+    and right), of which those of one name or number belong together, as for `calibrate_folders`; or two videos, of
+    which the frames of one number do.
 
     Two images of which one cannot be read or has no partner are left out, as by `rectify_image`. Raises InputError for
     cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be written.
@@ -132,30 +160,37 @@ def rectify_stereo_images(
     if missing or len(both) != 2:
         raise InputError(f"'{rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in both)
-    sources, single = _pairs(images, (both[0], both[1]))
-    out = options.output
-    if _is_folder(out):
-        jobs = [_outputs(own, out / name) for own, name in zip(sources, both, strict=True)]
-    elif len(sources[0]) > 1:
-        raise InputError(f"rectify: these are several images, so -o must name a folder, not '{out.name}'")
-    else:
-        jobs = [[(own[0], out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, own in enumerate(sources, start=1)]
-    _ensure_all([to for job in jobs for _, to in job], options, (*(source for job in jobs for source, _ in job), rig))
-    with about(rig):
-        pair = rectify_pair(camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection)
-        if options.crop:
-            map1, map2 = cropped([pair.map1, pair.map2])
-            pair = replace(pair, map1=map1, map2=map2)
-        both_jobs = list(zip(jobs, (pair.map1, pair.map2), strict=True))
-        covered = _coverage(both_jobs)
-    written, failures = _write(both_jobs, covered, rig, options, progress)
+    with ExitStack() as stack:
+        sources, single = _pairs(images, (both[0], both[1]), stack)
+        out = options.output
+        if _is_folder(out):
+            jobs = [_outputs(own, out / name) for own, name in zip(sources, both, strict=True)]
+        elif len(sources[0]) > 1:
+            raise InputError(f"rectify: these are several images, so -o must name a folder, not '{out.name}'")
+        else:
+            jobs = [[(own[0], out.with_name(f"{out.stem}-{i}{out.suffix}"))] for i, own in enumerate(sources, start=1)]
+        _ensure_all(
+            [to for job in jobs for _, to in job], options, (*(_file(source) for own in sources for source in own), rig)
+        )
+        for own, camera in zip(sources, (camera1, camera2), strict=True):
+            _require_sizes(own, camera.size_px, rig)
+        with about(rig):
+            pair = rectify_pair(
+                camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection
+            )
+            if options.crop:
+                map1, map2 = cropped([pair.map1, pair.map2])
+                pair = replace(pair, map1=map1, map2=map2)
+            both_jobs = list(zip(jobs, (pair.map1, pair.map2), strict=True))
+            covered = _coverage(both_jobs)
+        written, failures = _write(both_jobs, covered, rig, options, progress)
     _write_maps([pair.map1, pair.map2], pair, options)
     return RectificationResult(written, {**single, **failures}, pair)
 
 
 def _pairs(
-    images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str]
-) -> tuple[list[list[Path]], dict[str, InputError]]:
+    images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str], stack: ExitStack
+) -> tuple[Sequence[Sequence[Path | _Frame]], dict[str, InputError]]:
     """Return each camera's images, in one order, and why others have no partner."""
     if isinstance(images, (str, Path)):
         cameras = cameras_in([Path(images)])
@@ -168,7 +203,16 @@ def _pairs(
             )
         found = [sorted(p for folder, one in cameras[n] for p in folder.glob(one)) for n in names]
     elif not all(Path(image).is_dir() for image in images):
-        return [[Path(image)] for image in images], {}
+        one, two = images
+        if is_video(one) != is_video(two) or Path(one).is_dir() != Path(two).is_dir():
+            raise InputError(f"rectify: '{one}' and '{two}': give two images, two folders or two videos")
+        own = [_sources(Path(image), stack) for image in images]
+        if len(own[0]) != len(own[1]):
+            _log.warning(
+                f"rectify: '{one}' has {len(own[0])} frames and '{two}' {len(own[1])}: those of one number are paired"
+            )
+        count = min(len(sources) for sources in own)
+        return [sources[:count] for sources in own], {}
     else:
         found = [_images(Path(image)) for image in images]
     try:
@@ -188,6 +232,35 @@ def _pairs(
     return [[own[frame] for frame in both] for own in frames], single
 
 
+def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _Frame]:
+    """Return an image, those of a folder, or the frames of a video, which is open until `stack` ends."""
+    if source.is_dir():
+        return _images(source)
+    if not is_video(source):
+        return [source]
+    with Video(source) as video:
+        if video.live:
+            raise InputError(f"rectify: '{source}' is a live camera, which has no end; record a video of it")
+        count = video.passed_over()
+    if count == 0:
+        raise InputError(f"rectify: no frame of video '{source}' can be decoded; convert it to MP4")
+    opened = stack.enter_context(Video(source, colour=True))
+    return [_Frame(opened, number) for number in range(count)]
+
+
+def _file(source: Path | _Frame) -> Path:
+    return source.video.source if isinstance(source, _Frame) else source
+
+
+def _require_sizes(sources: Sequence[Path | _Frame], size_px: tuple[int, int], calibration: str | Path) -> None:
+    """Refuse a video, or an image that is alone, of another size, before the map: that takes as long as it is large."""
+    first = sources[0]
+    if isinstance(first, _Frame):
+        require_size(first.video.size_px, f"video '{first.video.source}'", size_px, calibration)
+    elif len(sources) == 1:
+        read_image_of(first, size_px, calibration)
+
+
 def _images(folder: Path) -> list[Path]:
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
     if not found:
@@ -199,9 +272,10 @@ def _is_folder(output: Path) -> bool:
     return not output.suffix or output.is_dir()
 
 
-def _outputs(images: Sequence[Path], folder: Path) -> list[tuple[Path, Path]]:
+def _outputs(images: Sequence[Path | _Frame], folder: Path) -> list[tuple[Path | _Frame, Path]]:
     """Return (image, where it goes): with its name into the folder."""
-    return [(path, folder / (path.name if cv2.haveImageWriter(path.name) else f"{path.stem}.png")) for path in images]
+    names = [one.name if cv2.haveImageWriter(one.name) else f"{Path(one.name).stem}.png" for one in images]
+    return [(one, folder / name) for one, name in zip(images, names, strict=True)]
 
 
 def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str | Path, ...]) -> None:
@@ -247,10 +321,20 @@ def _write(
 
 
 def _rectified(
-    source: Path, to: Path, size_px: tuple[int, int], calibration: str | Path, resample: Callable[[Image], Image]
+    source: Path | _Frame,
+    to: Path,
+    size_px: tuple[int, int],
+    calibration: str | Path,
+    resample: Callable[[Image], Image],
 ) -> bytes:
     """Return the file of one image; raises InputError that names it."""
-    image = read_image_of(source, size_px, calibration)
+    if isinstance(source, Path):
+        image = read_image_of(source, size_px, calibration)
+    else:
+        picture = source.video.frame(source.number)
+        if picture is None:
+            raise InputError(f"'{source}' cannot be decoded; convert the video to MP4")
+        image = picture
     try:
         return _encoded(resample(image), to)
     except InputError as error:

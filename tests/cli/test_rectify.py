@@ -278,3 +278,48 @@ def test_a_crop_is_seen_whole_and_its_geometry_follows(tmp_path: Path, capsys: p
     rows, columns = slice(top + 1, top + 1 + part.shape[0]), slice(left + 1, left + 1 + part.shape[1])
     assert not seen[top, columns].all() and not seen[rows.stop, columns].all()
     assert not seen[rows, left].all() and not seen[rows, columns.stop].all()
+
+
+def _video(path: Path, columns: list[int]) -> None:
+    """Write a video with a bright bar, one frame for each of its columns."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, CAMERA.size_px)
+    for column in columns:
+        frame = np.full((120, 160, 3), 40, dtype=np.uint8)
+        frame[:, column - 3 : column + 4] = (10, 20, 250)
+        writer.write(frame)
+    writer.release()
+
+
+def test_every_frame_of_a_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_camera(tmp_path / "camera.json", CAMERA)
+    _video(tmp_path / "clip.avi", [60, 80, 100])
+    view = ["--camera", str(tmp_path / "camera.json"), "--hfov-deg", "60", "--size", "81x61"]
+    out = tmp_path / "out"
+    assert main(["rectify", str(tmp_path / "clip.avi"), *view, "-o", str(out)]) == 0
+    assert "3 images" in capsys.readouterr().out
+    frames = [cv2.imread(str(out / f"{k:06d}.png")) for k in range(3)]
+    middles = [float(np.flatnonzero((f[30, :, 2] > 150) & (f[30, :, 0] < 60)).mean()) for f in frames if f is not None]
+    assert middles[0] < 30.0 and middles[1] == pytest.approx(40.5, abs=1.0) and middles[2] > 50.0
+    assert main(["rectify", str(tmp_path / "clip.avi"), *view, "-o", str(tmp_path / "one.png")]) == 2
+    assert "is a video, so -o must name a folder" in capsys.readouterr().err
+
+
+def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = tmp_path / "rig.json"
+    poses = {"left": Rigid3.identity(), "right": Rigid3(np.eye(3), np.array([-100.0, 0.0, 0.0]))}
+    entries = [
+        {"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, pose in poses.items()
+    ]
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
+    _video(tmp_path / "left.avi", [60, 80, 100])
+    _video(tmp_path / "right.avi", [60, 80])
+    both = [str(tmp_path / "left.avi"), str(tmp_path / "right.avi")]
+    assert main(["rectify", *both, "--rig", str(rig), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert "baseline 100.000 mm" in said.out and "3 frames" in said.err and "2: those of one number" in said.err
+    for name in poses:
+        assert sorted(p.name for p in (tmp_path / "out" / name).iterdir()) == ["000000.png", "000001.png"]
+    (tmp_path / "folder").mkdir()
+    assert main(["rectify", both[0], str(tmp_path / "folder"), "--rig", str(rig), "-o", str(tmp_path / "more")]) == 2
+    assert "two images, two folders or two videos" in capsys.readouterr().err
