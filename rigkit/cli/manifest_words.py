@@ -119,7 +119,7 @@ def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple
     for text in told:
         name, _, value = text.partition("=")
         number, _, sigma = value.partition("+-")
-        if name not in pairs:
+        if pairs and name not in pairs:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")
         what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
         out[name] = (told_length(what, number), told_length(what, sigma))

@@ -30,6 +30,9 @@ SIDE_FOLDERS = (
 )
 """The same of a folder; mere numbers and letters are more often those of pairs."""
 
+NUMBERED = re.compile(r"(.*\D)0*(\d+)")
+"""A name that ends in a number."""
+
 
 @dataclass(frozen=True, slots=True)
 class ImageBoards:
@@ -90,7 +93,7 @@ def board_sizes(detections: Sequence[BoardDetection]) -> tuple[tuple[int, int], 
 
 def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
     """Return the pairs: images whose names differ only in how the two sides are marked, images of one name in two
-    folders that are marked so, or the two of a folder.
+    folders that are marked so, number 1 and 2 where there are no others of the name, or the two of a folder.
 
     Images that show no board are left out.
     """
@@ -106,8 +109,15 @@ def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
         pairs += [FoundPair(_pair_name(*place, root), s[1], s[2]) for place, s in sides.items() if len(s) == 2]
         taken = {s.image for pair in pairs for s in (pair.first, pair.second)}
         free = [s for s in free if s.image not in taken]
-    by_folder: dict[Path, list[ImageBoards]] = {}
+    of_name: dict[tuple[Path, str], dict[int, ImageBoards]] = {}
     for one in free:
+        numbered = NUMBERED.fullmatch(one.image.stem)
+        if numbered is not None:
+            of_name.setdefault((one.image.parent, numbered[1].rstrip("_- ")), {})[int(numbered[2])] = one
+    of_name = {place: own for place, own in of_name.items() if sorted(own) == [1, 2]}
+    pairs += [FoundPair(_pair_name(*place, root), own[1], own[2]) for place, own in of_name.items()]
+    by_folder: dict[Path, list[ImageBoards]] = {}
+    for one in (s for s in free if not any(s in own.values() for own in of_name.values())):
         by_folder.setdefault(one.image.parent, []).append(one)
     for parent, two in by_folder.items():
         if len(two) == 2:
@@ -163,8 +173,8 @@ def manifest_text(
     """
     if not pairs:
         raise InputError(
-            "init: no two images look like a pair; name them ...left/...right or view1/view2, put them into folders "
-            "named so, or each pair into a folder of its own"
+            "init: no two images look like a pair; name them ...left/...right, view1/view2 or NAME1/NAME2, put them "
+            "into folders named so, or each pair into a folder of its own"
         )
     out = [
         "# Started by `rigkit init`; what a person measured is for a person to check.",

@@ -63,6 +63,18 @@ def test_folders_of_pairs_stay_so(tmp_path: Path, folders: tuple[str, str]) -> N
     ]
 
 
+def test_numbers_one_and_two_are_a_pair_where_there_are_no_others(tmp_path: Path) -> None:
+    root = tmp_path.resolve()
+    names = ("first1", "first2", "far-01", "far-02", "series1", "series2", "series3")
+    shown = [ImageBoards(root / f"{n}.jpg", (800, 600), ((8, 6),)) for n in names]
+    pairs = group_pairs(shown, root)
+    assert [(p.name, p.first.image.stem, p.second.image.stem) for p in pairs] == [
+        ("far", "far-01", "far-02"),
+        ("first", "first1", "first2"),
+    ]
+    assert group_pairs(shown[4:], root) == []
+
+
 def test_what_images_cannot_tell_must_be_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
