@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,8 @@ from rigkit.io.rig_session import RigSession
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
 from rigkit.workflows.folder_session import Known
 
+_log = logging.getLogger(__name__)
+
 
 def with_known(session: RigSession, known: Known) -> RigSession:
     """Return the session with what files tell; what it says itself of them is replaced.
@@ -31,10 +34,20 @@ def with_known(session: RigSession, known: Known) -> RigSession:
 
 
 def with_known_first(session: RigSession) -> RigSession:
-    """Return the session with the cameras of the known rig first, in its order: its frame stays that of its first."""
+    """Return the session with the cameras of the known rig first, in its order: its frame stays that of its first.
+
+    What of the rig has no images is warned of.
+    """
     if session.known_rig is None:
         return session
-    known = [name for name in _saved(session.known_rig, list(session.cameras)).cameras if name in session.cameras]
+    of_rig = list(_saved(session.known_rig, list(session.cameras)).cameras)
+    known = [name for name in of_rig if name in session.cameras]
+    if len(known) < len(of_rig):
+        without = ", ".join(name for name in of_rig if name not in known)
+        _log.warning(
+            f"'{session.known_rig}': without images here, {without} will not be in the new rig; give images of all its "
+            "cameras to keep them"
+        )
     order = [*known, *(name for name in session.cameras if name not in known)]
     return replace(session, cameras={name: session.cameras[name] for name in order})
 

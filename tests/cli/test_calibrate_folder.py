@@ -27,7 +27,7 @@ from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.folder_session import cameras_in, session_of_folders
-from rigkit.workflows.known_cameras import known_cameras
+from rigkit.workflows.known_cameras import known_cameras, with_known_first
 
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
@@ -224,7 +224,7 @@ def test_a_session_file_from_python_too(pictures: Path, tmp_path: Path) -> None:
 
 
 def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
-    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     """Only the mount is found with the lenses of files; a camera joins a rig that stays as it is; the session written
     says so, and does the same again."""
@@ -261,6 +261,10 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     told, saved_rig = known_cameras(session), load_saved_rig(added)
     assert told is not None and told.covariance is not None and saved_rig.covariance is not None
     np.testing.assert_array_equal(told.covariance, saved_rig.covariance[9:18, 9:18])
+    # A camera of the rig that has no images is not lost without a word.
+    left_alone = {"left": session.cameras["left"]}
+    with_known_first(replace(session, cameras=left_alone, lenses={}, known_rig=added))
+    assert "without images here, right will not be in the new rig" in caplog.text
     capsys.readouterr()
     assert main([*command, "--only-extrinsics", str(lens), str(lens), str(lens), "--force"]) == 2
     assert "3 lenses for 2 cameras" in capsys.readouterr().err
