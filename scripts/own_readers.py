@@ -1,21 +1,16 @@
 """Files of ours as the other programs' own code reads and projects them, none of rigkit's: for `round_trips.py`.
 
 What is not installed gives None: mrcal (Debian: python3-mrcal), ROS (Debian: python3-camera-calibration-parsers,
-python3-image-geometry), Kalibr (its checkout's `aslam_offline_calibration/kalibr/python` in KALIBR_PYTHON; its readers
-are Python, what they hand to Kalibr's compiled cameras is projected by OpenCV or by the models' published formulas).
+python3-image-geometry). Kalibr's reader needs its compiled cameras, which no package brings.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
 import subprocess
-import sys
 import tempfile
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import cv2
@@ -113,74 +108,6 @@ def ros_stereo(left: str, right: str, points: np.ndarray) -> tuple[np.ndarray, n
             return read["raw"], MM_PER_M * read["found"]
 
 
-@cache
-def _kalibr() -> ModuleType | None:
-    """Return Kalibr's reader; what it takes of Kalibr's compiled modules only holds what it is given."""
-    place = os.environ.get("KALIBR_PYTHON")
-    if place is None:
-        return None
-
-    class Holding(ModuleType):
-        def __getattr__(self, name: str) -> Any:
-            if name.startswith("_"):
-                raise AttributeError(name)
-            return lambda *given: (name, given)
-
-    class Transformation:
-        def __init__(self, matrix: np.ndarray) -> None:
-            self.matrix = matrix
-
-        def T(self) -> np.ndarray:
-            return self.matrix
-
-    for name in ("aslam_cv", "aslam_cv_backend", "sm"):
-        sys.modules[name] = Holding(name)
-    sys.modules["sm"].Transformation = Transformation  # type: ignore[attr-defined]
-    sys.path.insert(0, place)
-    return importlib.import_module("kalibr_common.ConfigReader")
-
-
-def kalibr_reads(text: str, rays: np.ndarray) -> list[tuple[np.ndarray, Rigid3]] | None:
-    """Return the pixels (N, 2) of rays (N, 3) for every camera of a camchain, and its pose from the one before, mm."""
-    reader = _kalibr()
-    if reader is None:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "camchain.yaml"
-        path.write_text(text)
-        chain = reader.CameraChainParameters(str(path))
-    out = []
-    for k in range(chain.numCameras()):
-        _, ((name, given),) = reader.AslamCamera.fromParameters(chain.getCameraParameters(k)).geometry
-        pose = np.eye(4) if k == 0 else chain.getExtrinsicsLastCamToHere(k).T()
-        out.append((_kalibr_projected(name, given, rays), Rigid3(pose[:3, :3], MM_PER_M * pose[:3, 3])))
-    return out
-
-
-def _kalibr_projected(name: str, given: tuple[Any, ...], rays: np.ndarray) -> np.ndarray:
-    """Return the pixels of rays by what Kalibr hands to its projection `name`."""
-    if name in ("DistortedPinholeProjection", "EquidistantPinholeProjection"):
-        *core, _, _, (_, distortion) = given
-        fisheye = name.startswith("Equidistant")
-        return _projected(_matrix(*core), np.array(distortion), rays, fisheye=fisheye)
-    *first, fu, fv, cu, cv, _, _ = given
-    x, y, z = (rays / np.linalg.norm(rays, axis=1)[:, None]).T
-    if name == "OmniProjection":
-        # Mei and Rives 2007, equation 5.
-        depth = z + first[0]
-    elif name == "ExtendedUnifiedProjection":
-        # Khomutenko et al. 2016, equation 5.
-        alpha, beta = first
-        depth = alpha * np.sqrt(beta * (x**2 + y**2) + z**2) + (1.0 - alpha) * z
-    elif name == "DoubleSphereProjection":
-        # Usenko et al. 2018, equation 40.
-        xi, alpha = first
-        depth = alpha * np.sqrt(x**2 + y**2 + (xi + z) ** 2) + (1.0 - alpha) * (xi + z)
-    else:
-        raise ValueError(f"no formula for Kalibr's {name}")
-    return np.stack([fu * x / depth + cu, fv * y / depth + cv], axis=1)
-
-
 def colmap_mount(text: str) -> Rigid3:
     """Return the second camera's pose from the first's by pycolmap's own reader of rig_config.json, mm."""
     import pycolmap
@@ -191,10 +118,6 @@ def colmap_mount(text: str) -> Rigid3:
         _, second = pycolmap.read_rig_config(path)[0].cameras
     pose: Any = second.cam_from_rig
     return Rigid3(pose.rotation.matrix(), np.asarray(pose.translation))
-
-
-def _matrix(fu: float, fv: float, cu: float, cv: float) -> np.ndarray:
-    return np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
 
 
 def _projected(K: np.ndarray, distortion: np.ndarray, rays: np.ndarray, *, fisheye: bool) -> np.ndarray:

@@ -132,13 +132,6 @@ def by_ros(camera: Camera) -> float | None:
     return None if found is None else float(np.linalg.norm(found - pixels, axis=1).max())
 
 
-def by_kalibr(camera: Camera) -> float | None:
-    """Return the largest error of a projection with what Kalibr's own reader has of the file."""
-    pixels, rays = pixels_and_rays(camera)
-    found = own_readers.kalibr_reads(write_kalibr([camera]).text, rays)
-    return None if found is None else float(np.linalg.norm(found[0][0] - pixels, axis=1).max())
-
-
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.02, -0.1, 0.03])), [-250.0, 4.0, 9.0])
 MM_PER_M = 1000.0
 
@@ -162,9 +155,6 @@ def _mount_by_ros(left: str, right: str) -> Rigid3:
 
 
 def _mount_by_kalibr(text: str) -> Rigid3:
-    found = own_readers.kalibr_reads(text, np.array([[0.0, 0.0, 1.0]]))
-    if found is not None:
-        return found[1][1]
     pose = np.array(yaml.safe_load(text)["cam1"]["T_cn_cnm1"])
     return Rigid3(pose[:3, :3], MM_PER_M * pose[:3, 3])
 
@@ -177,7 +167,7 @@ def _mount_by_mrcal(right: str) -> Rigid3 | None:
 MOUNTS: dict[str, Callable[..., Rigid3 | None]] = {
     "opencv": lambda text: _mount_by_opencv(text),
     "ros": _mount_by_ros,
-    "kalibr": lambda text: _mount_by_kalibr(text),
+    "kalibr": _mount_by_kalibr,
     "mrcal": lambda _, right: _mount_by_mrcal(right),
     "colmap": own_readers.colmap_mount,
 }
@@ -186,7 +176,7 @@ its own reader is not installed."""
 READ_BY = {
     "opencv": "`cv2.FileStorage`: R, T",
     "ros": "a YAML parser: R and P of both",
-    "kalibr": "Kalibr's `ConfigReader`: T_cn_cnm1",
+    "kalibr": "a YAML parser: T_cn_cnm1",
     "mrcal": "`mrcal.cameramodel`",
     "colmap": "`pycolmap.read_rig_config`",
 }
@@ -245,7 +235,6 @@ def stereo_by_ros() -> tuple[float, float] | None:
 READERS = {
     "OpenCV's own": by_opencv,
     "ROS's own": by_ros,
-    "Kalibr's own": by_kalibr,
     "pycolmap's own": by_pycolmap,
     "mrcal's own": by_mrcal,
 }

@@ -10,7 +10,6 @@ from helpers.data import REPOSITORY
 
 MODELS = {
     "ros": ("pinhole", "brown", "kannala_brandt"),
-    "kalibr": ("pinhole", "kannala_brandt", "ucm", "eucm", "double_sphere"),
     "mrcal": ("pinhole", "brown"),
 }
 """That the format has: nothing is refitted."""
