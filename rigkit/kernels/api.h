@@ -395,6 +395,9 @@ typedef struct {
     double even;
 } surface_rules_t;
 
+/* Whether each of the neighbours in 5 x 5 samples is darker. */
+enum { CENSUS_BITS = 24 };
+
 EXPORT int64_t sweep_levels(int64_t levels);
 EXPORT int64_t sweep_cost_memory(int64_t columns);
 EXPORT int64_t sweep_path_memory(int64_t columns, int64_t levels);

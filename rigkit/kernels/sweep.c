@@ -3,7 +3,7 @@
  * Functions in numpy that say what is computed are in tests/kernels/reference/sweep.py. */
 #include "kernels.h"
 
-enum { CENSUS_REACH = 2, CENSUS_BITS = 24, BAND = 16, SIDE_BYTES = 8 };
+enum { CENSUS_REACH = 2, BAND = 16, SIDE_BYTES = 8 };
 
 /* Cost of what is no level, above that of any path. */
 enum { NO_LEVEL = 128 };

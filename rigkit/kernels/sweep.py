@@ -7,7 +7,11 @@ from numpy.typing import NDArray
 
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
+
+CENSUS_BITS: int = header().constants["CENSUS_BITS"]
+"""Of a sample's census: whether each of the neighbours in 5 x 5 samples is darker."""
 
 
 @structure("sweep_t")

@@ -22,7 +22,7 @@ from rigkit.affine.surface import linear_gauge
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.sweep import swept_costs, swept_surfaces
+from rigkit.kernels.sweep import CENSUS_BITS, swept_costs, swept_surfaces
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import NodeMeasurements
@@ -32,11 +32,9 @@ SAMPLES_A_NODE = 2
 MAX_SWEEP_LEVELS = 160
 MARGIN_OF_RANGES = 0.1
 """Of the range of inverse ranges that grew, to either side."""
-BITS = 24
-"""Of the census: whether each of the neighbours in 5 x 5 samples is darker."""
-BEND_COST = BITS // 6
+BEND_COST = CENSUS_BITS // 6
 """Of a step to the next level, in bits of the census."""
-JUMP_COST = 2 * BITS
+JUMP_COST = 2 * CENSUS_BITS
 """Of any larger step, where the brightness is even; less where it changes."""
 EVEN_LEVELS = 8.0
 """Grey levels from sample to sample by which a jump becomes half as dear."""
