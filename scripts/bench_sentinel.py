@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 from bench_planner import BOARD, LENSES, Lens, by_hand, free_poses, see
-from sentinel_captures import SAID, left_out, pairs, real
-from sentinel_tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
+from sentinel.captures import SAID, left_out, pairs, real
+from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration

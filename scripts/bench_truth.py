@@ -17,11 +17,11 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-import bench_truth_peers as peers
-from bench_truth_cameras import aprilgrid_mocap, caliper_board, one_camera, ov_plane, simplestereo
-from bench_truth_pairs import cylinder, multicam, stereo, trihedral
-from bench_truth_singles import aprilgrid
-from bench_truth_table import Bench, Row, as_json, long_table, merged, short_table, with_table
+from truth import peers
+from truth.cameras import aprilgrid_mocap, caliper_board, one_camera, ov_plane, simplestereo
+from truth.pairs import cylinder, multicam, stereo, trihedral
+from truth.singles import aprilgrid
+from truth.table import Bench, Row, as_json, long_table, merged, short_table, with_table
 
 from rigkit.core.errors import RigkitError
 from rigkit.workflows.truth import fetch_public_set, public_sets

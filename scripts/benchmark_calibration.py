@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from benchmark_calibration_peers import (
+from calibrators.peers import (
     Mrcal,
     colmap_adjuster,
     colmap_model,

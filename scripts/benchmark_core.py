@@ -24,9 +24,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from core_loops import loop_affine, loop_normal, loop_planar
-from core_peers import colmap_robust, opencv_robust, optional, poselib_refine, poselib_robust
-from core_scenes import CAMERA, CONDITIONS, NOISE_PX, POSE, SIGMA_A, contaminated, jacobians, scene
+from core_speed.loops import loop_affine, loop_normal, loop_planar
+from core_speed.peers import colmap_robust, opencv_robust, optional, poselib_refine, poselib_robust
+from core_speed.scenes import CAMERA, CONDITIONS, NOISE_PX, POSE, SIGMA_A, contaminated, jacobians, scene
 
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines

@@ -6,7 +6,7 @@
 
 accuracy    errors at several blurs and noises beside the Cramer-Rao bound, predicted beside actual errors
 conditions  light, lens and sensor that are not as they should be; boards cut, covered, small, many
-peers       the same images through the detectors of scripts/benchmark_peers.py, each in a process of its own
+peers       the same images through the detectors of scripts/detectors/peers.py, each in a process of its own
 speed       image sizes, pictures without a board, memory
 pairs       three boards that look alike, in two rendered views: same corners, same indices
 
@@ -29,7 +29,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from benchmark_peers import DETECTORS, INSTALL, PEERS, Answer, Worker
+from detectors.peers import DETECTORS, INSTALL, PEERS, Answer, Worker
 
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.corner_bound import corner_information, position_bound

@@ -33,8 +33,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from benchmark_peers import Worker
-from degradations import SAME, Grey, degraded
+from detectors.degradations import SAME, Grey, degraded
+from detectors.peers import Worker
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board

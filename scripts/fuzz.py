@@ -33,10 +33,10 @@ from types import FrameType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-import fuzz_seeds
-from fuzz_kinds import KINDS, Kind
-from fuzz_messages import fault_of_message
-from fuzz_mutations import mutated, mutated_arguments
+from fuzzing.kinds import KINDS, Kind
+from fuzzing.messages import fault_of_message
+from fuzzing.mutations import mutated, mutated_arguments
+from fuzzing.seeds import write_seeds
 
 DOCUMENTED = {0, 1, 2, 3}
 """Exit codes that a person may see; 70 says that rigkit has a bug."""
@@ -48,7 +48,7 @@ POLL_S = 0.05
 PROCESSES = multiprocessing.get_context("forkserver")
 """A process that is forked where OpenCV has threads would wait for those of its parent for ever."""
 PROCESSES.set_forkserver_preload(["fuzz"])
-DRAWN = {"api": "fuzz_api", "requests": "fuzz_requests"}
+DRAWN = {"api": "fuzzing.api", "requests": "fuzzing.requests"}
 """Classes without files, and the modules whose `run_case(seed, number)` draws and runs a case."""
 
 
@@ -231,7 +231,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args.keep.mkdir(parents=True, exist_ok=True)
     seeds = args.keep / "seeds"
     if not seeds.is_dir():
-        fuzz_seeds.write_seeds(seeds)
+        write_seeds(seeds)
     total = 0
     for label in labels:
         begun = time.monotonic()

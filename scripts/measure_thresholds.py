@@ -33,7 +33,7 @@ import zlib
 
 import cv2
 import numpy as np
-from degradations import SAME, Grey, degraded
+from detectors.degradations import SAME, Grey, degraded
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
@@ -87,7 +87,7 @@ WORSE: dict[str, tuple[float, ...]] = {
     "cut": (0.5,),
     "webcam": (6.0,),
 }
-"""What is done to images, and how much: see `degradations`."""
+"""What is done to images, and how much: see `detectors/degradations.py`."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 
 

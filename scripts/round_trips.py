@@ -1,7 +1,7 @@
 """Every camera model, and a rig, through every format and back: the largest error over the image, px, and what the
 other programs' own readers make of the files. The tables are part of the documentation.
 
-python scripts/round_trips.py     (what is read by whom: own_readers.py)
+python scripts/round_trips.py     (what is read by whom: calibrators/own_readers.py)
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import own_readers
 import yaml
+from calibrators import own_readers
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
@@ -250,3 +251,14 @@ def test_public_names_exist() -> None:
     assert rigkit.__all__
     for name in rigkit.__all__:
         assert getattr(rigkit, name) is not None
+
+
+def test_every_script_is_listed() -> None:
+    """In the page that says which script answers which question; parts of scripts lie in folders."""
+    folder = PACKAGE.parent / "scripts"
+    page = (folder / "README.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"`(\w+\.py)", page))
+    assert listed - {"__init__.py"} == {path.name for path in folder.glob("*.py")}
+    for part in folder.glob("*/__init__.py"):
+        named = re.findall(r"`(\w+\.py)`", ast.get_docstring(tree_of(part)) or "")
+        assert all((folder / name).is_file() for name in named), part

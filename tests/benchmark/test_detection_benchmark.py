@@ -22,7 +22,7 @@ SCRIPTS = REPOSITORY / "scripts"
 @pytest.fixture
 def peers(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    return importlib.import_module("benchmark_peers")
+    return importlib.import_module("detectors.peers")
 
 
 def test_a_worker_answers_and_survives(peers: ModuleType, rng: np.random.Generator) -> None:

@@ -10,13 +10,13 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
-import fuzz_seeds
+from fuzzing.seeds import write_seeds
 
 
 @pytest.fixture(scope="session")
 def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fuzz") / "seeds"
-    fuzz_seeds.write_seeds(folder)
+    write_seeds(folder)
     return folder
 
 

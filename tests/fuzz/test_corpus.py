@@ -7,7 +7,7 @@ from pathlib import Path
 
 import fuzz
 import pytest
-from fuzz_kinds import KINDS
+from fuzzing.kinds import KINDS
 
 CORPUS = Path(__file__).resolve().parents[1] / "corpus"
 CASES = sorted(path for path in CORPUS.rglob("*") if path.is_file())
@@ -41,20 +41,20 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
         return reader
 
-    import fuzz_readers
+    from fuzzing import readers
 
     from rigkit.cli import main as cli
     from rigkit.core.errors import InputError
 
-    call = ["fuzz_readers:read_vnl", "case.toml"]
+    call = ["fuzzing.readers:read_vnl", "case.toml"]
     for error, said in (
         (ValueError("bad"), "ValueError: bad"),
         (InputError("no name; write one"), "does not name"),
         (InputError("case.toml: it is wrong"), "does not say what to do"),
     ):
-        monkeypatch.setattr(fuzz_readers, "read_vnl", raising(error))
+        monkeypatch.setattr(readers, "read_vnl", raising(error))
         assert said in str(fuzz.fault_of(call, "case.toml", sound=False))
-    monkeypatch.setattr(fuzz_readers, "read_vnl", raising(InputError("case.toml: one line is wrong; correct it")))
+    monkeypatch.setattr(readers, "read_vnl", raising(InputError("case.toml: one line is wrong; correct it")))
     assert fuzz.fault_of(call, "case.toml", sound=False) is None
     assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
     monkeypatch.setattr(cli, "build_parser", raising(ValueError("bad")))

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from fuzz_kinds import KINDS
+from fuzzing.kinds import KINDS
 
 from rigkit.calibration.hand_eye import HandEye
 from rigkit.cli.main import main

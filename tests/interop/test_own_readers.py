@@ -26,7 +26,7 @@ def scripts() -> ModuleType:
 def test_their_reader_has_the_same_camera(scripts: ModuleType, program: str, model: str) -> None:
     off_px = getattr(scripts, f"by_{program}")(scripts.lens_as(model))
     if off_px is None:
-        pytest.skip(f"{program}'s own reader is not installed; scripts/own_readers.py says what to install")
+        pytest.skip(f"{program}'s own reader is not installed; scripts/calibrators/own_readers.py says what to install")
     assert off_px < scripts.EXACT_PX
 
 

@@ -15,7 +15,7 @@ from rigkit.geometry.rotation import exp_so3
 
 sys.path.insert(0, str(REPOSITORY / "scripts"))
 
-from truth_marks import fit_similarity, lattice_affinities, mark_lattice
+from truth.marks import fit_similarity, lattice_affinities, mark_lattice
 
 ROWS, COLUMNS, STEP_PX, HALF_PX = 6, 5, 60.0, 9.0
 MAX_CENTRE_PX = 0.05

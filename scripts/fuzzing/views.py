@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from fuzz_scenes import H21, PLACES
 from scipy.spatial.transform import Rotation
 
+from fuzzing.scenes import H21, PLACES
 from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.registry import camera_model
 from rigkit.core.detections import BoardDetection

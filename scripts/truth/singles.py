@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import cv2
-from bench_truth_table import OPENCV, RIGKIT, Bench, Row
 
 from rigkit.core.arrays import in_8_bits
 from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image, to_grey
+from truth.table import OPENCV, RIGKIT, Bench, Row
 
 
 def aprilgrid(bench: Bench) -> Iterator[Row]:

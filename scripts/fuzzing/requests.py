@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import fuzz_seeds
-from fuzz_mutations import mutated
 
+from fuzzing.mutations import mutated
+from fuzzing.seeds import write_images
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES, coach_app
 from rigkit.core.boards import Board
@@ -63,7 +63,7 @@ ANSWERS = {200, 400, 403, 404, 405, 413}
 def _pictures() -> dict[str, bytes]:
     """Return good pictures by the ending of their files."""
     with tempfile.TemporaryDirectory() as folder:
-        fuzz_seeds.write_images(Path(folder))
+        write_images(Path(folder))
         return {
             name: (Path(folder) / name).read_bytes() for name in ("image.png", "image.jpg", "deep.png", "image.webp")
         }

@@ -1,6 +1,6 @@
-"""mrcal on corners from an .npz, in Debian's own Python: benchmark_calibration_peers.py starts it and asks for runs.
+"""mrcal on corners from an .npz, in Debian's own Python: peers.py starts it and asks for runs.
 
-    /usr/bin/python3 scripts/mrcal_worker.py corners.npz
+    /usr/bin/python3 scripts/calibrators/mrcal_worker.py corners.npz
 
 The .npz holds observations (N, rows, columns, 3) as mrcal has them, frame_camera (N, 2), the spacing in mm, the size of
 the images, the lens model, and whether the board may be warped and outliers be rejected, as mrcal-calibrate-cameras

@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from core_scenes import CAMERA, POSE
 
+from core_speed.scenes import CAMERA, POSE
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit

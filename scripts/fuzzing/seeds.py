@@ -6,11 +6,9 @@ import json
 from pathlib import Path
 
 import cv2
-import fuzz_media
-import fuzz_scenes
-import fuzz_views
 import numpy as np
 
+from fuzzing import media, scenes, views
 from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.registry import camera_model
 from rigkit.core.cloud import OrientedCloud
@@ -28,7 +26,7 @@ from rigkit.io.corners_file import corners_text
 from rigkit.io.correspondences import correspondences_text
 from rigkit.io.ply import write_ply
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 SIZE_PX = (160, 120)
 COLUMNS, ROWS, SQUARE_PX = 5, 4, 18
 
@@ -151,9 +149,9 @@ def write_seeds(folder: Path) -> None:
     _write_calibrations(folder)
     _write_cameras(folder)
     _write_tables(folder)
-    fuzz_media.write_media(folder)
-    fuzz_scenes.write_scenes(folder)
-    fuzz_views.write_views(folder)
+    media.write_media(folder)
+    scenes.write_scenes(folder)
+    views.write_views(folder)
     (folder / "other").mkdir()
     (folder / "other" / "dataset.toml").write_text(TOMLS["dataset.toml"].replace('"small"', '"other"', 1))
 

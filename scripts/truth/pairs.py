@@ -6,12 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import combinations
 
-import bench_truth_peers as peers
 import numpy as np
-from bench_truth_cameras import PEER_FAILURES, kept_views
-from bench_truth_colmap import colmap_pair, colmap_rig
-from bench_truth_table import COLMAP, MRCAL, OPENCV, RIGKIT, Bench, Row
-from truth_marks import fit_similarity, lattice_affinities, mark_lattice
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.calibration.rig.result import RigCalibration
@@ -24,6 +19,11 @@ from rigkit.io.correspondences import write_correspondences
 from rigkit.io.images import read_image
 from rigkit.workflows.reconstruct_scene import SceneOptions, reconstruct_views
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
+from truth import peers
+from truth.cameras import PEER_FAILURES, kept_views
+from truth.colmap import colmap_pair, colmap_rig
+from truth.marks import fit_similarity, lattice_affinities, mark_lattice
+from truth.table import COLMAP, MRCAL, OPENCV, RIGKIT, Bench, Row
 
 CYLINDER_SEEN = {"201": (1325.0, 455.0), "202": (1000.0, 418.0)}
 """Where the topmost mark of column 7 is."""

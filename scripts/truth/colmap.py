@@ -11,8 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from bench_truth_resection import Fit, Size, Views
-from benchmark_calibration_peers import opencv_fisheye, opencv_regular
+from calibrators.peers import opencv_fisheye, opencv_regular
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -21,6 +20,7 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import board_poses
 from rigkit.geometry.rigid3 import Rigid3
+from truth.resection import Fit, Size, Views
 
 HALF = 0.5
 """Its pixels count from the corner of the first, ours from its centre."""

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fuzz_mutations import strange_arrays
-from fuzz_seeds import SIZE_PX, small_cloud, small_detection
 
 import rigkit
+from fuzzing.mutations import strange_arrays
+from fuzzing.seeds import SIZE_PX, small_cloud, small_detection
 from rigkit.affine.correspondences import Correspondences
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError

@@ -4,7 +4,7 @@ A worker process holds one detector on one core with one thread, so that process
 crash is its own, and packages that do not get along with ours can live in another environment. This file needs numpy
 only; everything else is imported by the worker that needs it.
 
-    python scripts/benchmark_peers.py NAME        run as a worker (by `Worker`): pickles in, pickles out
+    python scripts/detectors/peers.py NAME        run as a worker (by `Worker`): pickles in, pickles out
 """
 
 from __future__ import annotations

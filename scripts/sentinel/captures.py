@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-from sentinel_tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, checked, tell, turned, unchanged
 from split_halves import load
 
 from rigkit.calibration.calibrate import calibrate
@@ -24,6 +23,7 @@ from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck
 from rigkit.validation.sentinel.watch import watched_camera
+from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, checked, tell, turned, unchanged
 
 PAIR_PX, PAIR_DEG = 0.1, 0.01
 """How sure published cameras and mounts of pairs are taken to be: over the image, and per axis."""

@@ -14,9 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from bench_truth_colmap import colmap_camera
-from bench_truth_resection import Fit, Size, Views
-from benchmark_calibration_peers import Mrcal, opencv_fisheye, opencv_points, opencv_regular
+from calibrators.peers import Mrcal, opencv_fisheye, opencv_points, opencv_regular
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -25,6 +23,8 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.images import read_image, to_grey
+from truth.colmap import colmap_camera
+from truth.resection import Fit, Size, Views
 
 MRCAL_LENS = "LENSMODEL_OPENCV8"
 MRCAL_FISHEYE = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=14_Ny=10_fov_x_deg=180"

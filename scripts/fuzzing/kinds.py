@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fuzz_commands import COMMANDS
+from fuzzing.commands import COMMANDS
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ def _board_file(name: str) -> Kind:
 
 def _video(name: str) -> Kind:
     read = ("detect", "-j", "1", "--board", "floor.toml", "{case}")
-    return Kind(name, (("fuzz_readers:read_frames", "{case}"), ("fuzz_readers:coach_video", "{case}"), read))
+    return Kind(name, (("fuzzing.readers:read_frames", "{case}"), ("fuzzing.readers:coach_video", "{case}"), read))
 
 
 def _found_board(name: str, picture: str) -> Kind:
@@ -49,7 +49,7 @@ RECONSTRUCT = ("-o", "{out}/new", "--no-pictures")
 
 AT_WORK: dict[str, Kind] = {
     "corners-at-work": Kind("views.csv", (("calibrate", "views.toml", "--corners", "{case}", *VIEWS),), judged=True),
-    "corners-kept": Kind("kept.json", (("fuzz_readers:calibrate_kept", "{case}"),), names_file=False),
+    "corners-kept": Kind("kept.json", (("fuzzing.readers:calibrate_kept", "{case}"),), names_file=False),
     "session-at-work": Kind("views.toml", (("calibrate", "{case}", *VIEWS),), judged=True),
     "board-at-work": Kind(
         "floor.toml",
@@ -87,7 +87,7 @@ AT_WORK: dict[str, Kind] = {
         (("check", "calibration.json", "image.png", "--board", "floor.toml", "--register", "{case}"),),
         judged=True,
     ),
-    "catalogue": Kind("public.toml", (("fuzz_readers:fetch_listed", "{case}"),), names_file=False),
+    "catalogue": Kind("public.toml", (("fuzzing.readers:fetch_listed", "{case}"),), names_file=False),
 }  # fmt: skip
 """Files that a whole piece of work uses, not only a reader."""
 
@@ -173,11 +173,11 @@ KINDS: dict[str, Kind] = {
         ),
     ),
     "corners-json": Kind(
-        "corners.json", (("rigkit.io.corners_file:read_corners", "{case}"), ("fuzz_readers:read_cache", "{case}"))
+        "corners.json", (("rigkit.io.corners_file:read_corners", "{case}"), ("fuzzing.readers:read_cache", "{case}"))
     ),
     "corners-csv": Kind("corners.csv", (("rigkit.io.corners_file:read_corners", "{case}"),)),
-    "corners-vnl": Kind("corners.vnl", (("fuzz_readers:read_vnl", "{case}"),)),
-    "truth-csv": Kind("truth.csv", (("fuzz_readers:read_truth", "{case}"),)),
+    "corners-vnl": Kind("corners.vnl", (("fuzzing.readers:read_vnl", "{case}"),)),
+    "truth-csv": Kind("truth.csv", (("fuzzing.readers:read_truth", "{case}"),)),
     "pairs-csv": Kind("pairs.csv", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
     "pairs-npz": Kind("pairs.npz", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
     "ply": Kind(
@@ -254,16 +254,18 @@ KINDS: dict[str, Kind] = {
     ),
     "matches-npz": Kind("lightglue.npz", MATCHES),
     "frames-npz": Kind("lafs.npz", MATCHES),
-    "colmap-database": Kind("matches.db", (("fuzz_readers:read_database", "{case}"), *MATCHES[1:])),
+    "colmap-database": Kind("matches.db", (("fuzzing.readers:read_database", "{case}"), *MATCHES[1:])),
     "poses": Kind("poses.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
     "poses-turned": Kind("turns.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
     "pose": Kind("pose.txt", (("rigkit.workflows.reconstruct_scene:_read_pose", "{case}"),)),
     "avi": _video("film.avi"),
     "mp4": _video("film.mp4"),
     "mkv": _video("film.mkv"),
-    "timestamps": Kind("times.csv", (("fuzz_readers:read_times", "{case}"),)),
-    "frames-record": Kind("frames.json", (("fuzz_readers:read_record", "{case}"),)),
-    "coach-watch": Kind("image.png", (("fuzz_readers:coach_folder", "{case}"), ("fuzz_readers:coach_again", "{case}"))),
+    "timestamps": Kind("times.csv", (("fuzzing.readers:read_times", "{case}"),)),
+    "frames-record": Kind("frames.json", (("fuzzing.readers:read_record", "{case}"),)),
+    "coach-watch": Kind(
+        "image.png", (("fuzzing.readers:coach_folder", "{case}"), ("fuzzing.readers:coach_again", "{case}"))
+    ),
     "many": Kind(
         "dataset.toml",
         (("validate", "{case}", "other/dataset.toml", "-o", "{out}/v", "-j", "1", "--no-pictures"),),
@@ -284,7 +286,7 @@ KINDS: dict[str, Kind] = {
     "mrcal": _camera_file("lens.cameramodel"),
     "mrcal-spline": _camera_file("spline.cameramodel"),
     "ocamcalib": _camera_file("calib_results.txt"),
-    "py-ocamcalib": Kind("ocam.json", (("fuzz_readers:read_py_ocam", "{case}"),)),
+    "py-ocamcalib": Kind("ocam.json", (("fuzzing.readers:read_py_ocam", "{case}"),)),
     "commands": Kind(None, COMMANDS, names_file=False, judged=True),
     "api": Kind(None, (), names_file=False),
     "requests": Kind(None, (), names_file=False),

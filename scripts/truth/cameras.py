@@ -7,11 +7,8 @@ from functools import partial
 from itertools import combinations
 from pathlib import Path
 
-import bench_truth_peers as peers
 import cv2
 import numpy as np
-from bench_truth_resection import FOLDS, Fit, Size, Views, folds_of, held_out_rms, rms_of
-from bench_truth_table import MRCAL, RIGKIT, Bench, Row
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.hand_eye import hand_eye
@@ -23,6 +20,9 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.images import read_image
 from rigkit.io.robot_poses import read_robot_poses
+from truth import peers
+from truth.resection import FOLDS, Fit, Size, Views, folds_of, held_out_rms, rms_of
+from truth.table import MRCAL, RIGKIT, Bench, Row
 
 HELD_OUT = "held-out rms"
 MOST_RELEASED = 100

@@ -1,4 +1,4 @@
-"""Good commands on the good files (`fuzz_seeds`), for `fuzz.py` to put other words into."""
+"""Good commands on the good files (`seeds.py`), for `fuzz.py` to put other words into."""
 
 from __future__ import annotations
 

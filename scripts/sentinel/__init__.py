@@ -1,0 +1,1 @@
+"""The real captures and the counts of `bench_sentinel.py`."""

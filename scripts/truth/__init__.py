@@ -1,0 +1,1 @@
+"""The sets, the peers and the tables of `bench_truth.py`."""
