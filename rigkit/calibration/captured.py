@@ -66,14 +66,16 @@ class Extent:
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
 
-def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray) -> list[Finding]:
+def judge_capture(
+    calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray, correlation: float
+) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
-    views, those that repeat others as those."""
+    views, those that repeat others as those, `correlation` is that of neighbouring residuals."""
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
         *two_cameras(calibration, clusters),
-        *changing(calibration),
+        *changing(calibration, correlation),
         *_repeated(images, number),
         *_too_few(images, number),
         *_tilts(calibration),

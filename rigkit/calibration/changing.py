@@ -27,6 +27,9 @@ MIN_VARIANCE_RATIO = 6.0
 MIN_SHARE_EXPLAINED = 0.5
 """The main part: a way to change that explains less of all squares may be a little of something else. A board held in
 hand before two cameras is bent by the residuals of one, sheared by those of the other, with a third of each."""
+MIN_NEIGHBOUR_CORRELATION = 0.1
+"""All ways to change are smooth over a board: where one is the main part, the residuals of neighbouring corners agree,
+by half of 0.5 and more. Those of mere noise have a correlation of 0, a little less after a pose."""
 MIN_LEAD_OF_CRITERION = 10.0
 """By so much its Bayesian information criterion must be below that of nothing and of every other way: very strong
 evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
@@ -68,9 +71,10 @@ NO_CHANGE = "columns"
 model."""
 
 
-def changing(calibration: Calibration) -> list[Finding]:
-    """Return a finding where one thing differs from image to image that the calibration takes for constant."""
-    changes = view_changes(calibration)
+def changing(calibration: Calibration, correlation: float) -> list[Finding]:
+    """Return a finding where one thing differs from image to image that the calibration takes for constant;
+    `correlation` is that of the residuals of neighbouring corners."""
+    changes = view_changes(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else {}
     if not changes:
         return []
     best = min(changes, key=lambda way: changes[way].criterion)

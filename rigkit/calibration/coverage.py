@@ -13,6 +13,8 @@ REACH = 1.0
 """A pixel within this many spacings of a corner (of its board in its view) lies on a board: discs of 0.71 would leave
 no gap inside a regular grid, and perspective makes spacings differ within a view."""
 PIXELS_AT_A_TIME = 256
+ONE_LINE = 1e-9
+"""Determinant of a grid's scatter, as a part of its squared trace, of a single row or column."""
 CORNERS_OF_PART = 512
 """Distances of so many pixels to so many corners are one product that stays in the cache, too small for threads."""
 
@@ -62,13 +64,18 @@ def _reach_px(views: Sequence[ViewResult], corners: Pixels) -> FloatArray:
     """
     count = np.array([int(view.kept.sum()) for view in views])
     start = np.cumsum(count) - count
-    grid = np.concatenate([view.grid[view.kept] for view in views]).astype(np.float64)
-    design = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
-    normal = np.add.reduceat(design[:, :, None] * design[:, None, :], start)
-    moments = np.add.reduceat(design[:, :, None] * corners[:, None, :], start)
-    # A single row or column leaves the other side open, which then counts as zero.
-    sides = np.linalg.norm((np.linalg.pinv(normal, hermitian=True) @ moments)[:, 1:], axis=-1)
-    return np.repeat(REACH * sides.max(axis=1), count)
+    grid = np.concatenate([view.grid[view.kept] for view in views])
+    values = np.concatenate([grid, corners], axis=1)
+    values -= np.repeat(np.add.reduceat(values, start) / count[:, None], count, axis=0)
+    x, y, u, v = values.T
+    xx, xy, yy, xu, yu, xv, yv = np.add.reduceat([x * x, x * y, y * y, x * u, y * u, x * v, y * v], start, axis=1)
+    # A single row or column leaves the other side open, which then counts as zero: the pseudo-inverse of rank one.
+    size, whole = xx + yy, xx * yy - xy * xy
+    flat = whole <= ONE_LINE * size**2
+    whole = np.where(flat, np.maximum(size, 1.0) ** 2, whole)
+    xx, xy, yy = np.where(flat, [yy, -xy, xx], [xx, xy, yy])
+    sides = np.hypot([yy * xu - xy * yu, xx * yu - xy * xu], [yy * xv - xy * yv, xx * yv - xy * xv]) / whole
+    return np.repeat(REACH * sides.max(axis=0), count)
 
 
 def corner_ranges(calibration: Calibration) -> FloatArray:

@@ -67,23 +67,24 @@ def _partners(
     reach = SAME_MOTION * distance * 2.0
     points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
     starts = np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))
-    i, j = (axis.ravel() for axis in np.meshgrid(starts, np.arange(len(centre)), indexing="ij"))
-    chosen = (number[i] != number[j]) & (boards[i] == boards[j])
-    i, j = i[chosen], j[chosen]
-    turn = rotation[j] @ np.swapaxes(rotation[i], -1, -2)
-    shift = centre[j] - np.einsum("nij,nj->ni", turn, centre[i])
-    # Where a motion takes a frame that stands where boards usually were.
+    # Where each motion takes a frame that stands where boards usually were, as products of all ends and all starts.
     usual = frame + centre.mean(axis=0)
-    ends = np.einsum("nij,pj->npi", turn, usual) + shift[:, None]
-    moved = np.linalg.norm(ends - usual, axis=-1).max(axis=-1) > MIN_MOTION * reach / 2.0
-    if not moved.any():
+    seen_from = (usual - centre[starts, None]) @ rotation[starts]
+    ends = (rotation.reshape(-1, 3) @ seen_from.reshape(-1, 3).T).reshape(len(centre), 3, len(starts), len(frame))
+    ends = ends.transpose(2, 0, 3, 1) + centre[:, None]
+    chosen = (number[starts, None] != number) & (boards[starts, None] == boards)
+    chosen &= ((ends - usual) ** 2).sum(axis=-1).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
+    if not chosen.any():
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    flat = ends.reshape(-1, 12)[moved]
+    i, j = np.nonzero(chosen)
+    i, ends = starts[i], ends[chosen]
+    flat = ends.reshape(-1, 12)
     near = np.linalg.norm(flat - flat[int(np.argmax(_neighbours(flat, reach)))], axis=1) <= reach
-    best = np.flatnonzero(moved)[near]
+    best = np.flatnonzero(near)
     # The motion of the one that lies in the middle of those.
     middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
-    landed = np.einsum("ij,npj->npi", turn[middle], points) + shift[middle]
+    turn = rotation[j[middle]] @ rotation[i[middle]].T
+    landed = (points - centre[i[middle]]) @ turn.T + centre[j[middle]]
     squared = np.zeros((len(points), len(points)))
     for one, other in zip(landed.reshape(-1, 12).T, points.reshape(-1, 12).T, strict=True):
         squared += (one[:, None] - other) ** 2

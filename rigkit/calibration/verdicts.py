@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
+from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
@@ -75,11 +76,11 @@ def judge(
     if clusters is None:
         views = calibration.views
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
-    extent = Extent.of(calibration)
+    extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
-        *judge_capture(calibration, extent, far, clusters),
+        *judge_capture(calibration, extent, far, clusters, correlation),
         *(finding for finding in also if finding.severity is Severity.BAD),
     ]
     found = [
@@ -87,7 +88,7 @@ def judge(
         *_left_out(calibration.dropped),
         *_coverage(calibration),
         *_views(calibration),
-        *_pattern(calibration, in_force),
+        *_pattern(calibration, correlation, in_force),
         *_overfit(calibration),
         *_boards(calibration),
         *_outliers(calibration),
@@ -230,24 +231,11 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration, in_force: Collection[str]) -> list[Finding]:
+def _pattern(c: Calibration, correlation: float, in_force: Collection[str]) -> list[Finding]:
     """Residuals of neighbours agree where a lens or a board is not what the model says."""
-    grid = np.concatenate([v.grid for v in c.views])
-    kept = np.concatenate([v.kept for v in c.views])
-    view = np.repeat(np.arange(len(c.views)), [len(v.grid) for v in c.views])
-    columns, rows = (grid.max(axis=0) + 1).tolist()
-    lattice, there = np.zeros((len(c.views) * rows * columns, 2)), np.zeros(len(c.views) * rows * columns)
-    place = ((view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
-    lattice[place], there[place] = np.concatenate([v.residuals_px for v in c.views])[kept], 1.0
-    lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
-    squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
-    products, power = 0.0, 0.0
-    for one, other in ((np.s_[:, :, 1:], np.s_[:, :, :-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        products += float((lattice[one] * lattice[other]).sum())
-        power += 0.5 * float((squared[one] * there[other] + squared[other] * there[one]).sum())
-    if not power > 0.0 or products / power < PATTERN:
+    if correlation < PATTERN:
         return []
-    what = f"residuals of neighbouring corners agree (correlation {products / power:.2f}): "
+    what = f"residuals of neighbouring corners agree (correlation {correlation:.2f}): "
     shapes = "board_shape" in in_force or any(board.kind == "released" for board in c.boards)
     if not shapes:
         return [_look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]

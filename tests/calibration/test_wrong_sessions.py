@@ -9,7 +9,8 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.changing import changing
+from rigkit.calibration.changing import MIN_NEIGHBOUR_CORRELATION, changing, view_changes
+from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
@@ -17,7 +18,7 @@ from rigkit.cameras.compare import compare_cameras
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
-from rigkit.core.findings import Severity, worst
+from rigkit.core.findings import Finding, Severity, worst
 from rigkit.geometry.rotation import exp_so3
 
 NOISE_PX = 0.1
@@ -46,6 +47,10 @@ def first(result: Calibration) -> str:
     assert result.verdicts[0].severity is not Severity.GOOD
     assert result.verdicts[0].remedy
     return result.verdicts[0].message
+
+
+def changing_in(result: Calibration) -> list[Finding]:
+    return changing(result, neighbour_correlation(result))
 
 
 def prefixed(views: list[BoardView], prefix: str) -> list[BoardView]:
@@ -222,29 +227,39 @@ def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.G
     """In most sessions; where two ways to change follow the images nearly as well, nothing is said rather than the
     wrong one."""
     results = [calibrate(changed_views(way, rng), SIZE, model="brown", board="flat") for _ in range(4)]
-    named = [result for result in results if changing(result)]
+    named = [result for result in results if changing_in(result)]
     assert len(named) >= 3
     assert all(words in str(result.verdicts) for result in named), [str(result.verdicts[0]) for result in named]
+
+
+@pytest.mark.parametrize("way", ["focus", "shift", "rows", "bend"])
+def test_what_changes_is_far_above_the_correlation_that_is_looked_at(way: str, rng: np.random.Generator) -> None:
+    result = calibrate(changed_views(way, rng), SIZE, model="brown", board="flat")
+    assert neighbour_correlation(result) > 3.0 * MIN_NEIGHBOUR_CORRELATION
+    # Mere noise is not looked at: nothing would be found there.
+    noise = calibrate(changed_views("nothing", rng), SIZE, model="brown", board="flat")
+    assert neighbour_correlation(noise) < MIN_NEIGHBOUR_CORRELATION
+    assert max(change.share for change in view_changes(noise).values()) < 0.1
 
 
 def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Generator) -> None:
     """A lens of another kind than the model, and a bent board, are no change from image to image."""
     same = changed_views("nothing", rng)
-    assert changing(calibrate(same, SIZE, model="brown", board="flat")) == []
-    assert changing(calibrate(same, SIZE, model="ucm", board="flat")) == []
+    assert changing_in(calibrate(same, SIZE, model="brown", board="flat")) == []
+    assert changing_in(calibrate(same, SIZE, model="ucm", board="flat")) == []
     bent = BOARD.points()
     bent[:, 2] += 1.5 * (1.0 - (BOARD.grid()[:, 0] / 4.0 - 1.0) ** 2)
     views = random_views(lens("reg"), 20, rng, reach_deg=33.0, noise_px=0.05, points_mm=bent)[0]
     for shape in ("flat", "warp"):
-        assert changing(calibrate(views, SIZE, model="brown", board=shape)) == []
+        assert changing_in(calibrate(views, SIZE, model="brown", board=shape)) == []
 
 
 def test_a_lens_beyond_all_numbers_tells_nothing_of_what_changes(rng: np.random.Generator) -> None:
     result = calibrate(changed_views("rows", rng), SIZE, model="brown", board="flat")
     parameters = np.array(result.camera.parameters)
     parameters[4] = -9e14
-    assert changing(result) != []
-    assert changing(replace(result, camera=result.camera.with_parameters(parameters))) == []
+    assert changing_in(result) != []
+    assert changing_in(replace(result, camera=result.camera.with_parameters(parameters))) == []
 
 
 def test_one_image_many_times_is_named(rng: np.random.Generator) -> None:
