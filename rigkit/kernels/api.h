@@ -414,4 +414,19 @@ EXPORT void sweep_winners(
     const surface_rules_t *rules, ARRAY(const uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)),
     ARRAY(int32_t, best, rules.rows, rules.columns), ARRAY(int32_t, around, rules.rows, rules.columns, 4));
 
+/* Surfaces at some samples (row, column): the level there, its change from row to row and from column to column, and how
+ * many levels away another surface begins. Samples count less the further they are, in units of `radius` samples, and the
+ * more their brightness differs, in units of `alike`. */
+typedef struct {
+    ARRAY(const int32_t, samples, count, 2);
+    ARRAY(const float, surfaces, count, 4);
+    int64_t count, rows, columns, levels;
+    double radius, alike;
+} claims_t;
+
+EXPORT void sweep_rivals(
+    const claims_t *claims, ARRAY(const uint8_t, costs, claims.rows, claims.columns, sweep_levels(claims.levels)),
+    ARRAY(const float, samples1, claims.rows, claims.columns), ARRAY(uint16_t, memory, sweep_levels(claims.levels)),
+    ARRAY(float, found, claims.count, 2));
+
 #endif

@@ -220,3 +220,63 @@ FOR_EACH_PROCESSOR void sweep_winners(const surface_rules_t *rules, const uint16
             around[4 * k + 1 + n] = at[inner - 1 + n];
     }
 }
+
+/* Samples around one that are asked, weights of those that count fully, and steps of a weight's table. */
+enum { RIVAL_REACH = 5, FULL_WEIGHT = 16, WEIGHT_STEPS = 64, STEPS_OF_ONE = 16 };
+
+/* Add `weight` times the costs of a sample to those of its surfaces, which lie `shift` levels higher there. */
+INLINE void add_shifted(const uint8_t *cost, int64_t shift, uint16_t weight, int64_t levels, uint16_t *sum)
+{
+    const int64_t from = shift < 0 ? -shift : 0, to = shift > 0 ? levels - shift : levels;
+    const uint16_t below = (uint16_t)(weight * cost[0]), above = (uint16_t)(weight * cost[levels - 1]);
+    for (int64_t k = 0; k < from; k++)
+        sum[k] = (uint16_t)(sum[k] + below);
+#pragma omp simd
+    for (int64_t k = from; k < to; k++)
+        sum[k] = (uint16_t)(sum[k] + weight * cost[k + shift]);
+    for (int64_t k = to; k < levels; k++)
+        sum[k] = (uint16_t)(sum[k] + above);
+}
+
+/* Write for each claim the costs a sample of its surface, at most a level off, and of the cheapest other one of the same
+ * slant: over the samples around that are as bright. NaN where the sweep has no such level. */
+FOR_EACH_PROCESSOR void sweep_rivals(
+    const claims_t *claims, const uint8_t *costs, const float *samples1, uint16_t *memory, float *found)
+{
+    const int64_t levels = claims->levels, padded = sweep_levels(levels);
+    float faint[WEIGHT_STEPS];
+    for (int64_t k = 0; k < WEIGHT_STEPS; k++)
+        faint[k] = expf(-(float)k / (float)STEPS_OF_ONE);
+    const float steps = (float)STEPS_OF_ONE / (float)claims->alike;
+    const float fall = (float)(0.5 * STEPS_OF_ONE / (claims->radius * claims->radius));
+    for (int64_t n = 0; n < claims->count; n++) {
+        const int64_t row = claims->samples[2 * n], column = claims->samples[2 * n + 1];
+        const float *surface = claims->surfaces + 4 * n, here = samples1[row * claims->columns + column];
+        memset(memory, 0, (size_t)levels * sizeof *memory);
+        float weights = 0.0f;
+        for (int64_t j = -RIVAL_REACH; j <= RIVAL_REACH; j++)
+            for (int64_t i = -RIVAL_REACH; i <= RIVAL_REACH; i++) {
+                if (row + j < 0 || row + j >= claims->rows || column + i < 0 || column + i >= claims->columns)
+                    continue;
+                const int64_t at = (row + j) * claims->columns + column + i;
+                const float unlike = steps * fabsf(samples1[at] - here) + fall * (float)(i * i + j * j);
+                const float shift = surface[1] * (float)j + surface[2] * (float)i;
+                if (!(unlike < (float)WEIGHT_STEPS && fabsf(shift) < (float)levels - 1.0f))
+                    continue;
+                const uint16_t weight = (uint16_t)((float)FULL_WEIGHT * faint[(int64_t)unlike] + 0.5f);
+                add_shifted(costs + at * padded, (int64_t)floorf(shift + 0.5f), weight, levels, memory);
+                weights += (float)weight;
+            }
+        float own = INFINITY, other = INFINITY;
+        for (int64_t k = 0; k < levels; k++) {
+            const float away = fabsf((float)k - surface[0]);
+            if (away <= 1.0f && (float)memory[k] < own)
+                own = (float)memory[k];
+            if (away > surface[3] && (float)memory[k] < other)
+                other = (float)memory[k];
+        }
+        const int known = own < INFINITY && other < INFINITY && weights > 0.0f;
+        found[2 * n] = known ? own / weights : NAN;
+        found[2 * n + 1] = known ? other / weights : NAN;
+    }
+}

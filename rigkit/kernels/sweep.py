@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
@@ -22,6 +23,11 @@ class _SweptRanges(Struct):
 @structure("surface_rules_t")
 class _SurfaceRules(Struct):
     """What steps of a surface from level to level cost."""
+
+
+@structure("claims_t")
+class _Claims(Struct):
+    """Surfaces at some samples, and which samples around are asked about them."""
 
 
 def swept_costs(
@@ -66,3 +72,38 @@ def swept_surfaces(
     best, around = np.empty((rows, columns), np.int32), np.empty((rows, columns, 4), np.int32)
     kernels().sweep_winners(rules, total, best, around)
     return best, around
+
+
+def swept_rivals(
+    costs: NDArray[np.uint8],
+    levels: int,
+    samples1: NDArray[np.float32],
+    samples: NDArray[np.int64],
+    surfaces: FloatArray,
+    *,
+    radius: float,
+    alike: float,
+) -> NDArray[np.float32]:
+    """Return for each of N surfaces its costs, and those of the cheapest other one of the same slant, (N, 2).
+
+    Both are bits a sample, over the samples around that are as bright: those further away than `radius` samples, or
+    different by more than `alike`, count little. NaN where the sweep has none of `levels` there.
+
+    `surfaces` (N, 4) at `samples` (N, 2), row and column: the level there, its change from row to row and from column
+    to column, and how many levels away another surface begins.
+    """
+    rows, columns = samples1.shape
+    claims = _Claims.of(
+        samples=np.ascontiguousarray(samples, np.int32),
+        surfaces=np.ascontiguousarray(surfaces, np.float32),
+        count=len(samples),
+        rows=rows,
+        columns=columns,
+        levels=levels,
+        radius=radius,
+        alike=alike,
+    )
+    memory = np.empty(kernels().sweep_levels(levels), np.uint16)
+    found = np.empty((len(samples), 2), np.float32)
+    kernels().sweep_rivals(claims, costs, np.ascontiguousarray(samples1, np.float32), memory, found)
+    return found

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from kernels.reference import sweep as reference
 
-from rigkit.kernels.sweep import swept_costs, swept_surfaces
+from rigkit.kernels.sweep import swept_costs, swept_rivals, swept_surfaces
 
 SPACING = 8
 RULES: dict[str, Any] = {"bend": 4, "jump": 48, "even": 8.0}
+ROUNDED_BITS = 0.3
+"""Of 24: weights are sixteenths, and their table has 16 steps to a factor e."""
 MAX_DIFFERING = 2e-3
 """Share of costs: brightnesses that differ by less than single precision may be darker or not."""
 
@@ -50,3 +52,31 @@ def test_the_surface_is_found_where_both_images_are_one(rng: np.random.Generator
     best, _ = swept_surfaces(swept_costs(image, samples, table, SPACING), 16, samples, **RULES)
     # Level 5 is that without a shift; beside the hole of the table and the row without brightness little is known.
     assert np.mean(best[12:-3, 12:-3] == 5) > 0.99
+
+
+def test_rivals_are_as_defined(rng: np.random.Generator) -> None:
+    levels = 21
+    image, samples1, table = scene(rng, levels)
+    costs = swept_costs(image, samples1, table, SPACING)
+    count = 200
+    samples = np.stack([rng.integers(0, n, count) for n in samples1.shape], axis=1)
+    surfaces = np.column_stack(
+        [
+            rng.uniform(-3.0, levels + 2.0, count),
+            rng.uniform(-0.6, 0.6, (count, 2)),
+            rng.uniform(1.0, 3.0, count),
+        ]
+    )
+    rules = {"radius": 3.0, "alike": 40.0}
+    ours = swept_rivals(costs, levels, samples1, samples, surfaces, **rules)
+    theirs = reference.rivals(costs[..., :levels], samples1, samples, surfaces, **rules)
+    np.testing.assert_array_equal(np.isnan(ours), np.isnan(theirs))
+    known = np.isfinite(ours[:, 0])
+    assert 0.6 * count < known.sum() < count
+    assert np.abs(ours - theirs)[known].max() < ROUNDED_BITS
+    # Level 5 is that without a shift.
+    right = np.flatnonzero(known & (samples > 14).all(axis=1) & (samples < np.array(samples1.shape) - 15).all(axis=1))
+    flat = np.tile([5.0, 0.0, 0.0, 1.5], (len(right), 1))
+    own, other = swept_rivals(costs, levels, samples1, samples[right], flat, **rules).T
+    assert len(right) > 20
+    assert np.mean(own < 0.5 * other) > 0.95

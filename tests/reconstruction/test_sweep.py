@@ -5,19 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
-from helpers.textured_scene import Corner
+from helpers.textured_scene import Corner, texture
 from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.features import match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.reconstruction.growing import sweep as sweep_module
+from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_both_ways
 from rigkit.reconstruction.growing.surface import NodeMeasurements, measure
 from rigkit.reconstruction.growing.sweep import filled
+from rigkit.reconstruction.scene import reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 SIZE = (320, 240)
@@ -61,7 +67,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
 @pytest.mark.parametrize("lens", LENSES)
 def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
-    done = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
     assert (done.swept & ~grown.valid).sum() == done.swept.sum()
     np.testing.assert_array_equal(done.pixels2[grown.valid], grown.pixels2[grown.valid])
     hole = np.zeros(done.valid.shape, dtype=bool)
@@ -83,7 +89,7 @@ def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
 
 def test_nothing_is_filled_where_there_is_no_texture() -> None:
     grown, measured, views, _ = grown_with_hole("pinhole")
-    done = filled(grown, measured, *views, CAM2_FROM_CAM1)
+    done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
     rows, columns = (np.arange(n) * STEP for n in done.valid.shape)
     inside = np.zeros(done.valid.shape, dtype=bool)
     v, u = FLAT
@@ -98,7 +104,9 @@ def test_a_sweep_that_contradicts_the_patches_is_not_believed() -> None:
     grown, measured, (view1, view2), _ = grown_with_hole("pinhole")
     unrelated = np.random.default_rng(1).uniform(0.0, 255.0, view2.grey.shape)
     other = replace(view2, grey=unrelated.astype(np.uint8))
-    assert filled(grown, measured, view1, other, CAM2_FROM_CAM1) is grown
+    done, sweep = filled(grown, measured, view1, other, CAM2_FROM_CAM1)
+    assert done is grown
+    assert sweep is None
 
 
 def test_a_wall_at_one_range_is_swept_without_a_fault() -> None:
@@ -107,5 +115,56 @@ def test_a_wall_at_one_range_is_swept_without_a_fault() -> None:
     same = measured.z.copy()
     same[..., 0] = np.where(np.isfinite(same[..., 0]), np.nanmedian(same[..., 0]), np.nan)
     with np.errstate(all="raise", under="ignore"):
-        done = filled(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
+        done, _ = filled(grown, replace(measured, z=same), *views, CAM2_FROM_CAM1)
     assert done.valid.sum() >= grown.valid.sum()
+
+
+CARD_MM, WALL_MM = 800.0, 1300.0
+CARD_HALF_MM = 110.0
+BESIDE_PX = 2.0
+"""From the card's edge: nearer, a sample shows both."""
+
+
+def card_before_a_wall(pose: Rigid3, camera: Pinhole, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """What a camera at `pose` from camera 1 sees: a bright card before a wall of little contrast."""
+    width, height = camera.size_px
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    rays, _ = camera.unproject(np.stack([u, v], axis=-1))
+    back = pose.inverse()
+    origin, directions = back.translation_mm, rays @ back.rotation.T
+    brightness = []
+    for depth, dull, seed in ((WALL_MM, 0.15, 1), (CARD_MM, 0.6, 2)):
+        at = origin[:2] + directions[..., :2] * ((depth - origin[2]) / directions[..., 2])[..., None]
+        inside = (np.abs(at) < CARD_HALF_MM).all(axis=-1)
+        maps = (np.ascontiguousarray(at[..., k] + 1024.0, np.float32) for k in (0, 1))
+        pattern = cv2.remap(texture(np.random.default_rng(seed)), *maps, cv2.INTER_LINEAR)
+        brightness.append((60.0 if depth == WALL_MM else 150.0) + dull * (pattern - 127.0))
+    image = np.where(inside, brightness[1], brightness[0])
+    return np.clip(image + rng.normal(0.0, 1.0, image.shape), 0, 255).astype(np.uint8)
+
+
+def cloud_of_the_card() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depths of the points, and how far beyond the card's edge they are in image 1, px."""
+    camera, rng = Pinhole((400, 300), np.array([380.0, 380.0, 199.5, 149.5])), np.random.default_rng(3)
+    pose = Rigid3(np.eye(3), np.array([-90.0, -20.0, 0.0]))
+    images = [card_before_a_wall(p, camera, rng) for p in (Rigid3.identity(), pose)]
+    seeds = match_affine_features(*images)
+    length = float(np.linalg.norm(pose.translation_mm))
+    known = KnownPose(pose, np.zeros((6, 6)))
+    sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=length, known_pose=known, image1=images[0])
+    r = grow_scene(sparse, seeds, *images, pose_is_known=True).scene.reconstruction
+    half = CARD_HALF_MM / CARD_MM * 380.0
+    outside = np.abs(r.pixels1 - np.array([199.5, 149.5])).max(axis=1) - half
+    return r.cloud.points_mm[:, 2], outside
+
+
+def test_a_wall_too_dull_for_patches_is_not_as_near_as_the_card_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth, outside = cloud_of_the_card()
+    monkeypatch.setattr(sweep_module, "MAX_OF_RIVAL", np.inf)
+    all_depths, all_outside = cloud_of_the_card()
+    near, all_near = (np.abs(z / CARD_MM - 1.0) < 0.2 for z in (depth, all_depths))
+    # Nothing but the card itself grows, and the sweep goes on from there.
+    before = (all_near & (all_outside > BESIDE_PX)).sum()
+    assert before > 500
+    assert (near & (outside > BESIDE_PX)).sum() < 0.05 * before
+    assert (outside < -BESIDE_PX).sum() > 0.95 * (all_outside < -BESIDE_PX).sum()

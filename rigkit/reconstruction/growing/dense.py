@@ -131,9 +131,14 @@ def grow_scene(
             "show surfaces with texture"
         )
     measured = measure(grown, r.camera1, r.camera2, pose)
-    grown = filled(grown, measured, view1, view2, pose)
+    grown, sweep = filled(grown, measured, view1, view2, pose)
     measured = measure(grown, r.camera1, r.camera2, pose)
     surface = fit_surface(measured, step, even.pose.amplitude_px)
+    if sweep is not None:
+        at = surface.valid
+        keep = at.copy()
+        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at])
+        surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(measured, grown, r, pose, covariance)
     if calibrations is not None:
         moves = _moved_poses(even, r, calibrations, view1.size_px, fixed=pose_is_known)

@@ -9,7 +9,7 @@ surface lose their weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -77,6 +77,10 @@ class GrownSurface:
     def valid(self) -> BoolArray:
         """Which nodes (R, C) have a plane."""
         return np.isfinite(self.plane[..., 0])
+
+    def where(self, keep: BoolArray) -> GrownSurface:
+        """Return the planes of the nodes `keep` (R, C) alone."""
+        return GrownSurface(**{field.name: _where(keep, getattr(self, field.name)) for field in fields(self)})
 
 
 def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> NodeMeasurements:

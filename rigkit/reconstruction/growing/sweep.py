@@ -10,6 +10,7 @@ equally spaced in inverse range, so that a plane rises evenly through them; noth
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from rigkit.affine.surface import linear_gauge
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.sweep import CENSUS_BITS, swept_costs, swept_surfaces
+from rigkit.kernels.sweep import CENSUS_BITS, swept_costs, swept_rivals, swept_surfaces
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrowingView, GrownPatches
 from rigkit.reconstruction.growing.surface import NodeMeasurements
@@ -48,35 +49,87 @@ SMALLEST_UNSEEN = 120
 """The same where no patch agrees, as beside many edges of depth."""
 MAX_MISFIT_LEVELS = 1.0
 """By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
+RIVAL_RADIUS = 3.0
+"""Samples: about the reach of a patch."""
+ALIKE_LEVELS = 10.0
+"""Grey levels that brightness varies by on a surface rather than from one to the next."""
+MAX_OF_RIVAL = 0.8
+"""Costs of a surface, over those of any other, that are no chance."""
 SIGMA_A = 0.3
 """Of an affinity that only says that the surface is seen at all: the sweep does not measure slants."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Sweep:
-    """Levels of inverse range (K,), samples (R, C, 2) of image 1 with their rays (NaN where there is none), and a table
-    (K, r, c, 2) of places in image 2 at every few of them."""
+class Sweep:
+    """What two images differ by at each of K levels of inverse range.
+
+    Attributes
+    ----------
+    inverse : (K,), equally spaced.
+    step_px : px between samples.
+    pixels1, rays1, samples1 : (R, C, 2), (R, C, 3), (R, C) samples of image 1 with their rays and brightness; NaN where
+        there is none.
+    costs : (R, C, K or more) bits of the census.
+    """
 
     inverse: FloatArray
+    step_px: float
     pixels1: NDArray[np.float32]
     rays1: FloatArray
-    step_px: float
-    table: NDArray[np.float32]
+    samples1: NDArray[np.float32]
+    costs: NDArray[np.uint8]
+
+    def distinct(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> BoolArray:
+        """Return which planes m . X = 1 (N, 3) explain what is seen at pixels (N, 2) clearly better than any other.
+
+        `slope` (N,) is by how many px along the epipolar line a place moves with the inverse range. True where the
+        sweep cannot tell.
+
+        Notes
+        -----
+        Beside an edge of depth a window shows both surfaces, and the edge itself, which belongs to the near one. So the
+        far one seems as near, as wide as windows reach. Samples as bright as the point are rather of its own surface
+        (K.-J. Yoon and I. S. Kweon, "Adaptive Support-Weight Approach for Correspondence Search", PAMI 2006): a plane
+        that is right costs these less than any other of the same slant does.
+        """
+        rows, columns = self.samples1.shape
+        last = np.array([columns - 2, rows - 2])
+        at = np.clip(np.rint(pixels1 / self.step_px).astype(np.int64), 0, last)[:, ::-1]
+        spacing = self.inverse[1] - self.inverse[0]
+        row, column = at.T
+        level, below, right = (
+            (np.einsum("ni,ni->n", plane, self.rays1[row + dr, column + dc]) - self.inverse[0]) / spacing
+            for dr, dc in ((0, 0), (1, 0), (0, 1))
+        )
+        # The census tells no surfaces apart that are less than a sample apart.
+        apart = np.maximum(self.step_px / (slope * spacing), 1.0)
+        surfaces = np.stack([level, below - level, right - level, apart], axis=1)
+        own, other = swept_rivals(
+            self.costs, len(self.inverse), self.samples1, at, surfaces, radius=RIVAL_RADIUS, alike=ALIKE_LEVELS
+        ).T
+        return ~(own > MAX_OF_RIVAL * other)
+
+
+class FilledPairs(NamedTuple):
+    """Pairs with those of a sweep, and the sweep; None where it was not believed."""
+
+    grown: GrownPatches
+    sweep: Sweep | None
 
 
 def filled(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
-) -> GrownPatches:
+) -> FilledPairs:
     """Return the pairs with those of a sweep at nodes where none grew; as they were where the sweep disagrees.
 
     The sigma of the sweep's ranges is what they are off by where both say something.
     """
     if not np.isfinite(measured.z).any():
-        return grown
-    sweep = _prepared(grown, measured, view1, view2, cam2_from_cam1)
-    samples1 = _at(_smooth(view1, sweep.step_px), sweep.pixels1)
-    costs = swept_costs(_smooth(view2, sweep.step_px), samples1, sweep.table, TABLE_SPACING)
-    best, around = swept_surfaces(costs, len(sweep.inverse), samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS)
+        return FilledPairs(grown, None)
+    sweep = _swept(grown, measured, view1, view2, cam2_from_cam1)
+    best, around = swept_surfaces(
+        sweep.costs, len(sweep.inverse), sweep.samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
+    )
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
     good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
     spacing = sweep.inverse[1] - sweep.inverse[0]
@@ -86,14 +139,14 @@ def filled(
     off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
     misfit = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
     if not misfit < MAX_MISFIT_LEVELS:
-        return grown
+        return FilledPairs(grown, None)
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    return _with(grown, inverse, misfit * spacing, view1, view2, cam2_from_cam1)
+    return FilledPairs(_with(grown, inverse, misfit * spacing, view1, view2, cam2_from_cam1), sweep)
 
 
-def _prepared(
+def _swept(
     grown: GrownPatches, measured: NodeMeasurements, view1: GrowingView, view2: GrowingView, cam2_from_cam1: Rigid3
-) -> _Sweep:
+) -> Sweep:
     inverse = measured.z[..., 0]
     low, high = np.nanquantile(inverse, [0.001, 0.999])
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
@@ -111,12 +164,15 @@ def _prepared(
     table = np.where((valid & seen)[..., None], places, np.nan).astype(np.float32)
     fine = np.stack(np.meshgrid(*(step * np.arange(n) for n in reversed(shape))), axis=-1)
     rays1, seen1 = view1.camera.unproject(fine)
-    return _Sweep(
+    pixels1 = fine.astype(np.float32)
+    samples1 = _at(_smooth(view1, step), pixels1)
+    return Sweep(
         inverse=levels,
-        pixels1=fine.astype(np.float32),
-        rays1=np.where(seen1[..., None], rays1, np.nan),
         step_px=step,
-        table=table,
+        pixels1=pixels1,
+        rays1=np.where(seen1[..., None], rays1, np.nan),
+        samples1=samples1,
+        costs=swept_costs(_smooth(view2, step), samples1, table, TABLE_SPACING),
     )
 
 
@@ -146,7 +202,7 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
 
 
 def _winners(
-    best: NDArray[np.int32], around: NDArray[np.int32], sweep: _Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
+    best: NDArray[np.int32], around: NDArray[np.int32], sweep: Sweep, view2: GrowingView, cam2_from_cam1: Rigid3
 ) -> tuple[FloatArray, BoolArray]:
     """Return the levels (R, C), between the `best` by a parabola, and where image 2 sees that surface."""
     count = len(sweep.inverse)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 REACH = 2
+RIVAL_REACH = 5
 BITS = (2 * REACH + 1) ** 2 - 1
 
 
@@ -68,3 +69,29 @@ def total_costs(costs: np.ndarray, samples1: np.ndarray, *, bend: int, jump: int
                     before, last = there[line] + best, line
                     here[line] += before
     return total
+
+
+def rivals(
+    costs: np.ndarray, samples1: np.ndarray, samples: np.ndarray, surfaces: np.ndarray, *, radius: float, alike: float
+) -> np.ndarray:
+    """Return what each surface costs a sample, at most a level off, and the cheapest other one, (N, 2)."""
+    rows, columns, levels = costs.shape
+    out = np.full((len(samples), 2), np.nan)
+    number = np.arange(levels)
+    for n, ((row, column), (level, by_row, by_column, apart)) in enumerate(zip(samples, surfaces, strict=True)):
+        total, weights = np.zeros(levels), 0.0
+        for j in range(-RIVAL_REACH, RIVAL_REACH + 1):
+            for i in range(-RIVAL_REACH, RIVAL_REACH + 1):
+                if not (0 <= row + j < rows and 0 <= column + i < columns):
+                    continue
+                unlike = abs(float(samples1[row + j, column + i]) - float(samples1[row, column])) / alike
+                weight = np.exp(-unlike - 0.5 * (i * i + j * j) / radius**2)
+                if not np.isfinite(weight):
+                    continue
+                shift = int(np.floor(by_row * j + by_column * i + 0.5))
+                total += weight * costs[row + j, column + i, np.clip(number + shift, 0, levels - 1)]
+                weights += weight
+        own, other = np.abs(number - level) <= 1.0, np.abs(number - level) > apart
+        if own.any() and other.any() and weights > 0.0:
+            out[n] = total[own].min() / weights, total[other].min() / weights
+    return out
