@@ -25,6 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "source", nargs="?", type=Path, metavar="CALIBRATION|SESSION.toml", help="what there is so far; or give --lens"
     )
     parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
+    parser.add_argument(
+        "--check", action="store_true", help="pictures to check it with: those that would tell changes of the lens"
+    )
     parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")
     parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
@@ -45,16 +48,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json
-    from rigkit.report.plan_page import plan_facts, plan_to_dict, plan_words
+    from rigkit.report.plan_page import plan_facts, plan_lead, plan_to_dict, plan_words
+    from rigkit.report.tables import tables_to_text
 
     done = _planned(args)
     plan = done.plan
     if args.json:
-        print_json(plan_to_dict(plan) | {"page": plan_facts(plan).to_dict()})
+        print_json(plan_to_dict(plan) | {"page": plan_facts(plan, done.found).to_dict()})
     else:
-        print(f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} then")
+        print(plan_lead(plan, "then"))
         print("\n".join(f"  {line}" for line in plan_words(plan)))
-        if args.lens is None:
+        if done.found:
+            print(tables_to_text(done.found))
+        elif args.lens is None:
             more = "1 more picture" if len(plan.views) == 1 else f"{len(plan.views)} more pictures"
             print(f"{more} would bring {100.0 * plan.gain:.0f} %")
     for path in done.written:
@@ -70,6 +76,8 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
 
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
+    if args.check and (args.lens is not None or args.length is not None):
+        raise InputError("plan: --check is about the lens of a calibration; leave --lens and --length away")
     if args.lens is None:
         told = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
         if told:
@@ -107,6 +115,7 @@ def _options(args: argparse.Namespace, count: int) -> PlanOptions:
         length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
     return PlanOptions(
         count=args.views or count,
+        check=args.check,
         length=length,
         reach=Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field),
         report=args.report,

@@ -4,6 +4,7 @@ trace(W C), with C their covariance."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -14,6 +15,20 @@ from rigkit.core.arrays import FloatArray, Pixels, Rays
 
 GOAL_GRID = (24, 18)
 """Columns and rows of the pixels that the goal averages over."""
+
+
+class Aim(Protocol):
+    """What views are chosen for: a number in `unit`, which `what` says in words, that is to become small."""
+
+    @property
+    def unit(self) -> str: ...
+
+    @property
+    def what(self) -> str: ...
+
+    def error(self, covariance: FloatArray) -> FloatArray:
+        """Return what covariances (..., T, T) of all that is known leave, (...,)."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -12,11 +12,12 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.goal import Goal
+from rigkit.planning.goal import Aim
 from rigkit.planning.information import Knowledge
 
 NEARLY = 0.03
-"""Of views whose gain is within this part of the best one's, the one nearest to the last pose is taken."""
+"""Of views whose gain and whose error are within this part of the best one's, the one nearest to the last pose is
+taken."""
 
 MAX_EXCHANGES = 50
 WORTH = 1e-3
@@ -37,7 +38,7 @@ class Plan:
     """Views to take, in this order, what the goal's error is before them, and what is known of the camera."""
 
     knowledge: Knowledge
-    goal: Goal
+    goal: Aim
     error: float
     views: tuple[Proposal, ...]
 
@@ -64,10 +65,11 @@ def covariance_of(information: FloatArray) -> FloatArray:
 def choose_views(
     information: FloatArray,
     views: FloatArray,
-    goal: Goal,
+    goal: Aim,
     count: int,
     *,
     effort: Callable[[int], FloatArray] | None = None,
+    nearly: float = NEARLY,
 ) -> tuple[list[int], list[float]]:
     """Return which `count` of C views to take, in order, and the error of the goal after each.
 
@@ -77,6 +79,7 @@ def choose_views(
     views : (C, P, P) what each view adds; each is taken once.
     effort : returns how far all views (C,) are from view j, or (-1) from the last one taken before: of views nearly as
         good the nearest is taken. None: the best is.
+    nearly : so good are those whose gain and whose error are within this part of the best one's.
     """
     left, taken, errors = np.arange(len(views)), [], []
     last = -1
@@ -86,7 +89,8 @@ def choose_views(
         if effort is None:
             pick = int(np.argmin(after))
         else:
-            good = np.flatnonzero(before - after >= (1.0 - NEARLY) * (before - after.min()))
+            best = float(after.min())
+            good = np.flatnonzero(after <= best + nearly * min(before - best, best))
             if not good.size:
                 raise DegenerateError(
                     "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
@@ -101,7 +105,7 @@ def choose_views(
     return taken, errors
 
 
-def exchanged_views(information: FloatArray, views: FloatArray, goal: Goal, taken: Sequence[int]) -> list[int]:
+def exchanged_views(information: FloatArray, views: FloatArray, goal: Aim, taken: Sequence[int]) -> list[int]:
     """Return as many views as `taken`, better ones of C: one after the other is put back where another helps more,
     until none does.
 
@@ -126,14 +130,15 @@ def exchanged_views(information: FloatArray, views: FloatArray, goal: Goal, take
 def plan_views(
     knowledge: Knowledge,
     boards: Sequence[Board],
-    goal: Goal,
+    goal: Aim,
     count: int,
     *,
     reach: Reach | None = None,
     last: Rigid3 | None = None,
+    nearly: float = NEARLY,
 ) -> Plan:
     """Return the next `count` views to take of `boards`, one board a view, the first near the pose `last` where several
-    are as good.
+    are (`nearly`, see `choose_views`) as good.
 
     Raises
     ------
@@ -154,7 +159,7 @@ def plan_views(
         rows = (rotation[view], middle[view]) if view >= 0 else (start.rotation, start.translation_mm)
         return _effort(rotation, middle, *rows)
 
-    taken, errors = choose_views(knowledge.information, views, goal, count, effort=effort)
+    taken, errors = choose_views(knowledge.information, views, goal, count, effort=effort, nearly=nearly)
     owner = np.repeat(np.arange(len(boards)), [len(h) for h in held])
     translation = np.concatenate([h.translation_mm for h in held])
     proposals = [

@@ -63,7 +63,10 @@ def check_words(check: SentinelCheck) -> CheckWords:
             "are left."
         )
     if check.holds and check.powers:
-        sentences.append(_could_have_found(min(check.powers, key=lambda power: power.chance)))
+        worst = min(check.powers, key=lambda power: power.chance)
+        sentences.append(_could_have_found(worst))
+        if worst.chance < FOUND and len(check.watched.cameras) == 1:
+            sentences.append("Which pictures would tell most: rigkit plan CALIBRATION --check")
     if change is not None and not check.holds and check.cost_unit != "px":
         sentences.append(f"In the length it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
     return CheckWords(headline, tuple(sentences))
@@ -93,8 +96,8 @@ def _frames_needed(power: Power) -> str:
     return f"{many} times as many, in the calibration too"
 
 
-def power_table(check: SentinelCheck) -> Table:
-    """Return how well changes would have been seen."""
+def power_table(powers: Sequence[Power], title: str = "What these pictures would have found") -> Table:
+    """Return how well changes are seen."""
     columns = (
         Column("change"),
         Column("of"),
@@ -110,10 +113,10 @@ def power_table(check: SentinelCheck) -> Table:
             Cell(f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen"),
             Cell(_frames_needed(power)),
         )
-        for power in check.powers
+        for power in powers
     )
     none = (Cell("none can be told from these pictures"), Cell(""), Cell(None), Cell(""), Cell(""))
-    return Table("powers", "What these pictures would have found", columns, rows or (none,))
+    return Table("powers", title, columns, rows or (none,))
 
 
 def check_table(check: SentinelCheck) -> Table:
@@ -146,7 +149,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         badge="holds" if check.holds else "does not hold",
         passed=check.holds,
         sentences=words.sentences,
-        tables=(check_table(check), power_table(check)),
+        tables=(check_table(check), power_table(check.powers)),
     )
 
 

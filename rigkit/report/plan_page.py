@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -43,7 +43,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     return {
         "goal": plan.goal.what,
         "unit": plan.goal.unit,
-        "error_now": plan.error,
+        "error_now": plan.error if np.isfinite(plan.error) else None,
         "views": [
             {
                 "board": view.board.board_id,
@@ -64,11 +64,13 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
 
 def plan_table(plan: Plan) -> Table:
     """Return the error of the goal after each view."""
-    columns = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than now by", "%", 0))
+    columns = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than before by", "%", 0))
     errors = [plan.error, *(view.error for view in plan.views)]
+    # Before the first picture nothing is told of a change: its share is taken from the first error there is.
+    first = next((k for k, error in enumerate(errors) if np.isfinite(error)), len(errors))
     rows = tuple(
-        (Cell(str(k)), Cell(float(f"{error:.4g}")), Cell(100.0 * (1.0 - error / plan.error)))
-        for k, error in enumerate(errors)
+        (Cell(str(k)), Cell(float(f"{errors[k]:.4g}")), Cell(100.0 * (1.0 - errors[k] / errors[first])))
+        for k in range(first, len(errors))
     )
     return Table("plan", "What the views bring", columns, rows)
 
@@ -126,16 +128,32 @@ def _path(pixels: Pixels) -> str:
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in seen)
 
 
-def plan_facts(plan: Plan) -> PageFacts:
-    """Return what the page of a plan says."""
-    lead = f"{plan.goal.what}: {plan.error:.3g} {plan.goal.unit} now, {plan.views[-1].error:.3g} after these pictures."
-    headline = lead[0].upper() + lead[1:]
-    return PageFacts(headline=headline, sentences=tuple(plan_words(plan)), tables=(plan_table(plan),))
+def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:
+    """Return what the page of a plan says, with tables of what else the pictures bring."""
+    headline = f"{plan_lead(plan, 'after these pictures')}."
+    return PageFacts(
+        headline=headline[0].upper() + headline[1:],
+        sentences=tuple(plan_words(plan)),
+        tables=(*found, plan_table(plan)),
+    )
 
 
-def plan_page(plan: Plan, title: str, provenance: Mapping[str, str], taken: Pixels | None = None) -> str:
+def plan_lead(plan: Plan, then: str) -> str:
+    """Return the error of the goal as it is now, if there is any, and as it will be `then`."""
+    now = f"{plan.error:.3g} {plan.goal.unit} now, " if np.isfinite(plan.error) else ""
+    unit = "" if now else f" {plan.goal.unit}"
+    return f"{plan.goal.what}: {now}{plan.views[-1].error:.3g}{unit} {then}"
+
+
+def plan_page(
+    plan: Plan,
+    title: str,
+    provenance: Mapping[str, str],
+    taken: Pixels | None = None,
+    found: Sequence[Table] = (),
+) -> str:
     """Return the plan as an HTML page that needs no other file."""
-    facts = plan_facts(plan)
+    facts = plan_facts(plan, found)
     return render(
         "plan.html",
         title=title,

@@ -11,6 +11,7 @@ from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
+from rigkit.core.tables import Table
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import about
@@ -21,8 +22,11 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
+from rigkit.report.check_page import power_table
 from rigkit.report.plan_page import plan_page
 from rigkit.validation.certificate.contracts import Task
+from rigkit.validation.sentinel.telling import views_that_tell
+from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
@@ -40,6 +44,8 @@ class PlanOptions:
 
     count: int = NEXT_VIEWS
     """Views to propose."""
+    check: bool = False
+    """What counts is that `rigkit check` finds what changed with these pictures, not that they improve anything."""
     length: Task | None = None
     """A length at a distance that is to be measured well; None: the projection over the image."""
     reach: Reach = field(default_factory=Reach)
@@ -66,9 +72,11 @@ class LensOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PlannedSession:
-    """The plan, the corners (N, 2) taken so far, and the files that were written."""
+    """The plan, tables of what its pictures would find, the corners (N, 2) taken so far, and the files that were
+    written."""
 
     plan: Plan
+    found: tuple[Table, ...]
     taken: Pixels
     written: tuple[Path, ...]
 
@@ -106,11 +114,18 @@ def plan_session(
         calibration = load_calibration(source)
         with about(source):
             boards = tuple(shape.board for shape in calibration.boards)
+    found: tuple[Table, ...] = ()
     with about(source):
-        plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
+        if options.check:
+            watched = watched_camera(calibration, source.stem)
+            plan, powers = views_that_tell(watched, boards, options.count, options.reach)
+            found = (power_table(powers, "What these pictures would find"),)
+        else:
+            plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
-    title = f"Next pictures for {source.name}"
-    return PlannedSession(plan=plan, taken=taken, written=_written(plan, options, title, source, inputs, taken))
+    title = f"Pictures to check {source.name} with" if options.check else f"Next pictures for {source.name}"
+    written = _written(plan, options, title, source, inputs, taken, found)
+    return PlannedSession(plan=plan, found=found, taken=taken, written=written)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
@@ -124,15 +139,22 @@ def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
         knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
     )
     title = f"{options.count} pictures for a lens of {lens.hfov_deg:g} degrees"
-    return PlannedSession(plan=plan, taken=np.zeros((0, 2)), written=_written(plan, options, title, None, [], None))
+    written = _written(plan, options, title, None, [], None)
+    return PlannedSession(plan=plan, found=(), taken=np.zeros((0, 2)), written=written)
 
 
 def _written(
-    plan: Plan, options: PlanOptions, title: str, source: Path | None, inputs: list[Path], taken: Pixels | None
+    plan: Plan,
+    options: PlanOptions,
+    title: str,
+    source: Path | None,
+    inputs: list[Path],
+    taken: Pixels | None,
+    found: tuple[Table, ...] = (),
 ) -> tuple[Path, ...]:
     if options.report is None:
         return ()
     ensure_writable([options.report], force=options.force, inputs=inputs)
     facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
-    write_atomic(options.report, plan_page(plan, title, facts, taken), force=options.force)
+    write_atomic(options.report, plan_page(plan, title, facts, taken, found), force=options.force)
     return (options.report,)

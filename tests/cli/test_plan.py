@@ -44,6 +44,18 @@ def test_a_length_is_planned_for_in_mm(calibrated: Path, capsys: pytest.CaptureF
     assert "1 more picture would bring" in out
 
 
+def test_pictures_to_check_with(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "check.html"
+    assert main(["plan", str(calibrated), "--check", "-r", str(page)]) == 0
+    out = capsys.readouterr().out
+    assert "standard error of a change of focus" in out and " now" not in out and "would bring" not in out
+    assert "What these pictures would find" in out and "principal point" in out
+    assert "What these pictures would find" in page.read_text() and "inf" not in out
+    assert main(["plan", str(calibrated), "--check", "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    assert data["error_now"] is None and len(data["views"]) == 3
+
+
 def test_what_a_lens_will_reach(capsys: pytest.CaptureFixture[str]) -> None:
     errors = {}
     for views in (4, 12):
@@ -61,6 +73,7 @@ def test_what_a_lens_will_reach(capsys: pytest.CaptureFixture[str]) -> None:
         (["plan", "--lens", "90", "--size", "12", "--board", "9x6x30"], "such as 1280x960"),
         (["plan", "--lens", "0", "--size", "640x480", "--board", "9x6x30"], "0.5 to 300"),
         (["plan", "x.json", "--board", "9x6x30"], "goes with --lens"),
+        (["plan", "x.json", "--check", "--length", "300", "--distance", "900"], "leave --lens and --length away"),
         (["plan", "--lens", "90", "--size", "640x480", "--board", "9x6x30", "--length", "3"], "belong together"),
     ],
 )

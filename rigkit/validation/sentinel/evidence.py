@@ -58,6 +58,12 @@ class Watched:
     freedom: float = float("inf")
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
 
+    @property
+    def fresh_sigma_px(self) -> float:
+        """What corners of fresh views count with: images disagree more than independent corners would. Images that
+        agree better would do so by chance."""
+        return max(self.sigma_px, MIN_SIGMA_PX) * max(self.overdispersion, 1.0)
+
     def lens(self, c: int) -> slice:
         """Return where the intrinsics of camera `c` stand in theta."""
         first = sum(camera.parameters.size for camera in self.cameras[:c])
@@ -134,8 +140,7 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
         found = found.moved(np.asarray(step, dtype=np.float64))
     information, score = reduced_by_cluster(found.products(watched), watched.size, found.frame)
     squares, count, left_out = found.residual_squares(watched)
-    # Images that agree better than independent corners would do so by chance.
-    sigma = max(watched.sigma_px, MIN_SIGMA_PX) * max(watched.overdispersion, 1.0)
+    sigma = watched.fresh_sigma_px
     return FreshEvidence(
         information=information,
         score=score,

@@ -21,6 +21,7 @@ from rigkit.validation.sentinel.causes import Cause, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
+LENS_KINDS = ("focus", "principal point", "distortion")
 CHANGED_PX, TURNED_DEG = 0.15, 0.02
 """Changes of which the chance is told: of a lens, rms over the image after the best rotation; of a mount."""
 FOUND = 0.9
@@ -73,7 +74,7 @@ def powers_of(
     goals = dict(zip(watched.names, lens_goals(watched), strict=True))
     out = []
     for cause in causes:
-        if cause.kind in ("focus", "principal point", "distortion"):
+        if cause.kind in LENS_KINDS:
             weight = goals[cause.camera or watched.names[0]].weight
             metric, size, unit = cause.directions.T @ weight @ cause.directions, CHANGED_PX, "px"
         elif cause.kind == "rotation":
