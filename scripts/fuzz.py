@@ -111,6 +111,12 @@ def fault_of(words: Sequence[str], names_file: str | None, sound: bool) -> str |
     return fault_of_message(" | ".join(lines), names_file, words) if code in (2, 3) else None
 
 
+def fault_of_case(kind: Kind, number: int, words: Sequence[str]) -> str | None:
+    """Run the case of `case_of` in the present folder; return what is wrong with how it ended."""
+    case = next((word for word in words if word.startswith("case.")), None) if kind.names_file else None
+    return fault_of(words, case, sound=number < len(kind.readers) and not kind.judged)
+
+
 def _command(label: str, words: Sequence[str], place: Path) -> str:
     """Return the shell line that shows a case again."""
     scripts = Path(__file__).resolve().parent
@@ -148,10 +154,9 @@ def run_cases(label: str, args: argparse.Namespace, start: int, seeds: Path, log
             words = case_of(kind, label, args.seed, number, seeds, place)
             notes.write(json.dumps({"number": number, "words": words, "mb": _most_mb()}) + "\n")
             os.chdir(place if place.is_dir() else args.keep)
-            case = next((w for w in words if w.startswith("case.")), None) if kind.names_file else None
             signal.setitimer(signal.ITIMER_PROF, args.seconds)
             try:
-                fault = fault_of(words, case, sound=number < len(kind.readers) and not kind.judged)
+                fault = fault_of_case(kind, number, words)
             except TooLong:
                 fault = "takes too long"
             signal.setitimer(signal.ITIMER_PROF, 0.0)
