@@ -136,8 +136,8 @@ def card_before_a_wall(pose: Rigid3, camera: Pinhole, rng: np.random.Generator) 
     for depth, dull, seed in ((WALL_MM, 0.15, 1), (CARD_MM, 0.6, 2)):
         at = origin[:2] + directions[..., :2] * ((depth - origin[2]) / directions[..., 2])[..., None]
         inside = (np.abs(at) < CARD_HALF_MM).all(axis=-1)
-        maps = (np.ascontiguousarray(at[..., k] + 1024.0, np.float32) for k in (0, 1))
-        pattern = cv2.remap(texture(np.random.default_rng(seed)), *maps, cv2.INTER_LINEAR)
+        x, y = (np.ascontiguousarray(at[..., k] + 1024.0, np.float32) for k in (0, 1))
+        pattern = cv2.remap(texture(np.random.default_rng(seed)), x, y, cv2.INTER_LINEAR)
         brightness.append((60.0 if depth == WALL_MM else 150.0) + dull * (pattern - 127.0))
     image = np.where(inside, brightness[1], brightness[0])
     return np.clip(image + rng.normal(0.0, 1.0, image.shape), 0, 255).astype(np.uint8)
@@ -160,7 +160,8 @@ def cloud_of_the_card() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def test_a_wall_too_dull_for_patches_is_not_as_near_as_the_card_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     depth, outside = cloud_of_the_card()
-    monkeypatch.setattr(sweep_module, "MAX_OF_RIVAL", np.inf)
+    for limit in ("MAX_OF_RIVAL", "MAX_OF_RIVAL_AT_END"):
+        monkeypatch.setattr(sweep_module, limit, np.inf)
     all_depths, all_outside = cloud_of_the_card()
     near, all_near = (np.abs(z / CARD_MM - 1.0) < 0.2 for z in (depth, all_depths))
     # Nothing but the card itself grows, and the sweep goes on from there.

@@ -137,7 +137,7 @@ def grow_scene(
     if sweep is not None:
         at = surface.valid
         keep = at.copy()
-        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at])
+        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.at_end[at])
         surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(measured, grown, r, pose, covariance)
     if calibrations is not None:

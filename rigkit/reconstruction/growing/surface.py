@@ -9,8 +9,9 @@ surface lose their weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
+import cv2
 import numpy as np
 
 from rigkit.affine.surface import linear_gauge
@@ -31,6 +32,10 @@ TURN_OF_LOSS = 2.385
 """In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
 MIN_SUPPORT = 0.2
 """Share of the nodes around, in sum of weights, that a plane needs: fewer agree by chance, or across an edge."""
+MAX_STEP_PX = 1.0
+"""By which planes differ from node to node on one surface."""
+MIN_COMPARED = 50
+"""Nodes whose median says how well nodes agree with their planes."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -64,6 +69,7 @@ class GrownSurface:
     plane : (R, C, 3) m of the plane m . X = 1; covariance : (R, C, 3, 3) of m.
     support : (R, C) neighbours that agree, in sum of weights.
     misfit : (R, C) how far the node's own range is from the plane, px along the epipolar line.
+    at_end : (R, C) bool, no further than a patch reaches from where the surface ends.
     """
 
     points: Points
@@ -72,6 +78,7 @@ class GrownSurface:
     covariance: FloatArray
     support: FloatArray
     misfit: FloatArray
+    at_end: BoolArray
 
     @property
     def valid(self) -> BoolArray:
@@ -80,7 +87,8 @@ class GrownSurface:
 
     def where(self, keep: BoolArray) -> GrownSurface:
         """Return the planes of the nodes `keep` (R, C) alone."""
-        return GrownSurface(**{field.name: _where(keep, getattr(self, field.name)) for field in fields(self)})
+        names = [field.name for field in fields(self) if field.name != "at_end"]
+        return replace(self, **{name: _where(keep, getattr(self, name)) for name in names})
 
 
 def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> NodeMeasurements:
@@ -133,7 +141,8 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     """Return the planes around all nodes, which are `step` px apart.
 
     Their covariance is scaled by what planes disagree by that share no node: neighbouring patches share their pixels,
-    and surfaces are not flat. Those of a sweep are scaled apart: its errors are alike further around. `shared_px` is
+    and surfaces are not flat. Those of a sweep are scaled apart: its errors are alike further around. Where a surface
+    ends windows see another one too, and nodes miss their planes by more: so much more their errors are. `shared_px` is
     what all places around err by together along their epipolar lines.
 
     Notes
@@ -162,9 +171,14 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         misfit = (measured.z[..., 0] - inverse) * measured.slope
     spread = np.full(normal.shape, np.nan)
     spread[keep] = _inverse(normal[keep])
+    at_end = _at_ends(_where(keep, plane), measured, step)
+    missed = np.abs(misfit) / (measured.slope * np.sqrt(measured.covariance[..., 0, 0]))
     for alike in (keep & measured.swept, keep & ~measured.swept):
         scale = _disagreement(_where(alike, normals), _where(alike, plane), _where(alike, spread), 2 * reach)
         spread[alike] *= max(scale, 1.0) ** 2
+        ends, inner = missed[alike & at_end], missed[alike & ~at_end]
+        if min(ends.size, inner.size) >= MIN_COMPARED:
+            spread[alike & at_end] *= max(float(np.median(ends) / np.median(inner)), 1.0) ** 2
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
         points=_where(keep, points),
@@ -173,7 +187,24 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         covariance=spread,
         support=_where(keep, support),
         misfit=_where(keep, misfit),
+        at_end=at_end,
     )
+
+
+def _at_ends(plane: FloatArray, measured: NodeMeasurements, step: int) -> BoolArray:
+    """Return which nodes (R, C), `step` px apart, are no further than a patch reaches from where their surface ends.
+
+    It ends where `plane` (R, C, 3) is not known, and where that of the next node is elsewhere.
+    """
+    ray, slope = measured.frame[..., 0, :], measured.slope
+    end = ~np.isfinite(plane[..., 0])
+    with np.errstate(invalid="ignore"):
+        for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+            apart = np.abs(np.sum((plane[other] - plane[one]) * ray[one], axis=-1)) * slope[one] > MAX_STEP_PX
+            end[one] |= apart
+            end[other] |= apart
+    far = cv2.distanceTransform((~end).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(far * step <= HALF_WIDTH + step)
 
 
 def _disagreement(normals: Normals, plane: FloatArray, covariance: FloatArray, lag: int) -> float:

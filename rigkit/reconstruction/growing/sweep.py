@@ -49,12 +49,14 @@ SMALLEST_UNSEEN = 120
 """The same where no patch agrees, as beside many edges of depth."""
 MAX_MISFIT_LEVELS = 1.0
 """By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
-RIVAL_RADIUS = 3.0
-"""Samples: about the reach of a patch."""
+RIVAL_RADIUS = 5.0
+"""Samples: the reach of a patch."""
 ALIKE_LEVELS = 10.0
 """Grey levels that brightness varies by on a surface rather than from one to the next."""
-MAX_OF_RIVAL = 0.8
-"""Costs of a surface, over those of any other, that are no chance."""
+MAX_OF_RIVAL = 1.0
+"""Costs of a surface, over those of any other."""
+MAX_OF_RIVAL_AT_END = 0.85
+"""The same where the surface ends, as windows reach over the end of the one that is."""
 SIGMA_A = 0.3
 """Of an affinity that only says that the surface is seen at all: the sweep does not measure slants."""
 
@@ -79,11 +81,11 @@ class Sweep:
     samples1: NDArray[np.float32]
     costs: NDArray[np.uint8]
 
-    def distinct(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> BoolArray:
-        """Return which planes m . X = 1 (N, 3) explain what is seen at pixels (N, 2) clearly better than any other.
+    def distinct(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray, at_end: BoolArray) -> BoolArray:
+        """Return which planes m . X = 1 (N, 3) explain what is seen at pixels (N, 2) better than any other does.
 
-        `slope` (N,) is by how many px along the epipolar line a place moves with the inverse range. True where the
-        sweep cannot tell.
+        `slope` (N,) is by how many px along the epipolar line a place moves with the inverse range. Those `at_end` (N,)
+        of their surface must be clearly better. True where the sweep cannot tell.
 
         Notes
         -----
@@ -107,7 +109,7 @@ class Sweep:
         own, other = swept_rivals(
             self.costs, len(self.inverse), self.samples1, at, surfaces, radius=RIVAL_RADIUS, alike=ALIKE_LEVELS
         ).T
-        return ~(own > MAX_OF_RIVAL * other)
+        return np.asarray(~(own > np.where(at_end, MAX_OF_RIVAL_AT_END, MAX_OF_RIVAL) * other))
 
 
 class FilledPairs(NamedTuple):
