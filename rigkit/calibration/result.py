@@ -255,7 +255,7 @@ class Calibration:
         deviations. The covariances count it in: they rest on what repeats from image to image.
     freedom : degrees of freedom of the covariances; infinite where there are too few images to know.
     views : the views used, in the order given.
-    dropped : (image, reason) of what was not used.
+    dropped : (image, reason) of what was not used; of images with views only something in them.
     outliers : corners left out of views that were used.
     candidates : models, degrees and board shapes tried.
     convergence : of the final solve.
@@ -302,7 +302,7 @@ class Calibration:
             f"Calibration of a {self.camera.model} camera, {width}x{height} px: held-out RMS {held}, training RMS "
             f"{self.rms_px:.4f} px",
             f"  {self.corner_count} corners in {len(self.views)} views of {images} images; {len(self.outliers)} "
-            f"corners and {len(self.dropped)} images left out",
+            f"corners and {self.images_left_out} images left out",
             *(f"  {finding}" for finding in self.verdicts[:1]),
         ]
         return "\n".join(lines)
@@ -311,6 +311,11 @@ class Calibration:
     def parameter_sigmas(self) -> FloatArray:
         """Standard deviations of `camera.parameters`, (P,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def images_left_out(self) -> int:
+        """Number of images of which nothing is used."""
+        return len({image for image, _ in self.dropped} - {view.image for view in self.views})
 
     @property
     def corner_count(self) -> int:

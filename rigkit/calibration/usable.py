@@ -24,6 +24,10 @@ MIN_SHARE_LARGER = 0.25
 """Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
 MAX_SHARE_REACHING = 0.1
 """Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
+MAX_SHARE_COPIES = 0.25
+"""Images that show more whole boards than are listed, as a part of those with any: from here on there are copies."""
+BESIDE = "grids beside the whole board, which may be parts of another or something else"
+"""Why a grid in an image that is used gives no view."""
 MIN_SPREAD = 1e-6
 """Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
 board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
@@ -108,6 +112,29 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
         return words if 2 * count > sum(len(own) for own in found) else None
     larger = any(max(board.size) <= size[0] and min(board.size) <= size[1] for board in boards)
     return words if larger and count >= MIN_SHARE_LARGER * len(found) else None
+
+
+def without_lookalikes(
+    detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board]
+) -> dict[str, tuple[BoardDetection, ...]]:
+    """Return the detections of a session's images (name -> detections) without what only may be part of a board where
+    every board of the session stands whole beside it.
+
+    A tiled floor or a patterned box lies in any room, and its squares need not be square. Where images often show more
+    whole boards than are listed, there are copies of them, and their parts are welcome.
+    """
+    listed = {frozenset(board.size) for board in boards}
+    whole = {name: [frozenset((d.columns, d.rows)) in listed for d in own] for name, own in detections.items()}
+    counts = [sum(own) for own in whole.values() if any(own)]
+    copies = sum(count > len(boards) for count in counts) > MAX_SHARE_COPIES * len(counts)
+    return {
+        name: tuple(
+            d
+            for d, is_whole in zip(own, whole[name], strict=True)
+            if copies or is_whole or d.board_id is not None or sum(whole[name]) < len(boards)
+        )
+        for name, own in detections.items()
+    }
 
 
 def _reach(found: BoardDetection) -> tuple[int, int]:

@@ -15,8 +15,9 @@ import numpy as np
 from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.repeats import cluster_numbers
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.usable import BESIDE
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
@@ -85,7 +86,7 @@ def judge(
     ]
     found = [
         *(finding for finding in also if finding.severity is not Severity.BAD),
-        *_left_out(calibration.dropped),
+        *_left_out(calibration.dropped, calibration.views),
         *_coverage(calibration),
         *_views(calibration),
         *_pattern(calibration, correlation, in_force),
@@ -102,7 +103,8 @@ def judge_session(
     calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[Finding] = ()
 ) -> tuple[Finding, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
-    return (*calibration.verdicts[:1], *_left_out(dropped), *calibration.verdicts[1:], *also)
+    found = _left_out(dropped, calibration.views)
+    return (*calibration.verdicts[:1], *found, *calibration.verdicts[1:], *also)
 
 
 def with_headline(
@@ -143,8 +145,16 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
     ]
 
 
-def _left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
-    """Name the images left out, or how many for each reason."""
+def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
+    """Name the images left out, or how many for each reason. What lies beside a board in an image that is used is no
+    cause to look."""
+    used = {view.image for view in views}
+    parts = [(image, reason) for image, reason in dropped if image in used and reason != BESIDE]
+    found = [_look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts]
+    return [*_images_left_out([(image, reason) for image, reason in dropped if image not in used]), *found[:NAMED]]
+
+
+def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     if len(dropped) <= NAMED:
         return [_look(f"image '{image}' is left out: {reason}", image=image) for image, reason in dropped]
     reasons = Counter(reason for _, reason in dropped)

@@ -55,15 +55,29 @@ def describe(calibration: Calibration) -> str:
     lines = [
         f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
         f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
-        f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {len(calibration.dropped)} images "
+        f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {calibration.images_left_out} images "
         "dropped",
     ]
     sigmas = calibration.parameter_sigmas
     for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
         lines.append(f"  {name:>4} = {rounded_words(float(value), float(sigma))}")
-    lines += [f"dropped {image}: {reason}" for image, reason in calibration.dropped]
+    lines += left_out(calibration)
     lines += _choices(calibration.candidates)
     return "\n".join([*lines, *map(str, gravest_first(calibration.verdicts))])
+
+
+def left_out(calibration: Calibration) -> list[str]:
+    """Return a line for each image left out, and one for each reason why something in an image that is used is."""
+    used = {view.image for view in calibration.views}
+    lines = [f"dropped {image}: {reason}" for image, reason in calibration.dropped if image not in used]
+    parts: dict[str, list[str]] = {}
+    for image, reason in calibration.dropped:
+        if image in used:
+            parts.setdefault(reason, []).append(image)
+    for reason, images in parts.items():
+        more = f" and {len(images) - 1} more" if len(images) > 1 else ""
+        lines.append(f"left out of {images[0]}{more}: {reason}")
+    return lines
 
 
 def _choices(candidates: Sequence[Candidate]) -> list[str]:

@@ -114,6 +114,6 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
         )
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
-        lines += [f"{camera.name}: dropped {image}: {reason}" for image, reason in alone.dropped]
+        lines += [f"{camera.name}: {line}" for line in calibration_words.left_out(alone)]
         lines += [f"{camera.name} alone: {verdict}" for verdict in gravest_first(alone.verdicts)]
     return "\n".join([*lines, *map(str, gravest_first(rig.verdicts))])

@@ -74,8 +74,8 @@ def _basis(c: Calibration) -> str:
     width, height = c.camera.size_px
     return (
         f"{c.camera.model} camera, {width} x {height} px, {c.corner_count} corners in {len(c.views)} views "
-        f"of {len({v.image for v in c.views})} images, {len(c.outliers)} corners and {len(c.dropped)} images left out; "
-        f"a corner scatters by {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after "
+        f"of {len({v.image for v in c.views})} images, {len(c.outliers)} corners and {c.images_left_out} images left "
+        f"out; a corner scatters by {c.sigma_px:.3f} px per axis; solver: {c.convergence.reason} after "
         f"{c.convergence.iterations} steps."
     )
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.usable import other_size, views_of_image
+from rigkit.calibration.usable import BESIDE, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError, RigkitError
@@ -61,20 +61,24 @@ class SessionCorners:
 def session_views(
     session: Session, corners: SessionCorners
 ) -> tuple[list[BoardView], tuple[int, int], list[tuple[str, str]]]:
-    """Return the views that the corners found give, the images' size, and (image, reason) of those that give none.
+    """Return the views that the corners found give, the images' size, and (image, reason) of those that give none, or
+    of which something is left out.
 
     Raises InputError where there is no view, or the boards clearly have another size than stated.
     """
     found = corners.found
     size_px = _common_size(session, found)
     views, dropped = [], list(corners.unreadable.items())
+    boards = without_lookalikes({name: item.detections for name, item in found.items()}, session.boards)
     for name, item in found.items():
         if item.size_px != size_px:
             width, height = item.size_px
             dropped.append((name, f"{width}x{height} px, most images have {size_px[0]}x{size_px[1]}"))
             continue
-        own, reason = views_of_image(name, item.detections, session.boards)
+        own, reason = views_of_image(name, boards[name], session.boards)
         views += own
+        if reason is None and len(boards[name]) < len(item.detections):
+            reason = BESIDE
         if reason is not None:
             dropped.append((name, reason))
     wrong = other_size({name: item.detections for name, item in found.items()}, session.boards)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.calibration.usable import other_size, views_of_image
+from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.circles import Circles
@@ -56,6 +56,27 @@ def test_parts_of_the_stated_board_are_not() -> None:
     assert other_size(shown(*[grid(9, 6)] * 2), STATED) is None
     assert other_size(shown(*[grid(9, 6, corners=50)] * 5), STATED) is None
     assert other_size({}, STATED) is None
+
+
+def left(found: dict[str, list[BoardDetection]], boards: tuple[Board, ...] = STATED) -> list[list[int]]:
+    return [[len(d.grid) for d in own] for own in without_lookalikes(found, boards).values()]
+
+
+def test_tiles_beside_the_whole_board_are_no_part_of_it() -> None:
+    whole, tiles = grid(9, 7), grid(5, 4)
+    assert left({"0.png": [whole, tiles], "1.png": [tiles], "2.png": [tiles, grid(7, 9)]}) == [[63], [20], [63]]
+    # A board that is named is one, though only its lower half is seen.
+    half = BoardDetection("stated", 9, 7, whole.grid[27:], whole.pixels[27:], whole.sigma_px[27:])
+    assert left({"0.png": [half, tiles]}) == [[36]]
+    # A part of another board that is listed is welcome while that one is not seen.
+    assert left({"0.png": [whole, tiles]}, (*STATED, Board("second", 6, 5, 30.0, 30.0))) == [[63, 20]]
+
+
+def test_parts_of_copies_of_the_board_are_used() -> None:
+    whole, part = grid(9, 7), grid(5, 4)
+    assert left({"0.png": [whole, whole, part], "1.png": [whole, part]}) == [[63, 63, 20], [63, 20]]
+    # Tiles that pass for the whole board once in many images make no copies.
+    assert left({str(k): [whole] * (1 + (k == 0)) + [part] for k in range(8)}) == [[63, 63], *[[63]] * 7]
 
 
 @pytest.mark.parametrize("layout", ["regular", "asymmetric", "hexagonal"])
