@@ -8,6 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+THOROUGH = Path(__file__).with_name("thorough.txt")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of thorough.txt, which `./scripts/test` leaves out."""
+    names = {line for line in THOROUGH.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+    for item in items:
+        if item.nodeid in names:
+            item.add_marker("thorough")
+    if config.args_source is config.ArgsSource.TESTPATHS and (gone := names - {item.nodeid for item in items}):
+        words = f"{THOROUGH.name} names tests that are not there: {', '.join(sorted(gone))}"
+        config.issue_config_time_warning(pytest.PytestWarning(words), stacklevel=2)
+
 
 @pytest.fixture
 def rng(request: pytest.FixtureRequest) -> np.random.Generator:

@@ -38,6 +38,7 @@ FOR_ALL = {"rigkit.core.arrays", "rigkit.core.errors"}
 MAX_LINES = 400
 
 MAX_FUNCTION_LINES = 60
+MAX_VERB_LINES = 120
 MAX_POSITIONAL_FIELDS = 6
 """Nobody remembers the order of more: classes of more fields take keywords."""
 
@@ -145,6 +146,17 @@ def test_one_camera_knows_nothing_of_rigs() -> None:
 def test_module_size() -> None:
     lines = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in MODULES}
     assert not {name: n for name, n in lines.items() if n > MAX_LINES}, "split them"
+
+
+def test_a_verb_is_a_page() -> None:
+    """What it takes, one call of a workflow, what it prints; longer ones do work that belongs below."""
+    from rigkit.cli.main import VERBS
+
+    lines = {
+        verb: len((PACKAGE / f"cli/{home.split('.')[-1]}.py").read_text().splitlines())
+        for verb, (home, _) in VERBS.items()
+    }
+    assert not {verb: n for verb, n in lines.items() if n > MAX_VERB_LINES}
 
 
 def place_of(path: Path, name: str) -> str:

@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.cli.board_identify import identify
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.core.patterns.base import Pattern
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.print_board import PrintOptions, print_board
 
     if args.size == "identify":
-        return _identify(args)
+        return identify(args)
     if args.images:
         raise InputError(f"board: '{args.images[0]}' after the board; give images to rigkit board identify alone")
     size = BOARD_SIZE.match(args.size)
@@ -71,38 +72,6 @@ def run(args: argparse.Namespace) -> int:
     for path in print_board(board, PrintOptions(output=Path(args.output), paper=args.paper, force=args.force)):
         print(path)
     return 0
-
-
-def _identify(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, progress_on_stderr
-    from rigkit.io.board_file import board_text
-    from rigkit.io.files import ensure_writable, write_atomic
-    from rigkit.io.video import is_video
-    from rigkit.workflows.detect import images_in
-    from rigkit.workflows.identify_board import identify_board
-
-    if args.square_mm is not None and not args.square_mm > 0.0:
-        raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
-    path = None if args.output is None else Path(args.output).with_suffix(".toml")
-    if path is not None and args.square_mm is None:
-        raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
-    images = [one for path in map(Path, args.images) for one in ([path] if is_video(path) else images_in([path]))]
-    if path is not None:
-        ensure_writable(path, force=args.force, inputs=images)
-    found = identify_board(images, progress=progress_on_stderr())
-    board = found.board
-    print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))
-    print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
-    print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
-    if found.beside:
-        print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}")
-    if path is not None:
-        text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
-        write_atomic(path, text, force=args.force)
-        print(path)
-    for error in found.unreadable:
-        note(f"left out: {error}")
-    return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
 
 
 def _store_measured(args: argparse.Namespace) -> int:

@@ -4,14 +4,9 @@ where it does, but an image could not be read."""
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from rigkit.core.errors import ExitCode, InputError
-
-if TYPE_CHECKING:
-    from rigkit.workflows.check import CheckedPictures
 
 HELP = "fresh pictures against a calibration or a rig: still holds, or what moved and by how much"
 
@@ -43,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, print_json, progress_on_stderr
     from rigkit.io.board_words import board_files, board_of_words
     from rigkit.io.files import ensure_writable
-    from rigkit.report.check_page import check_table
+    from rigkit.report.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.check import CheckOptions, check_pictures
@@ -68,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
     done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
     check = done.check
     if args.json:
-        print_json(_summary(done))
+        left_out = {"left_out": [list(entry) for entry in done.left_out], "unreadable": list(done.unreadable)}
+        print_json(check_to_dict(check) | left_out)
     else:
         print(done.words.headline)
         for sentence in done.words.sentences:
@@ -84,41 +80,3 @@ def run(args: argparse.Namespace) -> int:
     if not check.holds:
         return ExitCode.CHECK_FAILED
     return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL
-
-
-def _summary(done: CheckedPictures) -> dict[str, Any]:
-    from rigkit.report.check_page import check_facts
-
-    check, change = done.check, done.check.change
-    return {
-        "holds": check.holds,
-        "chance": check.chance,
-        "statement": done.words.headline,
-        "cause": None if change is None else change.cause.kind,
-        "camera": None if change is None else change.cause.camera,
-        "amounts": [] if change is None else change.amounts.tolist(),
-        "sigmas": [] if change is None else change.sigmas.tolist(),
-        "units": [] if change is None else list(change.cause.units),
-        "size_px": None if change is None else change.size_px,
-        "cost": check.cost,
-        "cost_unit": check.cost_unit,
-        "rms_px": check.rms_px,
-        "rms_fixed_px": check.rms_fixed_px,
-        "expected_px": check.expected_px,
-        "powers": [
-            {
-                "kind": power.kind,
-                "camera": power.camera,
-                "size": power.size,
-                "unit": power.unit,
-                "chance": power.chance,
-                "found_from": power.found_from if math.isfinite(power.found_from) else None,
-                "frames": power.frames,
-                "both": power.both,
-            }
-            for power in check.powers
-        ],
-        "page": check_facts(check).to_dict(),
-        "left_out": [list(entry) for entry in done.left_out],
-        "unreadable": list(done.unreadable),
-    }

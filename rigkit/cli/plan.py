@@ -12,9 +12,7 @@ from rigkit.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from rigkit.workflows.plan import PlannedSession, PlanOptions
 
-
 HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
-
 
 MAX_VIEWS = 100
 """Nobody takes more by a plan."""
@@ -39,9 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_argument_group("before there is a calibration")
     lens.add_argument("--lens", type=float, metavar="DEG", help="field of view across the width of the image")
     lens.add_argument("--size", metavar="WxH", help="of the images, px")
-    lens.add_argument(
-        "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="such as 9x6x25 (repeatable)"
-    )
+    lens.add_argument("--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="9x6x25 (repeatable)")
     lens.add_argument("--model", help="camera model (default: the usual one for such a lens)")
     lens.add_argument("--sigma-px", type=float, metavar="PX", help="scatter of a corner per coordinate (default: 0.15)")
 

@@ -5,22 +5,18 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.console import note, progress_on_stderr
 from rigkit.cli.dataset_arguments import (
     add_dataset_arguments,
     add_direction_arguments,
     add_planes_argument,
     dataset_options,
     direction_options,
-    exit_code_of,
-    failed_pairs,
 )
-from rigkit.cli.validation_words import show
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.cli.validation_words import show, show_paper
+from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.io.manifest import Dataset
-    from rigkit.workflows.paper import PaperOptions
     from rigkit.workflows.validate import ValidateOptions
 
 HELP = "captures beside what a person measured of them: a page, tables, oriented clouds; exit 1 if a check fails"
@@ -53,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifest import load_dataset
-    from rigkit.workflows.paper import PaperOptions
+    from rigkit.workflows.paper import PaperOptions, validate_as_paper
     from rigkit.workflows.validate import validate_dataset
 
     if len(args.dataset) > 1:
@@ -67,13 +63,12 @@ def run(args: argparse.Namespace) -> int:
     if args.paper and args.planes is not None:
         raise InputError("--paper takes the principal planes of the points; leave --planes out")
     if args.paper:
-        return _as_paper(
-            dataset, PaperOptions(**common, own_solvers=args.own_solvers, pictures=not args.no_pictures), json=args.json
-        )
+        options = PaperOptions(**common, own_solvers=args.own_solvers, pictures=not args.no_pictures)
+        return show_paper(validate_as_paper(dataset, options, progress=progress_on_stderr()), options, json=args.json)
     if args.own_solvers:
         raise InputError("--own-solvers is about --paper; add that, or leave it out")
-    options = _options(args, common)
-    return show(validate_dataset(dataset, options, progress=progress_on_stderr()), common["output"], json=args.json)
+    done = validate_dataset(dataset, _options(args, common), progress=progress_on_stderr())
+    return show(done, common["output"], json=args.json)
 
 
 def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOptions:
@@ -111,18 +106,3 @@ def _many(args: argparse.Namespace) -> int:
             note(f"'{path}': {outcome.error}")
     note(f"{common['output'] / 'summary.html'}")
     return done.code
-
-
-def _as_paper(dataset: Dataset, options: PaperOptions, *, json: bool) -> int:
-    """Repeat the paper and print its tables; return the exit code. What it claims passes or fails no check of ours."""
-    from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.paper import validate_as_paper
-
-    done = validate_as_paper(dataset, options, progress=progress_on_stderr())
-    if json:
-        result = {"output": str(options.output), "reports": [report.to_dict() for report in done.reports]}
-        print_json(result | failed_pairs(done.failures))
-    else:
-        print(tables_to_text([table for table in done.tables if table.key != "estimators"]))
-        print(f"{options.output}")
-    return exit_code_of(done.failures, ExitCode.WELL)

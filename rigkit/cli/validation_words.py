@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
+    from rigkit.workflows.paper import PaperOptions, PaperValidation
     from rigkit.workflows.validate import DatasetValidation
 
 
@@ -45,6 +46,19 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
         page = "report.html" if "report.html" in done.files else "tables.md"
         print(f"{'all checks passed' if done.passed else failed}; {out / page}, {done.seconds:.1f} s")
     return exit_code_of(done.failures, ExitCode.WELL if done.passed else ExitCode.CHECK_FAILED)
+
+
+def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> int:
+    """Print the paper's tables; return the exit code. What the paper claims passes or fails no check of ours."""
+    from rigkit.report.tables import tables_to_text
+
+    if json:
+        result = {"output": str(options.output), "reports": [report.to_dict() for report in done.reports]}
+        print_json(result | failed_pairs(done.failures))
+    else:
+        print(tables_to_text([table for table in done.tables if table.key != "estimators"]))
+        print(f"{options.output}")
+    return exit_code_of(done.failures, ExitCode.WELL)
 
 
 def _say_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -139,6 +141,28 @@ def check_table(check: SentinelCheck) -> Table:
         )
     none = (Cell("nothing can be told from these pictures"), Cell(""), Cell(None), Cell(""))
     return Table("causes", "What may have happened", columns, tuple(rows) or (none,))
+
+
+def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
+    """Return what a program needs to know."""
+    change = check.change
+    return {
+        "holds": check.holds,
+        "chance": check.chance,
+        "statement": check_words(check).headline,
+        "cause": None if change is None else change.cause.kind,
+        "camera": None if change is None else change.cause.camera,
+        "amounts": [] if change is None else change.amounts.tolist(),
+        "sigmas": [] if change is None else change.sigmas.tolist(),
+        "units": [] if change is None else list(change.cause.units),
+        "size_px": None if change is None else change.size_px,
+        **{name: getattr(check, name) for name in ("cost", "cost_unit", "rms_px", "rms_fixed_px", "expected_px")},
+        "powers": [
+            asdict(power) | {"found_from": power.found_from if math.isfinite(power.found_from) else None}
+            for power in check.powers
+        ],
+        "page": check_facts(check).to_dict(),
+    }
 
 
 def check_facts(check: SentinelCheck) -> PageFacts:

@@ -1,0 +1,41 @@
+"""What `rigkit rectify` says of the images that it wrote."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rigkit.workflows.rectify import RectifiedImage
+
+
+def image_to_dict(one: RectifiedImage, projection: str) -> dict[str, Any]:
+    """Return what a program needs to know."""
+    target = one.map.target
+    return {
+        "image": str(one.path),
+        "projection": projection,
+        "model": target.model,
+        "size_px": list(target.size_px),
+        "parameters": dict(zip(target.parameter_names(), target.parameters.tolist(), strict=True)),
+        "target_from_cam": one.map.target_from_cam.tolist(),
+        "covered": one.covered,
+    }
+
+
+def alike(images: Sequence[RectifiedImage], projection: str) -> list[tuple[str, list[Path]]]:
+    """Return what there is to say of images, and of which, those of one folder together."""
+    out: dict[tuple[Path, str], list[Path]] = {}
+    for one in images:
+        out.setdefault((one.path.parent, _words(one, projection)), []).append(one.path)
+    return [(words, paths) for (_, words), paths in out.items()]
+
+
+def _words(one: RectifiedImage, projection: str) -> str:
+    target = one.map.target
+    (width, height), focal = target.size_px, target.parameters[target.parameter_names().index("fx")]
+    return (
+        f"{projection}, {width} x {height} px, focal length {focal:.2f} px, "
+        f"{100.0 * one.covered:.1f} % of it seen by the camera"
+    )
