@@ -61,14 +61,23 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     """
     tags, markers = TagSightings(), MarkerSightings()
     plain: list[list[BoardDetection]] = []
+    looked, sure = 0, []
     for k, image in enumerate(images):
         progress(LOOKING, k, len(images))
         plain.append([d for d in detect_boards(image) if d.complete])
         if any(_without_marks(image, found) for found in plain[-1]):
+            sure.append(k)
             continue
         # Many dictionaries take a second a picture: a board without markers is not asked for ever.
-        if not tags.look(k, image) and (markers.images or k < MARKER_TRIES):
+        if not tags.look(k, image) and (markers.images or looked < MARKER_TRIES):
             markers.look(k, image)
+        looked += 1
+    # A tiled floor is a chessboard without marks in every image, but hardly of one size in most.
+    if tags.images or markers.images or not _in_most(plain):
+        for k in sure:
+            if not tags.look(k, images[k]) and (markers.images or looked < MARKER_TRIES):
+                markers.look(k, images[k])
+            looked += 1
     guess = _guess_of(images, plain, tags, markers)
     progress(LOOKING, len(images), len(images))
     return guess
@@ -112,25 +121,34 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVELS_APART * contrast for of in (odd, ~odd))
 
 
+def _sizes(found: Sequence[BoardDetection]) -> set[tuple[int, int]]:
+    """Return the sizes of an image's grids, the longer side first."""
+    return {(max(d.columns, d.rows), min(d.columns, d.rows)) for d in found}
+
+
+def _in_most(plain: Sequence[Sequence[BoardDetection]]) -> bool:
+    """Say whether at least half of the images, and more than one, show grids of one size."""
+    counts = Counter(size for found in plain for size in _sizes(found))
+    return max(counts.values(), default=0) >= max(0.5 * len(plain), MIN_IMAGES_OF_GUESS)
+
+
 def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[BoardDetection]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
-    sizes: dict[int, tuple[int, int]] = {}
     circles = CircleSightings()
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
-        if found:
-            sizes[k] = (max(found[0].columns, found[0].rows), min(found[0].columns, found[0].rows))
-        else:
+        if not (found and _in_most(plain)):
             circles.look(k, image)
-    grid = guessed_circles(circles)
-    if grid is not None and len(grid[1]) > len(sizes):
-        return BoardGuess(*grid)
-    if not sizes:
-        return None
-    # A part of a board that the frame cuts comes in many sizes; the whole board in one.
-    counts = Counter(sizes.values())
+    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
+    counts = Counter(size for found in plain for size in _sizes(found))
     often = [size for size, n in counts.items() if n >= min(MIN_IMAGES_OF_GUESS, max(counts.values()))]
-    best = max(often, key=lambda size: (counts[size], size[0] * size[1]))
-    return BoardGuess(Board("board", *best, 1.0, 1.0), tuple(k for k, size in sizes.items() if size == best))
+    best = max(often, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    grid = guessed_circles(circles)
+    if grid is not None and (best is None or len(grid[1]) > counts[best]):
+        return BoardGuess(*grid)
+    if best is None:
+        return None
+    shown = tuple(k for k, found in enumerate(plain) if best in _sizes(found))
+    return BoardGuess(Board("board", *best, 1.0, 1.0), shown)
 
 
 def difference(guess: Board, declared: Board) -> str | None:

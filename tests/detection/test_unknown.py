@@ -84,6 +84,21 @@ def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytes
     assert told == [(LOOKING, 0, 2), (LOOKING, 1, 2), (LOOKING, 2, 2)]
 
 
+@pytest.mark.parametrize("pattern", [AprilGrid(0.3), Charuco("DICT_5X5_50", 45.0), Chessboard()])
+def test_a_board_in_a_room_with_tiles(pattern: Pattern) -> None:
+    """Of the tiles every image shows another, larger part: no grid of one size is seen often, but the board's is."""
+    board = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
+    camera = Pinhole((1400, 600), np.array([800.0, 800.0, 699.5, 299.5]))
+    images = []
+    for k, size in enumerate(((9, 8), (10, 9), (11, 8), (12, 9))):
+        tiles = PlacedBoard(Board("tiles", *size, 50.0, 50.0), Rigid3(np.eye(3), [80.0, -200.0, 800.0 + k]))
+        held = PlacedBoard(board, Rigid3(np.eye(3), [-520.0 - 5.0 * k, -150.0, 700.0]))
+        images.append(grey_image(render([tiles, held], camera, Rigid3.identity(), optics=Optics(0.5))))
+    guess = guess_board(images)
+    assert guess is not None and type(guess.board.pattern) is type(pattern)
+    assert guess.board.size == (8, 6) and sorted(guess.images) == [0, 1, 2, 3]
+
+
 def test_markers_far_into_a_dictionary_are_told() -> None:
     board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_5X5_1000", 45.0, first_marker=600))
     guess = guess_board([shown(board)])
