@@ -26,19 +26,15 @@ from rigkit.calibration.fit import Fit, fit_kept
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.state import State
-from rigkit.calibration.uncertainty import projection_design
-from rigkit.cameras.base import Camera
-from rigkit.cameras.compare import best_rotation
-from rigkit.core.arrays import FloatArray, Mat3, Rays
+from rigkit.calibration.uncertainty import followed
+from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import RigkitError
-from rigkit.geometry.rotation import exp_so3, log_so3, skew
+from rigkit.geometry.rotation import log_so3, skew
 
 MIN_LIKELY = 0.05
 """A model that is less likely the better one adds next to nothing, however far it is off."""
 RAYS = 400
 """So many corners, spread over all views, are enough to follow another lens."""
-FOLLOWED = 1e-6
-"""Combinations of parameters with less than this part of the largest effect at the corners stay where they are."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -123,19 +119,3 @@ def spread_rays(points_in_cam: FloatArray) -> Rays:
     chosen = np.linspace(0, len(points_in_cam) - 1, min(RAYS, len(points_in_cam))).astype(np.int64)
     points = points_in_cam[chosen]
     return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
-
-
-def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
-    """Return by how much the parameters (P,) of a camera change for it to project `rays` (N, 3) as another one does,
-    and the rotation other_from_camera (3, 3) of the rays that goes with it; `sigmas` (P,) make them comparable."""
-    pixels, valid = camera.project(rays)
-    rays, pixels = rays[valid], pixels[valid]
-    turn = best_rotation(rays, pixels, np.ones(len(rays)), other)
-    there, seen = other.project(rays @ turn.T)
-    # Part of that rotation may be the parameters': both are found together.
-    rows = projection_design(camera, rays[seen]).transpose(2, 0, 1).reshape(-1, len(sigmas) + 3)
-    rows[:, :-3] *= sigmas
-    size = np.linalg.norm(rows, axis=0)
-    size = np.where(size > 0.0, size, 1.0)
-    step = np.linalg.lstsq(rows / size, (there - pixels)[seen].reshape(-1), rcond=FOLLOWED)[0] / size
-    return sigmas * step[:-3], turn @ exp_so3(-step[-3:])

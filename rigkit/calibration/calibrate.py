@@ -233,7 +233,7 @@ def _determined(result: Calibration, observations: Observations, fit: Fit) -> Fa
     """Return how sure the result is far away; raises DegenerateError where the views do not determine the camera."""
     points, _ = fit.state.points_in_cam(observations)
     far = FarProjection.of(result, points[fit.kept])
-    require_determined(result, far.at_corners_px)
+    require_determined(result, far.of_parameters_px)
     return far
 
 

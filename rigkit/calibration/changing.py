@@ -208,12 +208,8 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
 
 def _points(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
     """Return the points (N, 3) of the boards that the kept corners of the views are."""
-    shapes = {board.board_id: board.points_mm for board in calibration.boards}
-    columns = {
-        name: 1 + max(int(view.grid[:, 0].max()) for view in calibration.views if view.board_id == name)
-        for name in {view.board_id for view in views}
-    }
-    return np.concatenate([shapes[view.board_id][view.grid[view.kept] @ [1, columns[view.board_id]]] for view in views])
+    shapes = {board.board_id: board for board in calibration.boards}
+    return np.concatenate([shapes[view.board_id].at(view.grid[view.kept]) for view in views])
 
 
 def _without_pose(products: FloatArray, length: FloatArray) -> FloatArray:

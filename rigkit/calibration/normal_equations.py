@@ -162,7 +162,7 @@ class NormalEquations:
         """Whether the equations tell every global from the others at all: combinations of which they say less than the
         arithmetic can resolve have no inverse, and no covariance."""
         variance = np.diag(self.covariance()[0])
-        back = _inverse(self.pp) @ np.swapaxes(self.gp, -1, -2)
+        back = pose_inverses(self.pp) @ np.swapaxes(self.gp, -1, -2)
         # Against what it would be if all other globals were known.
         alone = np.diag(self.gg) - np.einsum("vgi,vig->g", self.gp, back)
         inflated = variance * alone
@@ -175,7 +175,7 @@ class NormalEquations:
 
         Directions that the data leave open get the pseudo-inverse's zero only after scaling to unit diagonal.
         """
-        inverse = _inverse(self.pp)
+        inverse = pose_inverses(self.pp)
         back = inverse @ np.swapaxes(self.gp, -1, -2)
         reduced = self.gg - _gemm(self.gp, back)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(reduced), np.finfo(float).tiny))
@@ -202,7 +202,7 @@ def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
     return out
 
 
-def _inverse(pp: FloatArray) -> FloatArray:
+def pose_inverses(pp: FloatArray) -> FloatArray:
     """Return the inverses of the poses' blocks (V, 6, 6); the pseudo-inverses where the corners leave a pose open."""
     scale = 1.0 / np.sqrt(_diagonal(pp))
     scale = scale[:, :, None] * scale[:, None]

@@ -196,6 +196,10 @@ class BoardShape:
         along_x, along_y = _stretch(board, points_mm)
         return cls(board.board_id, kind, points_mm, bow, along_x / along_y - 1.0, board)
 
+    def at(self, grid: IntArray) -> Points:
+        """Return the corners (N, 3) at places of the grid (N, 2), column and row."""
+        return np.asarray(self.points_mm[grid @ np.array([1, self.board.columns])])
+
     @property
     def board(self) -> Board:
         """The flat board nearest to the corners as the solution has them. Of one that no file declares it is known that
@@ -261,8 +265,8 @@ class Calibration:
     convergence : of the final solve.
     boards : shapes of the boards.
     verdicts : what is good and what is not, the headline first.
-    rivals : other lenses that the images support about as well: how far they differ is in the covariances. Files do not
-        keep them.
+    rivals : other lenses that the images support about as well: how far they differ where boards were is in the
+        covariances, elsewhere it is in the projection's uncertainty.
     """
 
     camera: Camera

@@ -11,7 +11,8 @@ appears: the boards' solved motions, averaged, are the motion of the world (W, T
 
     dq = d q / d k  dk + d q / d x (W x x + T)
 
-has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`).
+has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`). To both is added
+what the lens may do beyond its model (`departures`): next to nothing where many boards were and the model fits.
 
 Reference: D. Kogan, mrcal, "Projection uncertainty" and "Projection differences" (the mean over the frames and the
 rotation that is taken out are the same; here in closed form).
@@ -24,12 +25,17 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.departures import DISPLACEMENTS, Departures
+from rigkit.calibration.result import Calibration, Rival
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
+from rigkit.cameras.compare import best_rotation
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays
+from rigkit.geometry.rotation import exp_so3
 
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
+FOLLOWED = 1e-6
+"""Combinations of parameters with less than this part of the largest effect at the corners stay where they are."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -59,10 +65,12 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     pixels = np.asarray(pixels, dtype=np.float64)
     rays, valid = calibration.camera.unproject(pixels)
     flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
+    far = FarProjection.of(calibration)
     if np.isinf(range_mm):
-        found = FarProjection.of(calibration).covariance(flat)
+        found = far.covariance(flat)
     else:
         found = _propagated(calibration.frame_covariance, projection_design(calibration.camera, flat, range_mm))
+        found += far.beyond_model(flat, projection_design(calibration.camera, flat))
     covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
@@ -73,7 +81,7 @@ def worst_direction(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FarProjection:
     """How sure a calibration is of the projection of points at infinity, after the rotation that hides a change of the
     parameters best where the boards were.
@@ -83,16 +91,23 @@ class FarProjection:
     camera : the camera.
     correlation, sigmas : (P, P) and (P,) of its parameters.
     rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
-    corners : (2, P + 3, N) `projection_design` along the rays of those that have one.
+    rays, corners : (N, 3) those, and (2, P + 3, N) `projection_design` along them.
     hides : (3, P) the rotation that hides a step of one standard deviation of each parameter.
+    departures, hides_departures : what the lens may do beyond its model, and (3, J) the rotations that hide that.
+    rivals : lenses of other models, each with how the parameters (P,) follow it and the rotation of its rays (3, 3):
+        where boards were it is followed, elsewhere the two go apart.
     """
 
     camera: Camera
     correlation: FloatArray
     sigmas: FloatArray
     rays_valid: BoolArray
+    rays: Rays
     corners: FloatArray
     hides: FloatArray
+    departures: Departures
+    hides_departures: FloatArray
+    rivals: tuple[tuple[Rival, FloatArray, Mat3], ...]
 
     @classmethod
     def of(cls, calibration: Calibration, points_in_cam: Points | None = None) -> FarProjection:
@@ -112,21 +127,56 @@ class FarProjection:
         sigmas = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
         design = projection_design(camera, rays)
         there = design.transpose(1, 0, 2).reshape(p + 3, -1)
-        hides = np.asarray(
-            np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0], dtype=np.float64
-        )
+        departures, pixels = Departures.of(calibration), camera.project(rays)[0]
+        beyond = departures.left_over(pixels, design).transpose(1, 0, 2).reshape(DISPLACEMENTS, -1)
+        hidden = np.concatenate([sigmas[:, None] * there[:p], beyond]).T
+        hides = np.asarray(np.linalg.lstsq(there[p:].T, hidden, rcond=None)[0], dtype=np.float64)
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
-        return cls(camera, calibration.covariance / np.outer(safe, safe), sigmas, valid, design, hides)
+        return cls(
+            camera=camera,
+            correlation=calibration.covariance / np.outer(safe, safe),
+            sigmas=sigmas,
+            rays_valid=valid,
+            rays=rays,
+            corners=design,
+            hides=hides[:, :p],
+            departures=departures,
+            hides_departures=hides[:, p:],
+            rivals=tuple((one, *followed(camera, one.camera, rays, sigmas)) for one in calibration.rivals),
+        )
 
     def covariance(self, rays: FloatArray) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
-        return self._covariance(projection_design(self.camera, rays))
+        design = projection_design(self.camera, rays)
+        return self._of_parameters(design) + self.beyond_model(rays, design)
+
+    def beyond_model(self, rays: FloatArray, design: FloatArray) -> FloatArray:
+        """Return what of the covariance (M, 2, 2) along `rays` (M, 3) is what the lens may do beyond its model, from
+        `projection_design` there."""
+        pixels, p = self.camera.project(rays)[0], len(self.sigmas)
+        left = self.departures.left_over(pixels, design)
+        left -= np.einsum("wj,iwm->ijm", self.hides_departures, design[:, p:])
+        out = _propagated(self.departures.covariance, left)
+        for rival, step, turn in self.rivals:
+            there, seen = rival.camera.project(rays @ turn.T)
+            away = np.where(seen[:, None], there - pixels, 0.0) - np.einsum("ipm,p->mi", design[:, :p], step)
+            out += rival.likely * away[:, :, None] * away[:, None, :]
+        return out
 
     @cached_property
     def at_corners_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (M,) px, at the corners; NaN where one has no ray."""
+        beyond = self.beyond_model(self.rays, self.corners)
+        return self._over_all(self._of_parameters(self.corners) + beyond)
+
+    @property
+    def of_parameters_px(self) -> FloatArray:
+        """The same (M,) where the model were known to be right."""
+        return self._over_all(self._of_parameters(self.corners))
+
+    def _over_all(self, covariance: FloatArray) -> FloatArray:
         out = np.full(len(self.rays_valid), np.nan)
-        out[self.rays_valid] = worst_direction(self._covariance(self.corners))
+        out[self.rays_valid] = worst_direction(covariance)
         return out
 
     @property
@@ -141,7 +191,7 @@ class FarProjection:
         known = self.at_corners_px[np.isfinite(self.at_corners_px)]
         return float(known.max()) if known.size else float("inf")
 
-    def _covariance(self, design: FloatArray) -> FloatArray:
+    def _of_parameters(self, design: FloatArray) -> FloatArray:
         p = len(self.sigmas)
         left = self.sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:])
         return _propagated(self.correlation, left)
@@ -171,6 +221,22 @@ def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
     return design
+
+
+def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
+    """Return by how much the parameters (P,) of a camera change for it to project `rays` (N, 3) as another one does,
+    and the rotation other_from_camera (3, 3) of the rays that goes with it; `sigmas` (P,) make them comparable."""
+    pixels, valid = camera.project(rays)
+    rays, pixels = rays[valid], pixels[valid]
+    turn = best_rotation(rays, pixels, np.ones(len(rays)), other)
+    there, seen = other.project(rays @ turn.T)
+    # Part of that rotation may be the parameters': both are found together.
+    rows = projection_design(camera, rays[seen]).transpose(2, 0, 1).reshape(-1, len(sigmas) + 3)
+    rows[:, :-3] *= sigmas
+    size = np.linalg.norm(rows, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    step = np.linalg.lstsq(rows / size, (there - pixels)[seen].reshape(-1), rcond=FOLLOWED)[0] / size
+    return sigmas * step[:-3], turn @ exp_so3(-step[-3:])
 
 
 def _spread(count: int) -> IntArray:

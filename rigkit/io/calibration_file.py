@@ -16,7 +16,7 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
-from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, ViewResult
+from rigkit.calibration.result import BoardShape, Calibration, Candidate, Convergence, Outlier, Rival, ViewResult
 from rigkit.cameras.base import Camera
 from rigkit.cameras.plausible import fault_of_lens
 from rigkit.cameras.registry import camera_model
@@ -35,7 +35,7 @@ CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
 Made = Mapping[str, Any]
 """By what, when and from what a file was made: see `rigkit.workflows.provenance.made`."""
-LATER_KEYS = {"overdispersion", "freedom", "made"}
+LATER_KEYS = {"overdispersion", "freedom", "made", "rivals"}
 """Former files do not have them."""
 
 
@@ -56,6 +56,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
         "sigma_px": c.sigma_px,
         "verdicts": findings_to_json(c.verdicts),
         "candidates": [asdict(v) for v in c.candidates],
+        "rivals": [{"name": r.name, "likely": r.likely, "camera": camera_to_json(r.camera)} for r in c.rivals],
         "convergence": asdict(c.convergence),
         "dropped": [list(v) for v in c.dropped],
         "outliers": [asdict(v) for v in c.outliers],
@@ -127,6 +128,7 @@ def load_calibration(path: str | Path) -> Calibration:
             verdicts=findings_from_json(data["verdicts"]),
             overdispersion=positive(data.get("overdispersion", 1.0)),
             freedom=freedom(data.get("freedom")),
+            rivals=tuple(_rival_in(v, path) for v in data.get("rivals", ())),
         )
 
 
@@ -219,6 +221,10 @@ def _view_out(view: ViewResult) -> dict[str, Any]:
         "residuals_px": view.residuals_px.tolist(),
         "kept": view.kept.tolist(),
     }
+
+
+def _rival_in(data: dict[str, Any], path: str | Path) -> Rival:
+    return Rival(str(data["name"]), camera_from_json(data["camera"], path), real(data["likely"]))
 
 
 def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> ViewResult:

@@ -7,14 +7,14 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration import calibrate as module
-from rigkit.calibration.between_models import followed, rival_fits
+from rigkit.calibration.between_models import rival_fits
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.fit import Fit, fit_model
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.uncertainty import FarProjection, projection_design
+from rigkit.calibration.uncertainty import FarProjection, followed, projection_design
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model
 from rigkit.core.progress import silent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -171,7 +172,10 @@ def test_the_verdict_does_not_depend_on_how_the_model_was_reached(rng: np.random
     chosen = calibrate(together, SIZE, model="auto", board="flat")
     named = calibrate(together, SIZE, model=chosen.camera.model, board="flat")
     assert (chosen.camera.parameters == named.camera.parameters).all()
-    assert [v.message for v in chosen.verdicts] == [v.message for v in named.verdicts]
+    # How far other models go apart where no board was is known with "auto" alone, and part of the numbers.
+    number = re.compile(r"[0-9.]+")
+    words = [[(v.severity, number.sub("", v.message)) for v in one.verdicts] for one in (chosen, named)]
+    assert words[0] == words[1]
     assert "the lens (or the board) was another one" in str(chosen.verdicts[0])
     tried = {candidate.name.split()[0] for candidate in chosen.candidates}
     assert {"pinhole", "brown", "kannala_brandt", "scaramuzza"} <= tried

@@ -15,7 +15,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State
-from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
+from rigkit.calibration.uncertainty import FarProjection, projection_design, projection_uncertainty, uncertainty_map
 from rigkit.cameras.registry import MODELS
 from rigkit.geometry.rotation import exp_so3
 
@@ -46,13 +46,16 @@ def observed_over_predicted(
         fit = fit_kept(noisy, truth, exact.present)
         result = assemble(noisy, fit, None, (), ())
         if np.isinf(range_mm):
-            there, known = truth.camera.unproject(exact.pixels[exact.present])
-            carried = points @ _best_turn(fit.state, there[known], exact.pixels[exact.present][known]).T
+            rays, known = truth.camera.unproject(exact.pixels[exact.present])
+            carried = points @ _best_turn(fit.state, rays[known], exact.pixels[exact.present][known]).T
         else:
             carried = _carried(points, truth, fit.state)
         moved.append(fit.state.camera.project(carried)[0] - pixels)
         # Twenty views know their own disagreement to a fifth: what they say on average is what must be right.
-        predicted.append(projection_uncertainty(result, pixels, range_mm=range_mm).covariance)
+        # The lens is known to be of the model here: what it may do beyond that is no part of the scatter.
+        there = result.camera.unproject(pixels)[0]
+        beyond = FarProjection.of(result).beyond_model(there, projection_design(result.camera, there))
+        predicted.append(projection_uncertainty(result, pixels, range_mm=range_mm).covariance - beyond)
     scatter = np.array(moved)
     second = np.einsum("rni,rnj->nij", scatter, scatter) / runs
     covariance = np.mean(predicted, axis=0)

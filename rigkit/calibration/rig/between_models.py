@@ -11,11 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.between_models import followed, spread_rays
+from rigkit.calibration.between_models import spread_rays
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
+from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rotation import log_so3
