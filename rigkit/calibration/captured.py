@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.changing import changing
 from rigkit.calibration.coverage import corner_ranges, covered_by_boards
-from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import grid_pixels
@@ -66,16 +64,12 @@ class Extent:
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
 
-def judge_capture(
-    calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray, correlation: float
-) -> list[Finding]:
+def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
-    views, those that repeat others as those, `correlation` is that of neighbouring residuals."""
+    views, those that repeat others as those."""
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
-        *two_cameras(calibration, clusters),
-        *changing(calibration, correlation),
         *_repeated(images, number),
         *_too_few(images, number),
         *_tilts(calibration),

@@ -5,6 +5,8 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -22,6 +24,8 @@ OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
 MIN_SHARE_LARGER = 0.25
 """Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
+NEXT = 1.7
+"""Corners of one lattice lie this many times as far apart as the nearest two do there, or nearer: slanted squares."""
 MAX_SHARE_REACHING = 0.1
 """Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
 MAX_SHARE_COPIES = 0.25
@@ -99,15 +103,15 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
     the others.
     """
     listed = {frozenset(board.size) for board in boards}
-    found = [own for own in detections.values() if own]
+    found = [_put_together(own) for own in detections.values() if own]
     sizes = ", ".join(f"{c} x {r}" for c, r in sorted({board.size for board in boards}))
-    without = [own for own in found if not any(frozenset((d.columns, d.rows)) in listed for d in own)]
-    counts = Counter(max((d.columns, d.rows), (d.rows, d.columns)) for own in without for d in own if d.complete)
+    without = [own for own in found if not any(frozenset(seen.size) in listed for seen in own)]
+    counts = Counter((max(s.size), min(s.size)) for own in without for s in own if s.whole)
     size, count = counts.most_common(1)[0] if counts else ((0, 0), 0)
     words = f"{size[0]} x {size[1]} inner corners are seen in {count} of {len(found)} images, {sizes} are declared"
     if count < OFTEN:
         return None
-    reaching = [own for own in found if any(frozenset(_reach(d)) in listed for d in own)]
+    reaching = [own for own in found if any(frozenset(seen.reach) in listed for seen in own)]
     if len(reaching) <= MAX_SHARE_REACHING * len(found):
         return words if 2 * count > sum(len(own) for own in found) else None
     larger = any(max(board.size) <= size[0] and min(board.size) <= size[1] for board in boards)
@@ -135,6 +139,37 @@ def without_lookalikes(
         )
         for name, own in detections.items()
     }
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """A grid in an image: its size, how far its corners reach, whether it is whole."""
+
+    size: tuple[int, int]
+    reach: tuple[int, int]
+    whole: bool
+
+
+def _put_together(own: Sequence[BoardDetection]) -> list[_Seen]:
+    """Return the grids of an image; two that touch along a whole side are one, out of which a size was cut."""
+    seen = [_Seen((one.columns, one.rows), _reach(one), one.complete) for one in own]
+    for i, j in combinations(range(len(own)), 2):
+        sides = set(seen[i].size) & set(seen[j].size)
+        touching = _touching(own[i], own[j]) if sides else 0
+        side = next((side for side in sides if side - 1 <= touching <= side), None)
+        if side is not None:
+            size = sum(own[k].columns * own[k].rows for k in (i, j)) // side, side
+            others = [seen[k] for k in range(len(own)) if k not in (i, j)]
+            return [_Seen(size, size, seen[i].whole and seen[j].whole), *others]
+    return seen
+
+
+def _touching(one: BoardDetection, other: BoardDetection) -> int:
+    """Return how many corners of `one` have a corner of `other` as near as their own neighbours."""
+    own = np.linalg.norm(one.pixels[:, None] - one.pixels, axis=-1)
+    np.fill_diagonal(own, np.inf)
+    away = np.linalg.norm(one.pixels[:, None] - other.pixels, axis=-1).min(axis=1)
+    return int(((away > 0.5 * own.min(axis=1)) & (away < NEXT * own.min(axis=1))).sum())
 
 
 def _reach(found: BoardDetection) -> tuple[int, int]:

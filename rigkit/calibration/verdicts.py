@@ -13,6 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
+from rigkit.calibration.changing import changing
+from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, ViewResult
@@ -78,22 +80,29 @@ def judge(
         views = calibration.views
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
+    mixed = two_cameras(calibration, clusters)
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
-        *judge_capture(calibration, extent, far, clusters, correlation),
-        *(finding for finding in also if finding.severity is Severity.BAD),
+        *mixed,
+        *([] if mixed else changing(calibration, correlation)),
+        *judge_capture(calibration, extent, far, clusters),
+        *(finding for finding in also if finding.severity is Severity.BAD and not mixed),
     ]
     found = [
         *(finding for finding in also if finding.severity is not Severity.BAD),
         *_left_out(calibration.dropped, calibration.views),
         *_coverage(calibration),
-        *_views(calibration),
-        *_pattern(calibration, correlation, in_force),
-        *_overfit(calibration),
-        *_boards(calibration),
-        *_outliers(calibration),
     ]
+    if not mixed:
+        # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
+        found += [
+            *_views(calibration),
+            *_pattern(calibration, correlation, in_force),
+            *_overfit(calibration),
+            *_boards(calibration),
+            *_outliers(calibration),
+        ]
     share = extent.share
     where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
     return (*with_headline(calibration, causes, _unsure(calibration, far), where), *found)

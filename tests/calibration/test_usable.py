@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -38,6 +40,19 @@ def test_a_larger_board_of_which_part_was_taken() -> None:
     assert other_size(shown(*[grid(9, 6)] * 3, *[grid(8, 6)] * 20), declared) is None
     # Another board beside the declared one is no reason to doubt that.
     assert other_size({f"{k}.png": [grid(8, 6), grid(9, 6)] for k in range(10)}, declared) is None
+
+
+def test_a_larger_board_that_was_cut() -> None:
+    """A 9x6 board declared as 6x4: in most images it comes in two pieces."""
+    declared = (Board("b", 6, 4, 30.0, 30.0),)
+    first, rest = grid(6, 5), grid(6, 4)
+    below = replace(rest, pixels=rest.pixels + np.array([0.0, 100.0]))
+    beside = replace(rest, pixels=rest.pixels + np.array([160.0, 0.0]))
+    cut = {f"{k}.png": [first, below] for k in range(8)}
+    whole = {f"whole{k}.png": [grid(9, 6)] for k in range(3)}
+    assert other_size(cut | whole, declared) == "9 x 6 inner corners are seen in 11 of 11 images, 6 x 4 are declared"
+    # Two boards that stand apart are two.
+    assert other_size({f"{k}.png": [first, beside] for k in range(8)}, declared) is None
 
 
 def test_a_smaller_board_that_passes_for_part_of_the_stated_one() -> None:
