@@ -24,7 +24,7 @@ OFTEN = 3
 """Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
 MIN_SHARE_LARGER = 0.25
 """Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
-NEXT = 1.7
+TOUCHING = 1.7
 """Corners of one lattice lie this many times as far apart as the nearest two do there, or nearer: slanted squares."""
 MAX_SHARE_REACHING = 0.1
 """Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
@@ -169,7 +169,7 @@ def _touching(one: BoardDetection, other: BoardDetection) -> int:
     own = np.linalg.norm(one.pixels[:, None] - one.pixels, axis=-1)
     np.fill_diagonal(own, np.inf)
     away = np.linalg.norm(one.pixels[:, None] - other.pixels, axis=-1).min(axis=1)
-    return int(((away > 0.5 * own.min(axis=1)) & (away < NEXT * own.min(axis=1))).sum())
+    return int(((away > 0.5 * own.min(axis=1)) & (away < TOUCHING * own.min(axis=1))).sum())
 
 
 def _reach(found: BoardDetection) -> tuple[int, int]:
