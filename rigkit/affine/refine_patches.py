@@ -100,6 +100,11 @@ def patch_rules(
     )
 
 
+def levels_of_larger(A21: Affines) -> FloatArray:
+    """Return the levels (...) by which image 1 is read more coarsely, as it shows the patches larger."""
+    return np.asarray(np.maximum(np.floor(0.5 - 0.5 * np.log2(np.abs(np.linalg.det(A21)))), 0.0))
+
+
 def refine_patches(
     pyramid1: Pyramid,
     pyramid2: Pyramid,
@@ -120,7 +125,10 @@ def refine_patches(
     """
     rules = patch_rules(half_width_px, most_move=0.5 * half_width_px, excess_noise=EXCESS_NOISE)
     found = aligned(pyramid1, pyramid2, rules, starts_of(pixels1, pixels2, A21))
-    variances = np.einsum("nii->ni", found.covariance)
+    # Detail that only the sharper image 1 shows stays in the differences, alike over a pixel of image 2.
+    with np.errstate(invalid="ignore"):
+        shown = np.abs(np.linalg.det(found.A21)) * 4.0 ** levels_of_larger(found.A21)
+    variances = np.einsum("nii->ni", found.covariance) / np.minimum(shown, 1.0)[:, None]
     return RefinedPatches(
         A21=found.A21,
         pixels2=found.pixels2,

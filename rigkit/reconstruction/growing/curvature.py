@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.affine.refine_patches import WINDOW_OF_PATCH
+from rigkit.affine.refine_patches import WINDOW_OF_PATCH, levels_of_larger
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.geometry.rigid3 import Rigid3
@@ -34,9 +34,7 @@ def without_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam
     by_uu, by_uv, by_vv = _second_derivatives(place, plane, camera1, camera2, cam2_from_cam1)
     rows, columns = np.nonzero(at)
     du, dv = (place - grown.step * np.stack([columns, rows], axis=1)).T[:, :, None]
-    # An image that shows the surface larger is read more coarsely.
-    larger = np.maximum(np.floor(0.5 - 0.5 * np.log2(np.abs(np.linalg.det(A21)))), 0.0)
-    variance = (_window_variance() * 4.0 ** (grown.coarser[at] + larger))[:, None]
+    variance = (_window_variance() * 4.0 ** (grown.coarser[at] + levels_of_larger(A21)))[:, None]
     shift = 0.5 * (variance * (by_uu + by_vv) - (du**2 * by_uu + 2.0 * du * dv * by_uv + dv**2 * by_vv))
     good: BoolArray = np.linalg.norm(shift, axis=1) < MAX_CURVATURE_PX
     pixels2 = grown.pixels2.copy()

@@ -10,6 +10,7 @@ surface lose their weight.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -87,8 +88,10 @@ class GrownSurface:
 
     def where(self, keep: BoolArray) -> GrownSurface:
         """Return the planes of the nodes `keep` (R, C) alone."""
-        names = [field.name for field in fields(self) if field.name != "at_end"]
-        return replace(self, **{name: _where(keep, getattr(self, name)) for name in names})
+        known: dict[str, Any] = {
+            f.name: _where(keep, getattr(self, f.name)) for f in fields(self) if f.name != "at_end"
+        }
+        return replace(self, **known)
 
 
 def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> NodeMeasurements:
