@@ -263,6 +263,26 @@ EXPORT void read_modules(
     ARRAY(const double, patterns, patterns_count, side * side), int64_t patterns_count, ARRAY(double, bright, side * side),
     ARRAY(double, spread, count), ARRAY(double, likeness, count, patterns_count));
 
+/* tags.c */
+
+/* What comes out of a tag: moves of the four corners (8), their standard deviations (4), blur, contrast, RMS residual,
+ * whether it settled. Terms of a cubic polynomial of two variables. Doubles of a pixel. */
+enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SPOT = 9 };
+
+/* The constants of detection.tags.whole, under their names there. */
+typedef struct {
+    double tail_sigmas, pixel_kurtosis, sharp_blur, least_blur, most_blur, most_move_px, most_blur_change, light_sigma;
+    double least_variance, converged_px;
+    int64_t iterations;
+} tag_rules_t;
+
+EXPORT void fit_tags(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2), ARRAY(const double, scales, count),
+    ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells, ARRAY(const double, breaks, cells - 1), double reach,
+    ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
+    ARRAY(double, scratch, most, TAG_SPOT), ARRAY(double, out, count, TAG_OUTCOMES));
+
 /* circles.c */
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness

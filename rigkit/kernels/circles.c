@@ -67,40 +67,6 @@ INLINE double bell(double z)
     return 0.3989422804014327 * exp(-0.5 * z * z);
 }
 
-/* Return whether the lower triangle of the symmetric `N` (n x n) could be made its Cholesky factor. */
-static int factor(double *N, int n)
-{
-    for (int j = 0; j < n; j++) {
-        double left = N[j * n + j];
-        for (int k = 0; k < j; k++)
-            left -= N[j * n + k] * N[j * n + k];
-        if (!(left > 1e-12 * fabs(N[j * n + j])) || !(left > 0.0))
-            return 0;
-        N[j * n + j] = sqrt(left);
-        for (int i = j + 1; i < n; i++) {
-            double rest = N[i * n + j];
-            for (int k = 0; k < j; k++)
-                rest -= N[i * n + k] * N[j * n + k];
-            N[i * n + j] = rest / N[j * n + j];
-        }
-    }
-    return 1;
-}
-
-static void solve(const double *L, int n, double *x)
-{
-    for (int i = 0; i < n; i++) {
-        for (int k = 0; k < i; k++)
-            x[i] -= L[i * n + k] * x[k];
-        x[i] /= L[i * n + i];
-    }
-    for (int i = n - 1; i >= 0; i--) {
-        for (int k = i + 1; k < n; k++)
-            x[i] -= L[k * n + i] * x[k];
-        x[i] /= L[i * n + i];
-    }
-}
-
 INLINE int inverted(const double M[4], double out[4])
 {
     const double det = M[0] * M[3] - M[1] * M[2];
@@ -281,22 +247,22 @@ void fit_circles(
             linearise(&at, spots, seen, N, step);
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
-            solved = factor(N, PARAMETERS);
+            solved = cholesky(N, PARAMETERS);
             if (!solved)
                 break;
-            solve(N, PARAMETERS, step);
+            cholesky_solve(N, PARAMETERS, step);
             moved(&at, step, rules);
             settled = fabs(step[X]) + fabs(step[Y]) < rules->converged_px;
         }
         if (!solved)
             continue;
         sum = linearise(&at, spots, seen, N, step);
-        if (!factor(N, PARAMETERS))
+        if (!cholesky(N, PARAMETERS))
             continue;
         double cov[2][PARAMETERS] = {{0.0}};
         cov[0][X] = cov[1][Y] = 1.0;
-        solve(N, PARAMETERS, cov[0]);
-        solve(N, PARAMETERS, cov[1]);
+        cholesky_solve(N, PARAMETERS, cov[0]);
+        cholesky_solve(N, PARAMETERS, cov[1]);
         result[0] = at.c[0];
         result[1] = at.c[1];
         memcpy(result + 2, at.M, sizeof at.M);

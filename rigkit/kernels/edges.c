@@ -198,37 +198,6 @@ static void collect(
 /* Beyond so many s an edge is flat to float32; the exponential below needs a limit. */
 #define FLAT_SIGMAS 12.0f
 
-/* Return exp(y) for -80 <= y <= 0: 2^n times Taylor's series of the rest, relative error below 2e-7. */
-INLINE float decay(float y)
-{
-    const int32_t n = (int32_t)(y * 1.44269504f - 0.5f);
-    const float r = (y - (float)n * 0.693359375f) + (float)n * 2.12194440e-4f;
-    const float series =
-        1.0f + r * (1.0f + r * (0.5f + r * (1.0f / 6.0f + r * (1.0f / 24.0f + r * (1.0f / 120.0f + r * (1.0f / 720.0f))))));
-    const int32_t bits = (n + 127) * (1 << 23);
-    float power;
-    memcpy(&power, &bits, sizeof power);
-    return series * power;
-}
-
-/* reference.edges._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
-INLINE void blurred_edge(float x, float kurtosis, float out[5])
-{
-    const float square = x * x, gauss = decay(-0.5f * square);
-    const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
-    const float tail =
-        t * (0.254829592f + t * (-0.284496736f + t * (1.421413741f + t * (-1.453152027f + t * 1.061405429f)))) * gauss;
-    const float error = copysignf(1.0f - tail, x);
-    const float density = 0.79788456f * gauss, part = kurtosis * (1.0f / 24.0f);
-    const float third = part * x * (square - 3.0f) * density;
-    const float slope = density * (1.0f + part * (square * (square - 6.0f) + 3.0f));
-    out[0] = error - third;
-    out[1] = slope;
-    out[2] = -density * x * (1.0f + part * (square * (square - 10.0f) + 15.0f));
-    out[3] = density * (square - 1.0f);
-    out[4] = x * slope - 4.0f * third;
-}
-
 INLINE line_t line_of(
     double angle, double curvature, const double gaps[2], const double tilts[2], const double paper[2], double blur, const edge_rules_t *rules)
 {

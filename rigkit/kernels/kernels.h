@@ -241,4 +241,70 @@ INLINE double quick_median(double *values, int64_t count)
     return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
 }
 
+/* Return whether the lower triangle of the symmetric `N` (n x n) could be made its Cholesky factor. */
+INLINE int cholesky(double *N, int n)
+{
+    for (int j = 0; j < n; j++) {
+        double left = N[j * n + j];
+        for (int k = 0; k < j; k++)
+            left -= N[j * n + k] * N[j * n + k];
+        if (!(left > 1e-12 * fabs(N[j * n + j])) || !(left > 0.0))
+            return 0;
+        N[j * n + j] = sqrt(left);
+        for (int i = j + 1; i < n; i++) {
+            double rest = N[i * n + j];
+            for (int k = 0; k < j; k++)
+                rest -= N[i * n + k] * N[j * n + k];
+            N[i * n + j] = rest / N[j * n + j];
+        }
+    }
+    return 1;
+}
+
+/* Set `x` to the solution of N x = `x`, `L` being what `cholesky` made of N. */
+INLINE void cholesky_solve(const double *L, int n, double *x)
+{
+    for (int i = 0; i < n; i++) {
+        for (int k = 0; k < i; k++)
+            x[i] -= L[i * n + k] * x[k];
+        x[i] /= L[i * n + i];
+    }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int k = i + 1; k < n; k++)
+            x[i] -= L[k * n + i] * x[k];
+        x[i] /= L[i * n + i];
+    }
+}
+
+/* Return exp(y) for -80 <= y <= 0: 2^n times Taylor's series of the rest, relative error below 2e-7. */
+INLINE float decay(float y)
+{
+    const int32_t n = (int32_t)(y * 1.44269504f - 0.5f);
+    const float r = (y - (float)n * 0.693359375f) + (float)n * 2.12194440e-4f;
+    const float series =
+        1.0f + r * (1.0f + r * (0.5f + r * (1.0f / 6.0f + r * (1.0f / 24.0f + r * (1.0f / 120.0f + r * (1.0f / 720.0f))))));
+    const int32_t bits = (n + 127) * (1 << 23);
+    float power;
+    memcpy(&power, &bits, sizeof power);
+    return series * power;
+}
+
+/* reference.edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
+INLINE void blurred_edge(float x, float kurtosis, float out[5])
+{
+    const float square = x * x, gauss = decay(-0.5f * square);
+    const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
+    const float tail =
+        t * (0.254829592f + t * (-0.284496736f + t * (1.421413741f + t * (-1.453152027f + t * 1.061405429f)))) * gauss;
+    const float error = copysignf(1.0f - tail, x);
+    const float density = 0.79788456f * gauss, part = kurtosis * (1.0f / 24.0f);
+    const float third = part * x * (square - 3.0f) * density;
+    const float slope = density * (1.0f + part * (square * (square - 6.0f) + 3.0f));
+    out[0] = error - third;
+    out[1] = slope;
+    out[2] = -density * x * (1.0f + part * (square * (square - 10.0f) + 15.0f));
+    out[3] = density * (square - 1.0f);
+    out[4] = x * slope - 4.0f * third;
+}
+
 #endif

@@ -8,7 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from rigkit.benchmark.corner_bound import position_bound
 from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
+from rigkit.benchmark.tag_bound import tag_information
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
@@ -76,6 +78,27 @@ def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.
     assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
     assert np.sqrt((off**2).mean()) < (0.03 if pattern.corner_squares else 0.1)
     assert 0.7 < np.sqrt(((off / found.sigma_px[:, None]) ** 2).mean()) < 1.3
+
+
+@pytest.mark.parametrize("squares", [True, False])
+def test_tags_with_borders_narrower_than_windows_are_fitted_whole(squares: bool) -> None:
+    """Modules of little more than a pixel, slanted at the rim of a fisheye, are as fine as information has it."""
+    board = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=squares))
+    squared, bounds, relative = 0.0, 0.0, []
+    for seed in (1, 3):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, lens="fisheye", board=board)
+        (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
+        truth = scene.truth()[0]
+        place = np.zeros((board.rows, board.columns), np.int64)
+        place[truth.grid[:, 1], truth.grid[:, 0]] = np.arange(len(truth.grid))
+        bound = np.trace(position_bound(tag_information(scene, 0.7), 2.0), axis1=1, axis2=2)
+        bound = bound[place[found.grid[:, 1], found.grid[:, 0]]]
+        off, known = errors(found, truth), np.isfinite(bound)
+        squared, bounds = squared + (off[known] ** 2).sum(), bounds + bound[known].sum()
+        relative.append(off / found.sigma_px[:, None])
+    assert np.sqrt(squared / bounds) < 1.15
+    assert 0.8 < np.sqrt((np.concatenate(relative) ** 2).mean()) < 1.3
 
 
 def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> None:

@@ -1,0 +1,56 @@
+"""The kernel in tags.c: the fit of whole tags whose modules are known."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
+
+TAG_OUTCOMES, TAG_TERMS, TAG_SPOT = (header().constants[name] for name in ("TAG_OUTCOMES", "TAG_TERMS", "TAG_SPOT"))
+
+
+@structure("tag_rules_t")
+class TagRules(Struct):
+    """The constants of the model of a tag and its fit."""
+
+
+def fit_tags(
+    image: NDArray[np.uint8] | NDArray[np.float32],
+    maps: FloatArray,
+    centres: FloatArray,
+    scales: FloatArray,
+    ink: BoolArray,
+    breaks: FloatArray,
+    reach: float,
+    blur: FloatArray,
+    contrast: FloatArray,
+    bend_sigma: FloatArray,
+    rules: TagRules,
+) -> FloatArray:
+    """Return the outcomes of N tags, (N, 16).
+
+    Parameters
+    ----------
+    maps : (N, 2, 10) polynomials of 1, u, v, uu, uv, vv, uuu, uuv, uvv, vvv, (u, v) the position from `centres` (N, 2)
+        over `scales` (N,): the place in the tag, (0, 0) to (1, 1).
+    ink : (N, C, C) which of the cells between the `breaks` (C - 1,) along y and x are dark.
+    reach : pixels are used so far beyond the tag, in its sides.
+    blur, contrast : (N,) where to start.
+    bend_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
+    """
+    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
+    known = [np.ascontiguousarray(part, np.float64) for part in (maps, centres, scales)]
+    starts = [np.ascontiguousarray(part, np.float64) for part in (blur, contrast, bend_sigma)]
+    most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) + 2.0) ** 2)
+    height, width = grey.shape
+    out = np.empty((len(maps), TAG_OUTCOMES))
+    kernels().fit_tags(
+        *(grey, grey.dtype == np.uint8, width, height, len(maps), *known),
+        *(np.ascontiguousarray(ink, np.bool_), ink.shape[1], np.ascontiguousarray(breaks, np.float64), reach),
+        *(*starts, rules, most, np.empty((most, TAG_SPOT)), out),
+    )
+    return out
