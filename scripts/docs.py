@@ -7,7 +7,9 @@ python scripts/docs.py [--serve]
 from __future__ import annotations
 
 import argparse
+import ast
 import itertools
+import re
 import shutil
 import subprocess
 import sys
@@ -172,6 +174,29 @@ def api_page() -> str:
     return "\n".join(parts)
 
 
+def code_page() -> str:
+    """Return the page that says of every module in a line what it is about, by room, from the top layer down."""
+    layers = re.findall(r"^ {4,5}\d+ {2,}(\w.*?)(?: {2,}|$)", str(rigkit.__doc__), re.MULTILINE)
+    parts = ["# Every module in a line\n\nMade of their first lines, from the command line down.\n"]
+    for room in (name for row in layers for name in row.split(" | ")):
+        for folder in (
+            ROOT / "rigkit" / room,
+            *sorted(p.parent for p in (ROOT / "rigkit" / room).glob("*/__init__.py")),
+        ):
+            parts.append(
+                f"## {folder.relative_to(ROOT / 'rigkit').as_posix()}\n\n{_first_line(folder / '__init__.py')}\n"
+            )
+            modules = sorted(path for path in folder.glob("*.py") if path.stem != "__init__")
+            parts += [f"- `{path.stem}`: {_first_line(path)}" for path in modules]
+            parts.append("")
+    return "\n".join(parts)
+
+
+def _first_line(path: Path) -> str:
+    words = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return words.partition("\n\n")[0].replace("\n", " ")
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split(":")[0])
     parser.add_argument("--serve", action="store_true", help="serve the pages on this machine instead of building them")
@@ -179,6 +204,7 @@ def main() -> int:
     made_pictures()
     (PAGES / "keys.md").write_text(keys_page(), encoding="utf-8")
     (PAGES / "api.md").write_text(api_page(), encoding="utf-8")
+    (PAGES / "code.md").write_text(code_page(), encoding="utf-8")
     command = [
         sys.executable,
         "-m",

@@ -22,7 +22,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("cameras",),
     ("rectification",),
     ("affine", "relative_pose", "calibration", "synthetic", "interop"),
-    ("detection", "identification", "targets"),
+    ("detection", "identification"),
     ("reconstruction", "planning"),
     ("validation", "study", "benchmark"),
     ("io",),
@@ -112,6 +112,15 @@ def test_a_module_imports_only_rows_below() -> None:
     assert not wrong
 
 
+def test_the_layers_are_those_of_the_docstring() -> None:
+    import rigkit
+
+    rows = re.findall(r"^ {4}([ \d]\d)  (\w+(?: \| \w+)*)", rigkit.__doc__ or "", re.MULTILINE)
+    told = {int(level): set(names.split(" | ")) for level, names in rows}
+    assert told == {level: set(row) for level, row in enumerate(LAYERS)}
+    assert set(LEVEL) == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+
+
 def test_no_module_is_part_of_a_circle() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
     assert circles(import_graph()) == []
@@ -157,6 +166,16 @@ def test_a_verb_is_a_page() -> None:
         for verb, (home, _) in VERBS.items()
     }
     assert not {verb: n for verb, n in lines.items() if n > MAX_VERB_LINES}
+
+
+def test_every_room_says_what_is_in_it() -> None:
+    """And calibration lists modules that there are, in the order of the work."""
+    rooms = [path for path in MODULES if path.name == "__init__.py"]
+    assert not [path for path in rooms if not ast.get_docstring(tree_of(path))]
+    calibration = PACKAGE / "calibration"
+    listed = set(re.findall(r"`(\w+)(?:\.py)?`", ast.get_docstring(tree_of(calibration / "__init__.py")) or ""))
+    there = {path.stem for path in calibration.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert listed <= there
 
 
 def place_of(path: Path, name: str) -> str:
