@@ -11,7 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from rigkit.core.arrays import FloatArray
 from rigkit.core.posetype import PoseType
+from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -33,6 +35,8 @@ of some squares."""
 SIDE_DEG = 15.0
 """Standard deviation of the direction that a person calls a side of a scene."""
 LIMIT_K = 2.0
+MAX_TURNED_DEG = 45.0
+"""Between its two walls a person names the sides of a room's corner alike, however the camera is turned."""
 
 
 def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> tuple[Check, ...]:
@@ -43,6 +47,7 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
     """
     ratio = {name: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for name, b in boards.items()}
     checks = []
+    sides = _sides(boards, layout)
     for name, found in boards.items():
         # Of three and more the middle one is right, whichever is wrong.
         others = [value for other, value in ratio.items() if other != name or len(ratio) > 2]
@@ -52,9 +57,7 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
             known = (side, found.board.square_sigma_mm or RULER_MM, "declared; by the other boards")
             checks.append(compare(f"size {name}", "board size", "mm", known, ours, LIMIT_K, found.plane.count))
         if name in layout:
-            off = {
-                s: np.degrees(np.arccos(np.clip(found.plane.normal @ to, -1.0, 1.0))) for s, to in BOARD_SIDES.items()
-            }
+            off = {s: np.degrees(np.arccos(np.clip(found.plane.normal @ to, -1.0, 1.0))) for s, to in sides.items()}
             nearest = min(off, key=lambda s: float(off[s]))
             # How much nearer the board faces another side: nothing where the declared one is the nearest.
             beyond = (float(off[layout[name]] - off[nearest]), float("nan"))
@@ -62,6 +65,22 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
             known = (0.0, SIDE_DEG, words)
             checks.append(compare(f"layout {name}", "layout", "deg", known, beyond, LIMIT_K, found.plane.count))
     return tuple(check for check in checks if not check.passed)
+
+
+def _sides(boards: Mapping[str, BoardResult], layout: Mapping[str, str]) -> dict[str, FloatArray]:
+    """Return where each side of the scene faces, turned about the camera's y axis as the listed walls stand, if there
+    are two: in the corner of a room none of them stands where its side does."""
+    sides = {side: np.array(to) for side, to in BOARD_SIDES.items()}
+    walls = [(boards[name].plane.normal, sides[side]) for name, side in layout.items() if name in boards]
+    walls = [(normal, to) for normal, to in walls if to[1] == 0.0]
+    if len(walls) < 2:
+        return sides
+    # The sum of the cosines is along cos(turn) + across sin(turn).
+    along = sum(float(n[0] * to[0] + n[2] * to[2]) for n, to in walls)
+    across = sum(float(n[0] * to[2] - n[2] * to[0]) for n, to in walls)
+    most = np.radians(MAX_TURNED_DEG)
+    turn = exp_so3([0.0, float(np.clip(np.arctan2(across, along), -most, most)), 0.0])
+    return {side: np.asarray(turn @ to) for side, to in sides.items()}
 
 
 def declaration_checks(reconstruction: Reconstruction) -> tuple[tuple[Check, ...], tuple[str, ...]]:

@@ -95,7 +95,7 @@ class Capture:
     cam_from_rig: dict[str, Rigid3] = field(default_factory=dict)
     bend_mm: float = 0.0
     partial: float = 0.15
-    count: int = 14
+    count: int = 12
     exposure: Exposure = field(default_factory=Exposure)
 
     @property

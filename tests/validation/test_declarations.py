@@ -13,11 +13,13 @@ from helpers.reconstructions import BOARDS
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, PairTruth
+from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.validation.checks import validate, validate_each
+from rigkit.validation.declarations import contradicted_boards
 
 TRUTH = PairTruth(None, (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),))
 
@@ -82,6 +84,33 @@ def test_a_board_of_another_size_than_declared_fails_with_its_size(rng: np.rando
     assert not row.passed and not report.passed
     assert row.ours == pytest.approx(BOARDS[1].square_x_mm, rel=0.01) and row.measured == wrong.square_x_mm
     assert [check.name for check in report.checks if check.kind == "board size"] == [row.name]
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "declared_sides", "wrong"),
+    [
+        (0.0, ("left", "right"), False),
+        (40.0, ("left", "right"), False),
+        (-40.0, ("left", "right"), False),
+        (0.0, ("right", "left"), True),
+        (40.0, ("right", "left"), True),
+        (80.0, ("left", "right"), True),
+    ],
+)
+def test_the_walls_of_a_corner_keep_their_sides_when_the_camera_turns(
+    yaw_deg: float, declared_sides: tuple[str, str], wrong: bool, rng: np.random.Generator
+) -> None:
+    """Two walls at a right angle, seen from between them, both stand half-way to the back; the floor is as it is."""
+    found = validate(declared(PoseType.GENERAL, PoseType.GENERAL, rng), TRUTH).boards
+    half = np.sqrt(0.5)
+    turn = exp_so3([0.0, np.radians(yaw_deg), 0.0])
+    normals = [turn @ n for n in ([half, 0.0, -half], [-half, 0.0, -half], [0.0, -1.0, 0.0])]
+    boards = {
+        name: replace(result, plane=replace(result.plane, normal=normal))
+        for name, result, normal in zip(("a", "b", "c"), found, normals, strict=True)
+    }
+    layout = dict(zip(("a", "b", "c"), (*declared_sides, "floor"), strict=True))
+    assert any(check.kind == "layout" for check in contradicted_boards(boards, layout)) == wrong
 
 
 def test_a_board_on_another_side_than_declared_fails(rng: np.random.Generator) -> None:
