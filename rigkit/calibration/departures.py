@@ -21,12 +21,13 @@ inadequacy as a random function beside its parameters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
@@ -36,8 +37,12 @@ DISPLACEMENTS = len(RADIAL_POWERS) + 8
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
 """A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
 smaller than the first are rounding, and tell nothing."""
-SIZES_TRIED = 12
+SIZES_TRIED = 8
 """So many sizes between them are tried."""
+ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
+"""Of at least so many corners every second (third ...) is taken, where as many of each view are left."""
+CORNERS_AT_A_TIME = 8192
+"""Their derivatives then stay in the cache, and memory does not grow with the views."""
 RIDGE = 1e-12
 """Added to the information of parameters, as a part of its mean: those that do not move take up nothing."""
 
@@ -73,27 +78,36 @@ class Departures:
 
 def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
     """Return the displacements (2, J, M) at pixels (M, 2), px: of about one px in the corners of the image."""
-    x, y = (pixels - image_center(size_px)).T / (0.5 * np.hypot(*size_px))
-    square = x * x + y * y
-    out = np.empty((2, DISPLACEMENTS, len(pixels)))
-    for j, power in enumerate(RADIAL_POWERS):
-        stretch = square ** (power // 2)
-        np.multiply(stretch, x, out=out[0, j])
-        np.multiply(stretch, y, out=out[1, j])
-    zero = np.zeros(len(pixels))
-    k = len(RADIAL_POWERS)
-    # Decentring (tangential distortion), thin prisms, both again with the square of the radius, aspect ratio, shear.
-    out[0, k:], out[1, k:] = (
-        (square + 2.0 * x * x, 2.0 * x * y, square, zero, square * square, zero, x, y),
-        (2.0 * x * y, square + 2.0 * y * y, zero, square, zero, square * square, -y, x),
-    )
+    out = np.zeros((2, DISPLACEMENTS, len(pixels)))
+    _displace(out, pixels[:, 0], pixels[:, 1], size_px)
     return out
+
+
+def _displace(out: FloatArray, u: FloatArray, v: FloatArray, size_px: tuple[int, int]) -> None:
+    """Write the displacements at (u, v), (M,) each, into `out` (2, J, M), which is zero."""
+    centre, scale = image_center(size_px), 2.0 / np.hypot(*size_px)
+    x, y = (u - centre[0]) * scale, (v - centre[1]) * scale
+    xx, xy, yy = x * x, x * y, y * y
+    square = xx + yy
+    np.multiply(square, x, out=out[0, 0])
+    np.multiply(square, y, out=out[1, 0])
+    for j in range(1, len(RADIAL_POWERS)):
+        np.multiply(square, out[:, j - 1], out=out[:, j])
+    # Decentring (tangential distortion), thin prisms, these again with the square of the radius, aspect ratio, shear.
+    k = len(RADIAL_POWERS)
+    out[0, k], out[1, k] = square + 2.0 * xx, 2.0 * xy
+    out[0, k + 1], out[1, k + 1] = out[1, k], square + 2.0 * yy
+    out[0, k + 2] = out[1, k + 3] = square
+    out[0, k + 4] = out[1, k + 5] = square * square
+    out[0, k + 6], out[1, k + 6] = x, -y
+    out[0, k + 7], out[1, k + 7] = y, x
 
 
 def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     """Return E[a a^T] (J, J) of amounts a of which the images give the information (J, J) and the score (J,), averaged
     over the sizes that those along the radius, and the others, may have beforehand."""
-    sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, SIZES_TRIED)
+    # The middles of so many equal parts.
+    sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, 2 * SIZES_TRIED + 1)[1::2]
     along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
     prior = np.where(np.arange(DISPLACEMENTS) < len(RADIAL_POWERS), along[:, None], others[:, None])
     scaled = np.eye(DISPLACEMENTS) + prior[:, :, None] * information * prior[:, None, :]
@@ -111,31 +125,41 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
 def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, int]:
     """Return the sums of products (K, K) of derivatives by the parameters in units of `sigmas` (P,), the displacements
     and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the parameters."""
-    rows, count = _rows(calibration, sigmas)
-    each = rows.shape[1] - 6
-    out = np.zeros((each, each))
-    for part in rows:
-        out += part[6:] @ part[6:].T
-    stops = np.cumsum(count)
-    of_views = [slice(stop - n, stop) for n, stop in zip(count.tolist(), stops.tolist(), strict=True)]
-    with_pose = np.array([rows[0, :, s] @ rows[0, :6, s].T + rows[1, :, s] @ rows[1, :6, s].T for s in of_views])
+    views = [view for view in calibration.views if view.kept.any()]
+    kept = [np.flatnonzero(view.kept) for view in views]
+    # Of very many corners some tell enough.
+    fewest, total = min(len(own) for own in kept), sum(len(own) for own in kept)
+    every = max(1, min(total // ENOUGH_CORNERS, fewest // CORNERS_OF_VIEW))
+    used = [own[::every] for own in kept]
+    count = np.array([len(own) for own in used])
+    each = len(sigmas) + DISPLACEMENTS + 1
+    out, with_pose = np.zeros((each, each)), np.empty((len(views), each + 6, 6))
+    block = np.cumsum(count) // CORNERS_AT_A_TIME
+    for number in np.unique(block):
+        chosen = np.flatnonzero(block == number)
+        rows = _rows(calibration, [(views[k], used[k]) for k in chosen], sigmas)
+        for part in rows:
+            out += part[6:] @ part[6:].T
+        stop = 0
+        for k in chosen:
+            own = slice(stop, stop + count[k])
+            stop = own.stop
+            with_pose[k] = rows[0, :, own] @ rows[0, :6, own].T + rows[1, :, own] @ rows[1, :6, own].T
     coupling = with_pose[:, 6:]
     back = pose_inverses(with_pose[:, :6]) @ np.swapaxes(coupling, 1, 2)
     out -= coupling.transpose(1, 0, 2).reshape(each, -1) @ back.reshape(-1, each)
     return out, int(2 * count.sum()) - 6 * len(count)
 
 
-def _rows(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return for the kept corners, view by view, (2, K, N): derivatives by the view's pose (6), by the parameters, the
-    displacements, the residual; and how many corners each view has (V,)."""
-    views = [view for view in calibration.views if view.kept.any()]
-    count = np.array([int(view.kept.sum()) for view in views])
+def _rows(calibration: Calibration, used: Sequence[tuple[ViewResult, IntArray]], sigmas: FloatArray) -> FloatArray:
+    """Return for the corners used of some views (2, K, N): derivatives by the view's pose (6), by the parameters, the
+    displacements, the residual. Corners that do not project are zero."""
     shapes = {board.board_id: board for board in calibration.boards}
-    points = np.concatenate([shapes[v.board_id].at(v.grid[v.kept]) for v in views])
-    view = np.repeat(np.arange(len(views)), count)
-    rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
+    points = np.concatenate([shapes[v.board_id].at(v.grid[own]) for v, own in used])
+    view = np.repeat(np.arange(len(used)), [len(own) for _, own in used])
+    rotation = np.array([one.cam_from_board.rotation for one, _ in used]).transpose(1, 2, 0)[..., view]
     lever = (rotation * points.T).sum(axis=1)
-    in_cam = lever + np.array([one.cam_from_board.translation_mm for one in views])[view].T
+    in_cam = lever + np.array([one.cam_from_board.translation_mm for one, _ in used]).T[:, view]
     p = len(sigmas)
     rows = np.zeros((2, 6 + p + DISPLACEMENTS + 1, len(points)))
     by_point = rows[:, 3:6]
@@ -145,9 +169,9 @@ def _rows(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, Int
         np.multiply(lever[i], by_point[:, j], out=rows[:, k])
         rows[:, k] -= lever[j] * by_point[:, i]
     rows[:, 6 : 6 + p] *= sigmas[:, None]
-    rows[:, 6 + p : -1] = displacements(np.stack([u, v], axis=-1), calibration.camera.size_px)
-    rows[:, -1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
-    told = valid & np.isfinite(rows).all(axis=(0, 1))
+    _displace(rows[:, 6 + p : -1], u, v, calibration.camera.size_px)
+    rows[:, -1] = np.concatenate([one.residuals_px[own] for one, own in used]).T
+    told = valid & np.isfinite(rows[:, -1]).all(axis=0)
     if not told.all():
         rows[..., ~told] = 0.0
-    return rows, count
+    return rows

@@ -198,7 +198,8 @@ class BoardShape:
 
     def at(self, grid: IntArray) -> Points:
         """Return the corners (N, 3) at places of the grid (N, 2), column and row."""
-        return np.asarray(self.points_mm[grid @ np.array([1, self.board.columns])])
+        columns = self.board.columns if self.declared is None else self.declared.columns
+        return np.asarray(self.points_mm[grid @ np.array([1, columns])])
 
     @property
     def board(self) -> Board:
