@@ -28,12 +28,16 @@ from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
+from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
 from rigkit.workflows.camera_files import import_camera, import_rig, is_ours
+from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
 CLOUD = "scene.ply"
+SCENE_PAGE = "scene.html"
+"""The cloud, to be turned in a browser."""
 MAPS = "maps.npz"
 """Depth, range and normals at pixels of the first image."""
 
@@ -306,6 +310,7 @@ def _files(
     if not options.pictures:
         return files
     files["cloud.png"] = cloud_png(r, unit=unit)
+    files[SCENE_PAGE] = build_cloud_page(f"Scene {r.pair_id}", r.cloud, software_facts(), unit=unit)
     if images:
         files["epipolar.png"] = epipolar_png(r, *images, every=max(1, len(r.cloud) // 40))
         files["normals.png"] = normals_png(scene, found, *images)

@@ -28,7 +28,8 @@ def view(pattern: NDArray[np.float32], A: NDArray[np.float64], rng: np.random.Ge
 
 def errors_in_sigmas(scale: float, rng: np.random.Generator) -> float:
     """Return the median error of the affinities of patches all over the image, in their sigmas."""
-    pattern = cv2.resize(texture(np.random.default_rng(3))[:1024, :1024], (2048, 2048), interpolation=cv2.INTER_CUBIC)
+    part = texture(np.random.default_rng(3))[:1024, :1024]
+    pattern = np.asarray(cv2.resize(part, (2048, 2048), interpolation=cv2.INTER_CUBIC), np.float32)
     A = scale * np.array([[1.04, -0.14], [0.22, 0.93]])
     first, second = (patch_pyramid(view(pattern, B, rng)) for B in (np.eye(2), A))
     nodes = np.stack(np.meshgrid(*(np.arange(60.0, SIDE - 60.0, 12.0),) * 2), axis=-1).reshape(-1, 2)

@@ -68,7 +68,7 @@ def test_three_views_become_one_cloud(
     off = np.abs((points - corner.apex_mm) @ corner.axes).min(axis=1)
     # Of a distance of 1.3 m: a thousandth.
     assert np.median(off) < 1.3
-    assert sorted(p.name for p in (folder / "out").iterdir()) == ["cloud.png", "scene.ply"]
+    assert sorted(p.name for p in (folder / "out").iterdir()) == ["cloud.png", "scene.html", "scene.ply"]
 
 
 def test_what_cannot_be_fused_is_said(

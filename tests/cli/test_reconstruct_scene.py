@@ -47,7 +47,7 @@ def test_a_file_of_correspondences(files: tuple[Path, Rigid3], capsys: pytest.Ca
     # 60 points at 0.3 px know the pose to about 0.05 degrees.
     assert max(pose_errors_deg(Rigid3.from_matrix(result["cam2_from_cam1"]), pose)) < 0.5
     assert len(read_ply(folder / "out" / "scene.ply")) == result["points"] > 50
-    assert sorted(p.name for p in (folder / "out").iterdir()) == ["cloud.png", "scene.ply"]
+    assert sorted(p.name for p in (folder / "out").iterdir()) == ["cloud.png", "scene.html", "scene.ply"]
     assert run(folder, "--correspondences", str(folder / "found.csv")) == 2
     assert "--force" in capsys.readouterr().err
     assert run(folder, "--correspondences", str(folder / "found.csv"), "--force", "--no-pictures") == 0
@@ -87,7 +87,15 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
     result = json.loads(capsys.readouterr().out)
     assert max(pose_errors_deg(Rigid3.from_matrix(result["cam2_from_cam1"]), CAM2_FROM_CAM1)) < 0.5
     found = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert found == ["cloud.png", "correspondences.csv", "epipolar.png", "maps.npz", "normals.png", "scene.ply"]
+    assert found == [
+        "cloud.png",
+        "correspondences.csv",
+        "epipolar.png",
+        "maps.npz",
+        "normals.png",
+        "scene.html",
+        "scene.ply",
+    ]
     with np.load(tmp_path / "out" / "maps.npz") as maps:
         known = np.isfinite(maps["depth"])
         assert known.sum() == result["points"]

@@ -1,0 +1,122 @@
+// A dense cloud that turns: points of one packed array, drawn into an image with a depth for every pixel. No library and
+// no graphics card is needed for a hundred thousand points. Drag turns, with shift moves, wheel zooms, double click resets.
+// Packed: float32 places x, y, z (x right, y down, z forward; about the middle, in units of the reach), int8 normals over
+// 127, uint8 red, green, blue.
+"use strict";
+
+const CLOUD_START = {yaw: -0.3, pitch: 0.2, zoom: 1, u: 0, v: 0};
+const CLOUD_DISTANCE = 2.6;
+const CLOUD_FILL = 1.3;
+const CLOUD_TURN = 0.008;
+const NEAREST = 0.1;
+const MOST_PX = 7;
+
+function cloudView(canvas) {
+  const packed = Uint8Array.from(atob(document.getElementById(canvas.dataset.cloud).textContent), (c) => c.charCodeAt(0));
+  const count = Number(canvas.dataset.count), spacing = Number(canvas.dataset.spacing);
+  const places = new Float32Array(packed.buffer, 0, 3 * count);
+  const normals = new Int8Array(packed.buffer, 12 * count, 3 * count), colours = packed.subarray(15 * count);
+  const tools = canvas.parentElement, pen = canvas.getContext("2d", {willReadFrequently: true});
+  const shape = tools.querySelector("[data-shape]"), turning = tools.querySelector("[data-turn]");
+  let view = {...CLOUD_START}, image = null, depths = null, asked = false, last = null;
+
+  function draw() {
+    asked = false;
+    if (!canvas.clientWidth) return;
+    const begin = performance.now(), ratio = window.devicePixelRatio || 1;
+    const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+    if (!image || canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+      image = pen.createImageData(width, height);
+      depths = new Float32Array(width * height);
+    }
+    const out = new Uint32Array(image.data.buffer), lit = shape.checked;
+    out.fill(0);
+    depths.fill(Infinity);
+    const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw), cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
+    const scale = view.zoom * CLOUD_FILL * Math.min(width, height);
+    const middle = width / 2 + view.u * ratio, centre = height / 2 + view.v * ratio;
+    for (let k = 0, j = 0; k < count; k++, j += 3) {
+      const x = places[j], y = places[j + 1], z = places[j + 2];
+      const aside = cy * x + sy * z, ahead = cy * z - sy * x;
+      const down = cp * y + sp * ahead, far = cp * ahead - sp * y + CLOUD_DISTANCE;
+      if (far < NEAREST) continue;
+      const here = scale / far, side = Math.min(MOST_PX, Math.ceil(spacing * here));
+      const left = Math.round(middle + here * aside - side / 2), top = Math.round(centre + here * down - side / 2);
+      if (left < 0 || top < 0 || left + side > width || top + side > height) continue;
+      let red = colours[j], green = colours[j + 1], blue = colours[j + 2];
+      if (lit) {
+        const facing = cp * (sy * normals[j] - cy * normals[j + 2]) + sp * normals[j + 1];
+        red = green = blue = 60 + 1.5 * Math.max(0, facing);
+      }
+      const colour = (255 << 24) | (blue << 16) | (green << 8) | red;
+      for (let row = top; row < top + side; row++) {
+        for (let at = row * width + left, end = at + side; at < end; at++) {
+          if (far < depths[at]) {
+            depths[at] = far;
+            out[at] = colour;
+          }
+        }
+      }
+    }
+    pen.putImageData(image, 0, 0);
+    canvas.dataset.view = `${view.yaw.toFixed(3)} ${view.pitch.toFixed(3)} ${view.zoom.toFixed(3)}`;
+    canvas.dataset.ms = (performance.now() - begin).toFixed(2);
+    if (turning.checked) turn();
+  }
+
+  function ask() {
+    if (!asked) requestAnimationFrame(draw);
+    asked = true;
+  }
+
+  function turn() {
+    view.yaw += CLOUD_TURN;
+    ask();
+  }
+
+  canvas.addEventListener("pointerdown", (e) => {
+    last = [e.clientX, e.clientY];
+    canvas.setPointerCapture(e.pointerId);
+  });
+  canvas.addEventListener("pointermove", (e) => {
+    if (!last) return;
+    const by = [e.clientX - last[0], e.clientY - last[1]];
+    last = [e.clientX, e.clientY];
+    if (e.shiftKey) {
+      view.u += by[0];
+      view.v += by[1];
+    } else {
+      view.yaw -= by[0] * CLOUD_TURN;
+      view.pitch = Math.max(-1.57, Math.min(1.57, view.pitch + by[1] * CLOUD_TURN));
+    }
+    ask();
+  });
+  canvas.addEventListener("pointerup", () => (last = null));
+  canvas.addEventListener("wheel", (e) => {
+    e.preventDefault();
+    view.zoom *= Math.exp(-e.deltaY * 0.001);
+    ask();
+  }, {passive: false});
+  canvas.addEventListener("dblclick", () => {
+    view = {...CLOUD_START};
+    ask();
+  });
+  canvas.addEventListener("keydown", (e) => {
+    const step = {ArrowLeft: [-0.1, 0, 1], ArrowRight: [0.1, 0, 1], ArrowUp: [0, 0.1, 1], ArrowDown: [0, -0.1, 1],
+      "+": [0, 0, 1.15], "-": [0, 0, 1 / 1.15]}[e.key];
+    if (!step) return;
+    e.preventDefault();
+    view.yaw += step[0];
+    view.pitch += step[1];
+    view.zoom *= step[2];
+    ask();
+  });
+  for (const box of [shape, turning]) box.addEventListener("change", ask);
+  window.addEventListener("resize", ask);
+  window.addEventListener("beforeprint", draw);
+  draw();
+}
+
+for (const canvas of document.querySelectorAll("canvas[data-cloud]")) cloudView(canvas);

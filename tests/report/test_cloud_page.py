@@ -1,0 +1,80 @@
+"""The page of a dense cloud in a real browser: it is drawn, it turns, and nothing comes from the network."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+from report.test_page_in_browser import QUIET, chromium
+
+from rigkit.core.cloud import OrientedCloud
+from rigkit.report.cloud_page import MAX_DRAWN, build_cloud_page
+
+PROBE = """<script>
+const canvas = document.querySelector("canvas[data-cloud]"), box = document.querySelector("[data-shape]");
+const pixels = () => [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data];
+const drawn = () => { window.dispatchEvent(new Event("beforeprint")); return pixels(); };
+const count = (image, colour) =>
+  image.filter((v, i) => i % 4 === colour && v > 200 && image[i + 3 - colour] > 0).length;
+const before = drawn(), first = canvas.dataset.view;
+canvas.dispatchEvent(new KeyboardEvent("keydown", {key: "ArrowLeft"}));
+const after = drawn(), second = canvas.dataset.view;
+box.checked = true;
+const grey = drawn();
+const differ = before.filter((v, i) => v !== after[i]).length;
+const same = grey.filter((v, i) => i % 4 === 0 && (v !== grey[i + 1] || v !== grey[i + 2])).length;
+document.body.dataset.probe = [first, second, count(before, 0), count(before, 2), differ, same].join("|");
+</script></body>"""
+
+
+def sheets(count: int, rng: np.random.Generator) -> OrientedCloud:
+    """A red sheet before a blue one of the same size: seen from the front the red one hides most of the other."""
+    points = rng.uniform(-100.0, 100.0, (count, 3))
+    points[:, 2] = np.where(np.arange(count) % 2, 500.0, 530.0)
+    near = points[:, 2] < 510.0
+    return OrientedCloud(
+        points_mm=points,
+        normals=np.tile([0.0, 0.0, -1.0], (count, 1)),
+        colours=np.where(near[:, None], [255, 0, 0], [0, 0, 255]).astype(np.uint8),
+        board_index=np.full(count, -1),
+        grid=np.zeros((count, 2), dtype=np.int64),
+        sigma_mm=np.full(count, 0.25),
+        normal_sigma_rad=np.full(count, 0.01),
+        board_ids=(),
+    )
+
+
+def test_a_cloud_is_drawn_near_points_before_far_ones_and_turns(tmp_path: Path, rng: np.random.Generator) -> None:
+    browser = chromium()
+    page = build_cloud_page("A < B", sheets(60_000, rng), {"rigkit": "x"}, unit="mm")
+    assert not re.search(r"""(src|href)=["']?https?:""", page)
+    assert "A &lt; B" in page
+    assert "half of them known to 0.25 mm or better" in page
+    path = tmp_path / "cloud.html"
+    path.write_text(page.replace("</body>", PROBE), encoding="utf-8")
+    done = subprocess.run(
+        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
+    assert probe is not None
+    first, second, red, blue, differ, coloured = probe[1].split("|")
+    assert abs(float(first.split()[0]) - float(second.split()[0])) > 0.05
+    assert int(red) > 20_000
+    assert 0 < int(blue) < 0.5 * int(red)
+    assert int(differ) > 10_000
+    assert int(coloured) == 0
+
+
+def test_of_very_many_points_some_are_shown(rng: np.random.Generator) -> None:
+    page = build_cloud_page("many", sheets(2 * MAX_DRAWN + 2, rng), {}, unit="mm")
+    shown = re.search(r'data-count="(\d+)"', page)
+    assert shown is not None
+    assert 0.5 * MAX_DRAWN < int(shown[1]) <= MAX_DRAWN
+    assert f"{shown[1]} are shown" in page
