@@ -78,7 +78,7 @@ def import_graph() -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for path in MODULES:
         wanted: set[str] = set()
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.ImportFrom) and node.module:
                 inner = {f"{node.module}.{alias.name}" for alias in node.names} & known
                 wanted |= inner or {node.module}
@@ -187,11 +187,16 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
+@functools.cache
+def nodes_of(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(tree_of(path)))
+
+
 def test_function_size() -> None:
     long = {
         place_of(path, node.name)
         for path in MODULES
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
         and (node.end_lineno or node.lineno) - node.lineno >= MAX_FUNCTION_LINES
     }
@@ -201,7 +206,7 @@ def test_function_size() -> None:
 def test_classes_of_many_fields_take_keywords() -> None:
     positional = set()
     for path in MODULES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             decorator = next((d for d in getattr(node, "decorator_list", ()) if "dataclass" in ast.unparse(d)), None)
             if not isinstance(node, ast.ClassDef) or decorator is None or "kw_only=True" in ast.unparse(decorator):
                 continue
@@ -216,7 +221,7 @@ def test_what_begins_with_an_underscore_stays_in_its_module() -> None:
     """The underscore says which names are a module's own; all others may be imported."""
     taken = []
     for path in MODULES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rigkit."):
                 taken += [place_of(path, alias.name) for alias in node.names if alias.name.startswith("_")]
     assert not taken

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from pathlib import Path
 
@@ -10,8 +11,12 @@ import rigkit
 SOURCE_SUFFIXES = {".py", ".c", ".h"}
 
 
+@functools.cache
 def source_hash(*packages: str) -> str:
-    """Return a hash of the sources of subpackages of rigkit, such as "detection"; of all of it where none is named."""
+    """Return a hash of the sources of subpackages of rigkit, such as "detection"; of all of it where none is named.
+
+    They are read once: what runs is what was there then.
+    """
     root = Path(rigkit.__path__[0])
     digest = hashlib.sha256()
     for folder in [root / name for name in packages] or [root]:
