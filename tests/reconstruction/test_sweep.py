@@ -20,7 +20,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.growing import sweep as sweep_module
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_both_ways
-from rigkit.reconstruction.growing.surface import NodeMeasurements, measure
+from rigkit.reconstruction.growing.surface import NodeMeasurements, PairRays
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
@@ -61,7 +61,8 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
     keep = np.ones(grown.valid.shape, dtype=bool)
     keep[HOLE] = False
     grown = grown.where(keep)
-    return grown, measure(grown, camera, camera, CAM2_FROM_CAM1), (view1, view2), corner
+    measured = PairRays.of(grown, camera, camera).measured(CAM2_FROM_CAM1)
+    return grown, measured, (view1, view2), corner
 
 
 @pytest.mark.parametrize("lens", LENSES)

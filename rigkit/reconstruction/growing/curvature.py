@@ -18,7 +18,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches
-from rigkit.reconstruction.growing.surface import measure, own_planes
+from rigkit.reconstruction.growing.surface import PairRays
 
 STENCIL_PX = 4.0
 """Of the second differences, about as wide as a window."""
@@ -28,7 +28,7 @@ MAX_CURVATURE_PX = 1.0
 
 def without_curvature(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> GrownPatches:
     """Return the pairs, at their nodes or `centred`, with places in image 2 where their nodes' points are."""
-    planes = own_planes(measure(grown, camera1, camera2, cam2_from_cam1))
+    planes = PairRays.of(grown, camera1, camera2).planes(cam2_from_cam1)
     at = grown.valid & np.isfinite(planes[..., 0])
     place, plane, A21 = grown.pixels1[at], planes[at], grown.A21[at]
     by_uu, by_uv, by_vv = _second_derivatives(place, plane, camera1, camera2, cam2_from_cam1)

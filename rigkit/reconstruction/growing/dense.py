@@ -22,7 +22,7 @@ from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
-from rigkit.reconstruction.growing.surface import GrownSurface, NodeMeasurements, fit_surface, measure, own_planes
+from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
 from rigkit.reconstruction.metric import POSE_STEP_RAD
@@ -130,19 +130,19 @@ def grow_scene(
             f"no surface grows from {len(agreeing)} correspondences; check that the images are sharp and "
             "show surfaces with texture"
         )
-    measured = measure(grown, r.camera1, r.camera2, pose)
-    grown, sweep = filled(grown, measured, view1, view2, pose)
-    measured = measure(grown, r.camera1, r.camera2, pose)
+    grown, sweep = filled(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
+    rays = PairRays.of(grown, r.camera1, r.camera2)
+    measured = rays.measured(pose)
     surface = fit_surface(measured, step, even.pose.amplitude_px)
     if sweep is not None:
         at = surface.valid
         keep = at.copy()
         keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.at_end[at])
         surface = surface.where(keep)
-    by_pose, of_pose = _moved_planes(measured, grown, r, pose, covariance)
+    by_pose, of_pose = _moved_planes(rays, pose, covariance)
     if calibrations is not None:
         moves = _moved_poses(even, r, calibrations, view1.size_px, fixed=pose_is_known)
-        by_pose, of_pose = _with_calibrations(measured, grown, pose, moves, by_pose, of_pose)
+        by_pose, of_pose = _with_calibrations(rays, pose, moves, by_pose, of_pose)
         covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
@@ -248,9 +248,7 @@ def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
     return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
 
 
-def _moved_planes(
-    measured: NodeMeasurements, grown: GrownPatches, r: Reconstruction, pose: Rigid3, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives (R, C, 3, 5) of the nodes' own planes by the pose, and the pose's covariance (5, 5) so."""
     length = float(np.linalg.norm(pose.translation_mm))
     t = pose.translation_mm / length
@@ -259,10 +257,10 @@ def _moved_planes(
 
     def planes(step: FloatArray) -> FloatArray:
         there = Rigid3(exp_so3(step[:3]) @ pose.rotation, length * unit(t + step[3:]))
-        return own_planes(measure(grown, r.camera1, r.camera2, there))
+        return rays.planes(there)
 
     # Sigmas need no better derivatives than forward differences.
-    here = own_planes(measured)
+    here = rays.planes(pose)
     each = [(planes(POSE_STEP_RAD * d) - here) / POSE_STEP_RAD for d in directions]
     to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
     return np.stack(each, axis=-1), np.asarray(to_five @ covariance @ to_five.T)
@@ -309,19 +307,14 @@ def _moved_poses(
 
 
 def _with_calibrations(
-    measured: NodeMeasurements,
-    grown: GrownPatches,
-    pose: Rigid3,
-    moves: list[_Moved],
-    by_pose: FloatArray,
-    of_pose: FloatArray,
+    rays: PairRays, pose: Rigid3, moves: list[_Moved], by_pose: FloatArray, of_pose: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return what `_moved_planes` returns with a column more for each move, of variance one."""
-    here = own_planes(measured)
+    here = rays.planes(pose)
     planes = []
     for cameras, change in moves:
         there = Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
-        planes.append(own_planes(measure(grown, *cameras, there)) - here)
+        planes.append(PairRays.of(rays.grown, *cameras).planes(there) - here)
     ends = np.eye(of_pose.shape[0] + len(moves))
     ends[: of_pose.shape[0], : of_pose.shape[0]] = of_pose
     return np.stack([*np.moveaxis(by_pose, -1, 0), *planes], axis=-1), ends

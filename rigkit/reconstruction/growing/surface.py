@@ -17,7 +17,7 @@ import numpy as np
 
 from rigkit.affine.surface import linear_gauge
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Normals, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
@@ -94,50 +94,89 @@ class GrownSurface:
         return replace(self, **known)
 
 
-def measure(grown: GrownPatches, camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3) -> NodeMeasurements:
-    """Return what the pairs say of the surface, node by node."""
-    shape, at = grown.valid.shape, np.flatnonzero(grown.valid.ravel())
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class PairRays:
+    """The rays of grown pairs, which stay as the pose moves: those of K nodes of the grid.
 
-    def flat(values: FloatArray) -> FloatArray:
-        return values.reshape(-1, *values.shape[2:])[at]
+    Attributes
+    ----------
+    grown : the pairs; nodes : (K,) indices, row by row.
+    rays1, rays2 : (K, 3) with the ray Jacobians jacobians1, jacobians2 (K, 3, 2).
+    seen : (K,) bool, in both fields of view.
+    """
 
-    pixels1, pixels2, A21 = flat(grown.pixels1), flat(grown.pixels2), flat(grown.A21)
-    (rays1, seen1), (rays2, seen2) = camera1.unproject(pixels1), camera2.unproject(pixels2)
-    B1, B2 = camera1.ray_jacobian(pixels1), camera2.ray_jacobian(pixels2)
-    points, valid = triangulate_rays(rays1, rays2, cam2_from_cam1, jacobians1=B1, jacobians2=B2)
-    J1, J2 = pair_projection_jacobians(points, rays1, B1, rays2, B2, cam2_from_cam1)
-    G, h, _ = linear_gauge(J1, J2)
-    length = np.linalg.norm(h, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / np.linalg.norm(points, axis=1)
-        along = h / length[:, None]
-        slope = length / inverse**2
-        y = np.einsum("nij,ni->nj", G - A21, along) / length[:, None]
-        z = np.concatenate([inverse[:, None], inverse[:, None] ** 2 * y], axis=1)
+    grown: GrownPatches
+    nodes: IntArray
+    rays1: FloatArray
+    rays2: FloatArray
+    jacobians1: FloatArray
+    jacobians2: FloatArray
+    seen: BoolArray
+
+    @classmethod
+    def of(cls, grown: GrownPatches, camera1: Camera, camera2: Camera) -> PairRays:
+        """Return the rays of all pairs."""
+        at = grown.valid
+        pixels1, pixels2 = grown.pixels1[at], grown.pixels2[at]
+        (rays1, seen1), (rays2, seen2) = camera1.unproject(pixels1), camera2.unproject(pixels2)
+        return cls(
+            grown=grown,
+            nodes=np.flatnonzero(at.ravel()),
+            rays1=rays1,
+            rays2=rays2,
+            jacobians1=camera1.ray_jacobian(pixels1),
+            jacobians2=camera2.ray_jacobian(pixels2),
+            seen=seen1 & seen2,
+        )
+
+    def measured(self, cam2_from_cam1: Rigid3) -> NodeMeasurements:
+        """Return what the pairs say of the surface, node by node."""
+        z, along, slope, good = self._values(cam2_from_cam1)
         # d place = -h d(1/r) r^2, and along h the same for the affinity and the gradient.
-        to_z = np.zeros((len(at), 3, 6))
-        to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
-    covariance = to_z @ flat(grown.covariance) @ np.swapaxes(to_z, 1, 2)
-    good = valid & seen1 & seen2 & np.isfinite(z).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
-    # Ranges are along the node's own ray.
-    frame = np.concatenate([rays1[:, None, :], np.swapaxes(B1, 1, 2)], axis=1)
+        to_z = np.zeros((len(z), 3, 6))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
+        covariance = to_z @ self.grown.covariance[self.grown.valid] @ np.swapaxes(to_z, 1, 2)
+        good &= np.isfinite(covariance).all(axis=(1, 2))
+        return NodeMeasurements(
+            z=self._spread(z, good),
+            covariance=self._spread(covariance, good),
+            frame=self._spread(self._frames(), good),
+            slope=self._spread(slope, good),
+            swept=self.grown.swept,
+        )
 
-    def spread(values: FloatArray) -> FloatArray:
+    def planes(self, cam2_from_cam1: Rigid3) -> FloatArray:
+        """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
+        z, _, _, good = self._values(cam2_from_cam1)
+        out = np.full(z.shape, np.nan)
+        out[good] = np.linalg.solve(self._frames()[good], z[good][..., None])[..., 0]
+        return self._spread(out, good)
+
+    def _frames(self) -> FloatArray:
+        """Return rays and columns of the ray Jacobians in rows: ranges are along the nodes' own rays."""
+        return np.concatenate([self.rays1[:, None, :], np.swapaxes(self.jacobians1, 1, 2)], axis=1)
+
+    def _values(self, cam2_from_cam1: Rigid3) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return z (K, 3), the directions (K, 2) of the epipolar lines, the slopes (K,) and which nodes have them."""
+        B1, B2 = self.jacobians1, self.jacobians2
+        points, valid = triangulate_rays(self.rays1, self.rays2, cam2_from_cam1, jacobians1=B1, jacobians2=B2)
+        J1, J2 = pair_projection_jacobians(points, self.rays1, B1, self.rays2, B2, cam2_from_cam1)
+        G, h, _ = linear_gauge(J1, J2)
+        length = np.linalg.norm(h, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1.0 / np.linalg.norm(points, axis=1)
+            along = h / length[:, None]
+            y = np.einsum("nij,ni->nj", G - self.grown.A21[self.grown.valid], along) / length[:, None]
+            z = np.concatenate([inverse[:, None], inverse[:, None] ** 2 * y], axis=1)
+            return z, along, length / inverse**2, valid & self.seen & np.isfinite(z).all(axis=1)
+
+    def _spread(self, values: FloatArray, good: BoolArray) -> FloatArray:
+        """Return values (K, ...) on the grid (R, C, ...), NaN where they are not `good`."""
+        shape = self.grown.valid.shape
         out = np.full((shape[0] * shape[1], *values.shape[1:]), np.nan)
-        out[at[good]] = values[good]
+        out[self.nodes[good]] = values[good]
         return out.reshape(*shape, *values.shape[1:])
-
-    return NodeMeasurements(
-        z=spread(z), covariance=spread(covariance), frame=spread(frame), slope=spread(slope), swept=grown.swept
-    )
-
-
-def own_planes(measured: NodeMeasurements) -> FloatArray:
-    """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
-    out = np.full(measured.z.shape, np.nan)
-    good = np.isfinite(measured.z[..., 0])
-    out[good] = np.linalg.solve(measured.frame[good], measured.z[good][..., None])[..., 0]
-    return out
 
 
 def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -> GrownSurface:
