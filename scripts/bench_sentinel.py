@@ -26,7 +26,8 @@ from pathlib import Path
 import numpy as np
 from bench_planner import BOARD, LENSES, Lens, by_hand, free_poses, see
 from scipy.special import ndtr, ndtri
-from sentinel.captures import SAID, left_out, pairs, real
+from sentinel.captures import SAID, left_out, real
+from sentinel.scenes import pairs
 from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 
 from rigkit.calibration.calibrate import calibrate

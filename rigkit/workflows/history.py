@@ -81,4 +81,6 @@ def _as_evidence(watched: Watched, calibration: Calibration) -> FreshEvidence:
         expected_px=difference.rms_px,
         corners=corners,
         left_out=0,
+        overdispersion=watched.overdispersion,
+        freedom=watched.freedom,
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +10,13 @@ from split_halves import load
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
-from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import unit
-from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.validation.sentinel.causes import causes_of
-from rigkit.validation.sentinel.epipolar import check_scene
-from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck
 from rigkit.validation.sentinel.watch import watched_camera
-from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, checked, tell, turned, unchanged
-
-PAIR_PX, PAIR_DEG = 0.1, 0.01
-"""How sure published cameras and mounts of pairs are taken to be: over the image, and per axis."""
+from sentinel.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
 
 
 def real(name: str, data: Path, cache: Path, draws: int) -> None:
@@ -100,42 +90,3 @@ def moved(view: BoardView, before: Camera, after: Camera) -> BoardView:
     use = valid & seen
     pixels = np.clip(pixels[use], -0.5, np.array(before.size_px) - 0.5)
     return BoardView(view.image, view.board, view.grid[use], pixels, view.sigma_px[use])
-
-
-def pairs(data: Path, seeds: int) -> None:
-    """Real pairs: the pose as published, and as if the mount had turned since."""
-    found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
-    for pair in json.loads((data / "scenes/pairs.json").read_text()):
-        cameras = tuple(
-            camera_model(kind)(tuple(size), np.array(numbers))
-            for kind, size, numbers in (pair["camera1"], pair["camera2"])
-        )
-        true = Rigid3(np.array(pair["cam2_from_cam1_R"]), 100.0 * unit(np.array(pair["cam2_from_cam1_t_direction"])))
-        images = [read_image(data / "scenes" / pair[key]) for key in ("image1", "image2")]
-        lenses = [lens_covariance(camera) for camera in cameras]
-        sizes = [len(own) for own in lenses]
-        covariance = np.zeros((sum(sizes) + 6, sum(sizes) + 6))
-        covariance[: sizes[0], : sizes[0]] = lenses[0]
-        covariance[sizes[0] : sum(sizes), sizes[0] : sum(sizes)] = lenses[1]
-        covariance[-6:, -6:] = np.diag([np.radians(PAIR_DEG)] * 3 + [0.1] * 3) ** 2
-        for seed in range(seeds):
-            rng = np.random.default_rng([seed, 23])
-            for what, checks in found.items():
-                told = turned(true, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)
-                if what == "nothing" and seed > 0:
-                    continue
-                watched = Watched(
-                    names=("left", "right"), cameras=cameras, cam_from_rig=(Rigid3.identity(), told),
-                    covariance=covariance, sigma_px=0.1,
-                )  # fmt: skip
-                checks.append(check_scene(watched, [images]))
-                if checks[-1].holds == (what == "rotation"):
-                    print(f"   {pair['name']}: {what}, chance {checks[-1].chance:.2g}, {checks[-1].change}")
-    for what, checks in found.items():
-        tell(f"pairs: {what}", checks, what)
-
-
-def lens_covariance(camera: Camera) -> np.ndarray:
-    """Return a covariance of a camera's parameters that leaves PAIR_PX over the image, each parameter alike."""
-    goal = projection_goal(camera)
-    return np.diag(PAIR_PX**2 / (camera.parameters.size * np.maximum(np.diag(goal.weight), 1e-12)))

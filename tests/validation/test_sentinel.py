@@ -38,7 +38,7 @@ from rigkit.workflows.history import add_calibration
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
 """Change of the projection, rms after the best rotation: what three views show beyond doubt."""
-MATCH_NOISE_PX = 0.3
+MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
 POWER_DRAWS, POWER_NOISE_PX = 30, 0.04
 UNSURE = 16.0
 POWER_WITHIN = 0.27
@@ -227,14 +227,14 @@ def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generato
     assert check.change.amounts == pytest.approx([1.0], abs=0.1)
 
 
-def _matches(pose: Rigid3, rng: np.random.Generator) -> PairMatches:
+def _matches(pose: Rigid3, rng: np.random.Generator, noise_px: float = MATCH_NOISE_PX) -> PairMatches:
     camera = lens("wide")
     rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (600, 2)))
     points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
     pixels1, seen1 = camera.project(points)
     pixels2, seen2 = camera.project(pose.apply(points))
     both = seen1 & seen2 & camera.on_image(pixels2)
-    noisy = [p[both] + MATCH_NOISE_PX * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
+    noisy = [p[both] + noise_px * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
     # One match in ten is wrong.
     wrong = rng.random(len(noisy[0])) < 0.1
     noisy[1][wrong] += rng.uniform(-60.0, 60.0, (int(wrong.sum()), 2))
@@ -255,6 +255,17 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
     assert named >= 5
     with pytest.raises(DegenerateError, match="texture"):
         check_matches(_rig(), [])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.random.Generator) -> None:
+    # Good matches, and a turn that moves them by many times their noise.
+    turn = np.radians(0.3) * np.eye(3)[axis]
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    check = check_matches(_rig(), [_matches(moved, rng, FINE_MATCH_NOISE_PX)])
+    assert check.expected_px < 2.0 * FINE_MATCH_NOISE_PX < 0.25 * check.rms_px
+    assert check.chance < 1e-9 and check.change is not None and check.change.cause.kind == "rotation"
+    assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
 
 
 def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, tmp_path: Path) -> None:

@@ -1,8 +1,10 @@
 """What any textured scene says of a rig: matches that leave the epipolar geometry. No board, and no scale.
 
 Of a pair of cameras every match has a Sampson distance r with derivatives J by theta: a change d moves r by J d, so
-scores -J^T r have the mean J^T J d, as those of boards have. Matches of one part of the image share their errors: by
-how much more the parts disagree than independent matches would, counts against all of them.
+scores -J^T r have the mean J^T J d, as those of boards have. How much matches scatter is what is left once everything
+that theta could explain is taken away: else a change would hide behind the scatter that it makes. Matches of one part
+of the image share their errors: by how much more the parts disagree than independent matches would, counts against all
+of them.
 """
 
 from __future__ import annotations
@@ -31,6 +33,10 @@ MIN_FRAME_MATCHES = 40
 """Fewer matches of a frame may be of one surface, or wrong."""
 PARTS = 4
 """Columns and rows of the parts of an image that are taken as independent."""
+FIT_ROUNDS, FIT_RANK = 15, 1e-5
+"""Of the fit of everything to the matches; directions that move them by less beside others are none."""
+MIN_MATCH_PX = 0.01
+"""No match is better."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
 
@@ -72,37 +78,40 @@ def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Goal |
         raise DegenerateError(
             f"check: less than {MIN_FRAME_MATCHES} matches in every frame; show the rig a scene with texture and depth"
         )
-    return judge_evidence(watched, lambda now: _evidence(now, matches), cost)
+    return judge_evidence(watched, lambda now: matches_say(now, matches), cost)
 
 
-def _evidence(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
+def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
+    """Return what matches of a rig's cameras say of theta."""
     n = watched.size
-    information, scores, variances = [], [], []
-    squares, count = 0.0, 0
+    information, scores, variances, disagreements = [], [], [], []
+    squares, left_squares, count, parts = 0.0, 0.0, 0, 0
     for pair in matches:
         residual, jacobian, good = _linearised(watched, pair)
-        sigma = float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
-        weight = 1.0 / (1.0 + (residual / (CAUCHY_SIGMAS * sigma)) ** 2)
+        left, weight, sigma = _unexplained(residual, jacobian)
         by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
         np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
         np.add.at(score, by_part, -(weight * residual)[:, None] * jacobian)
         information.append(own.sum(axis=0))
         scores.append(score.sum(axis=0))
-        variances.append(sigma**2 * _disagreement(own / sigma**2, score / sigma**2))
+        disagreements.append(_disagreement(own / sigma**2, score / sigma**2))
+        variances.append(sigma**2 * disagreements[-1])
+        parts += len(np.unique(by_part))
         squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
+        left_squares += float((weight * left**2).sum())
     usual = float(np.median(variances))
     share = usual / np.array(variances)
-    # Matches have a scatter of their own, which the images themselves show: nothing else is expected of them.
-    rms = float(np.sqrt(squares / count))
     return FreshEvidence(
         information=share[:, None, None] * np.array(information),
         score=share[:, None] * np.array(scores),
         variance_px2=usual,
-        rms_px=rms,
-        expected_px=rms,
+        rms_px=float(np.sqrt(squares / count)),
+        expected_px=float(np.sqrt(left_squares / count)),
         corners=count,
         left_out=0,
+        overdispersion=float(np.sqrt(np.median(disagreements))),
+        freedom=float(parts - len(matches)),
     )
 
 
@@ -119,6 +128,27 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
         jacobian[:, k] = (ahead - behind) / (2.0 * reach[k])
     good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
     return residual[good], jacobian[good], np.asarray(good)
+
+
+def _unexplained(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return what is left of residuals (M,) after the best change of theta of all, the weights of the matches, and
+    their standard deviation: wrong matches count little."""
+    size = np.linalg.norm(jacobian, axis=0)
+    design = jacobian[:, size > 0.0] / size[size > 0.0]
+    values = np.linalg.svd(design, compute_uv=False)
+    rank = int(np.count_nonzero(values > FIT_RANK * values[0]))
+    freedom = max(len(residual) - rank, 1) / len(residual)
+    left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
+    for _ in range(FIT_ROUNDS):
+        root = np.sqrt(_weights(left, sigma))
+        step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_RANK)[0]
+        left = residual - design @ step
+        sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
+    return left, _weights(left, sigma), max(sigma, MIN_MATCH_PX)
+
+
+def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + (left / (CAUCHY_SIGMAS * max(sigma_px, MIN_MATCH_PX))) ** 2))
 
 
 def _distances(watched: Watched, pair: PairMatches) -> FloatArray:

@@ -114,7 +114,8 @@ class FreshView:
 class FreshEvidence:
     """What N frames say: information (N, T, T) and score (N, T) in px^2, the variance (px^2) that each counts with
     where nothing changed, and what the residuals are like: their rms over the `corners` kept, what it should be
-    (`expected_px`), and how many were `left_out`."""
+    (`expected_px`), and how many were `left_out`. The variance contains that images, or parts of them, disagree more
+    than independent corners would, by `overdispersion` (a ratio of standard deviations), known with `freedom`."""
 
     information: FloatArray
     score: FloatArray
@@ -123,6 +124,8 @@ class FreshEvidence:
     expected_px: float
     corners: int
     left_out: int
+    overdispersion: float
+    freedom: float
 
 
 def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
@@ -149,6 +152,8 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
         expected_px=float(np.sqrt(2.0) * sigma),
         corners=count,
         left_out=left_out,
+        overdispersion=watched.overdispersion,
+        freedom=watched.freedom,
     )
 
 

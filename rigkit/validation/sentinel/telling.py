@@ -89,6 +89,8 @@ def views_that_tell(
         expected_px=float(np.sqrt(2.0) * sigma),
         corners=sum(view.board.corner_count for view in plan.views),
         left_out=0,
+        overdispersion=watched.overdispersion,
+        freedom=watched.freedom,
     )
     return plan, powers_of(watched, evidence, causes_of(watched), ALARM_CHANCE)
 

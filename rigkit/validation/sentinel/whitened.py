@@ -56,13 +56,13 @@ class Whitened:
                 "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
                 "covariance, or the lens); calibrate again"
             )
-        return cls(own, covariance, left.T, _freedom(watched, len(own)))
+        return cls(own, covariance, left.T, min(_freedom(watched, len(own)), _freedom(evidence, len(own))))
 
 
-def _freedom(watched: Watched, directions: int) -> float:
+def _freedom(known: Watched | FreshEvidence, directions: int) -> float:
     """Return the degrees of freedom of the variance in one direction (Satterthwaite): what corners scatter is known
     from all directions of all images; of what images disagree beyond it, only the mean over the directions is."""
-    beyond = max(0.0, 1.0 - 1.0 / watched.overdispersion**2) if watched.overdispersion > 0.0 else 0.0
-    unsure = beyond**2 * (1.0 / watched.freedom + 1.0 / COMMON_FREEDOM)
-    unsure += (1.0 - beyond) ** 2 / (watched.freedom * directions)
+    beyond = max(0.0, 1.0 - 1.0 / known.overdispersion**2) if known.overdispersion > 0.0 else 0.0
+    unsure = beyond**2 * (1.0 / known.freedom + 1.0 / COMMON_FREEDOM)
+    unsure += (1.0 - beyond) ** 2 / (known.freedom * directions)
     return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
