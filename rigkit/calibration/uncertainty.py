@@ -30,7 +30,7 @@ from rigkit.calibration.result import Calibration, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, skew
 
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
@@ -237,6 +237,27 @@ def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> t
     size = np.where(size > 0.0, size, 1.0)
     step = np.linalg.lstsq(rows / size, (there - pixels)[seen].reshape(-1), rcond=FOLLOWED)[0] / size
     return sigmas * step[:-3], turn @ exp_so3(-step[-3:])
+
+
+def pose_covariance_of_lens(
+    camera: Camera, covariance: FloatArray, points_in_cam: Points, origin_in_cam: FloatArray, sigma_px: FloatArray
+) -> FloatArray:
+    """Return the lens's share in the covariance of a pose that was found with it: (6, 6) of (w, v), R' = exp([w]x) R,
+    t' = t + v, rad and mm.
+
+    A changed lens and a moved board show one image: with dq = A dp + K dk = 0, dp = -(A^T W A)^-1 A^T W K dk.
+
+    Parameters
+    ----------
+    covariance : (P, P) of the camera's parameters.
+    points_in_cam, origin_in_cam, sigma_px : (N, 3) and (3,) the board's points and its origin, mm, and (N,) the
+        standard deviations that weighted them.
+    """
+    _, _, by_point, by_lens = camera.project_with_jacobians(points_in_cam)
+    by_pose = np.concatenate([-by_point @ skew(points_in_cam - origin_in_cam), by_point], axis=-1)
+    weight, count = 1.0 / sigma_px[:, None, None], 2 * len(points_in_cam)
+    step = np.linalg.lstsq((by_pose * weight).reshape(count, -1), (by_lens * weight).reshape(count, -1), rcond=None)[0]
+    return np.asarray(step @ covariance @ step.T)
 
 
 def _spread(count: int) -> IntArray:

@@ -57,12 +57,12 @@ def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigm
     import numpy as np
 
     from rigkit.geometry.rotation import log_so3
+    from rigkit.report.tables import rounded_words
 
-    turned = ", ".join(
-        f"{value:.3f} ± {sigma:.3f}"
-        for value, sigma in zip(np.degrees(log_so3(pose.rotation)), np.degrees(turn_sigma_rad), strict=True)
-    )
-    moved = ", ".join(f"{v:.2f} ± {s:.2f}" for v, s in zip(pose.translation_mm, move_sigma_mm, strict=True))
+    degrees = zip(np.degrees(log_so3(pose.rotation)), np.degrees(turn_sigma_rad), strict=True)
+    turned = ", ".join(rounded_words(float(value), float(sigma)) for value, sigma in degrees)
+    shifts = zip(pose.translation_mm, move_sigma_mm, strict=True)
+    moved = ", ".join(rounded_words(float(value), float(sigma)) for value, sigma in shifts)
     return f"{name}: rotation vector ({turned}) deg, translation ({moved}) mm"
 
 

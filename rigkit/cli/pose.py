@@ -31,4 +31,6 @@ def run(args: argparse.Namespace) -> int:
     print(pose_in_words("cam_from_board", pose, sigmas[:3], sigmas[3:]))
     print(f"centre of the camera on the board: {centre[0]:.2f}, {centre[1]:.2f}, {centre[2]:.2f} mm")
     print(f"RMS {placed.rms_px:.3f} px" + ("; the board tilted the other way fits too" if placed.ambiguous else ""))
+    if not placed.lens_known:
+        print("the lens counts as exact: its file does not say how sure it is")
     return 0

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.hand_eye import HandEye, hand_eye
+from rigkit.calibration.uncertainty import pose_covariance_of_lens
 from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
@@ -19,6 +21,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import BoardPose, board_poses
 from rigkit.io.board_words import board_of_words
+from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image_of
 from rigkit.io.reading import about
@@ -64,12 +67,17 @@ class HandEyeCalibration:
 @dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
     """Where a camera is against a board, from which image, the RMS in px, and whether the board tilted the other way
-    fits too."""
+    fits too.
+
+    The pose's covariance counts the corners, the size of the board's squares where its file says how well that is
+    known, and, as `lens_known` says, the lens.
+    """
 
     pose: BoardPose
     image: Path
     rms_px: float
     ambiguous: bool
+    lens_known: bool
 
     __repr__ = brief
 
@@ -142,7 +150,24 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
             raise DegenerateError("the lens does not see the board where it stands; check the numbers of its file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
-    return PlacedCamera(found[0], Path(image), rms, ambiguous)
+    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _lens_covariance(camera)
+    if of_lens is not None:
+        covariance += pose_covariance_of_lens(
+            lens, of_lens, pose.apply(points), pose.translation_mm, view.sigma_px[valid]
+        )
+    if known.square_sigma_mm is not None:
+        shift = pose.translation_mm * known.square_sigma_mm / np.sqrt(known.square_x_mm * known.square_y_mm)
+        covariance[3:, 3:] += np.outer(shift, shift)
+    placed = BoardPose(pose, found[0].rms_rad, covariance)
+    return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None)
+
+
+def _lens_covariance(camera: str | Path) -> FloatArray | None:
+    """Return how sure the parameters of a camera's file are, (P, P); None of another tool's, which does not say."""
+    try:
+        return load_calibration(camera).covariance
+    except InputError:
+        return None
 
 
 def _one_way_up(board: Board) -> Board:
