@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.clustered import reduced_by_cluster
+from rigkit.calibration.clustered import drawn_errors, reduced_by_cluster
 from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.linearise import view_products
@@ -33,6 +33,7 @@ from rigkit.calibration.uncertainty import projection_design
 from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.convert import refit_camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
@@ -69,6 +70,7 @@ CAPTURES = {
     "caliper": Capture("public/caliper-board", "*.png", Board("b", 16, 10, 15.0, 15.0)),
     "fisheye-chess": Capture("public/fisheye-chess", "*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "cylinder": Capture("public/cylinder/201", "*", Board("b", 19, 14, 10.0, 10.0)),
+    "cylinder-202": Capture("public/cylinder/202", "*", Board("b", 19, 14, 10.0, 10.0)),
     "bumblebee-left": Capture("public/bumblebee2", "left*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "bumblebee-right": Capture("public/bumblebee2", "right*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "charuco-stereo-left": Capture(
@@ -86,12 +88,20 @@ CAPTURES = {
 }
 
 
-OTHERS = [("bouguet-left", "bouguet-right"), ("bumblebee-left", "bumblebee-right"), ("lab-regular", "lab-fisheye")]
+OTHERS = [
+    ("bouguet-left", "bouguet-right"),
+    ("bumblebee-left", "bumblebee-right"),
+    ("charuco-stereo-left", "charuco-stereo-right"),
+    ("cylinder", "cylinder-202"),
+    ("lab-regular", "lab-fisheye"),
+]
 """Different cameras with images of one size."""
 
 
 DRAWS = 4000
 """Sessions drawn anew, for the scatter of a ratio."""
+ASKED_IMAGES, POWER_DRAWS = 20, 20
+"""Images a side with which a touched lens is asked to be found, and pairs of such sessions drawn."""
 
 
 def published_corners(path: Path, board: Board) -> tuple[list[BoardView], tuple[int, int]]:
@@ -231,21 +241,48 @@ def shift_px(camera: Camera, pixels: np.ndarray, remaining_px: float) -> np.ndar
     return remaining_px / max(float(np.sqrt(2.0 * (left**2).mean())), 1e-9) * along
 
 
-def power(name: str, loaded: tuple[Views, tuple[int, int]], model: str) -> list[CalibrationComparison]:
-    """Print and return the comparisons of one half with the other half behind a lens that was touched."""
+def power(name: str, loaded: tuple[Views, tuple[int, int]], model: str) -> None:
+    """Print the comparisons of one half with the other half behind a lens that was touched; and how often it would be
+    found with as many images a side as are asked of a user, of this camera and these boards: errors drawn from what
+    all images say that calibrations err by."""
     views, size = loaded
     a_views, b_views = halves(views, np.random.default_rng(0))
-    a = calibrated(a_views, size, model)
+    a, whole = calibrated(a_views, size, model), calibrated(views, size, model)
     centre = a.camera.project(np.array([0.0, 0.0, 1.0]))[0]
     pixels = np.concatenate([view.pixels[view.kept] for view in a.views])
     shift = shift_px(a.camera, pixels[:: max(1, len(pixels) // 500)], 0.2)
-    found = []
     for what, move in (
         ("focal length + 0.1 %", lambda p: centre + 1.001 * (p - centre)),
         (f"principal point moved by {np.linalg.norm(shift):.1f} px", lambda p: p + shift),
     ):
-        found.append(compare_calibrations(a, calibrated(changed(b_views, move, size), size, model)))
-        print(in_words(f"{name}, {what}", found[-1]), flush=True)
+        found = compare_calibrations(a, calibrated(changed(b_views, move, size), size, model))
+        print(
+            f"{in_words(f'{name} ({len(a_views)} images a side), {what}', found)}; with {ASKED_IMAGES} a side, drawn: "
+            f"found {drawn_power(whole, move, len(views))} of {POWER_DRAWS} times",
+            flush=True,
+        )
+
+
+def drawn_power(whole: Calibration, move: Callable[[np.ndarray], np.ndarray], images: int) -> int:
+    """Return how often two calibrations from ASKED_IMAGES images each would be told apart, the second behind a lens
+    that was touched: POWER_DRAWS pairs drawn from the covariance of one from so many `images`."""
+    pixels = np.concatenate([view.pixels[view.kept] for view in whole.views])
+    rays, valid = whole.camera.unproject(pixels)
+    cameras = whole.camera, refit_camera(whole.camera, rays[valid], move(pixels[valid]))
+    covariance, rng = whole.covariance * images / ASKED_IMAGES, np.random.default_rng(0)
+    errors = drawn_errors(covariance, np.inf, rng).T
+    found = 0
+    for k in range(POWER_DRAWS):
+        a, b = (
+            replace(
+                whole,
+                camera=camera.with_parameters(camera.parameters + errors[2 * k + side]),
+                covariance=covariance,
+                freedom=float(ASKED_IMAGES - 1),
+            )
+            for side, camera in enumerate(cameras)
+        )
+        found += compare_calibrations(a, b).verdict is CameraVerdict.OTHER
     return found
 
 
