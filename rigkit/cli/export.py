@@ -1,4 +1,4 @@
-"""`rigkit export`: cameras to and from other tools' formats; clouds as PLY, npz or a COLMAP model."""
+"""`rigkit export`: cameras to and from other tools' formats; clouds as PLY, LAS, npz or a COLMAP model."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 
 from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
-from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, READ_FORMATS
+from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
 
-HELP = "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"
+HELP = "cameras in other tools' formats; clouds as PLY, LAS, npz or a COLMAP model"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", type=Path, help="a camera file, a rig, or a data set (then --pair)")
+    parser.add_argument("source", type=Path, help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)")
     parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.source.is_dir() or args.source.suffix == ".toml":
+    if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
         return _export_cloud(args)
     import numpy as np
 
@@ -65,12 +65,18 @@ def run(args: argparse.Namespace) -> int:
 
 def _export_cloud(args: argparse.Namespace) -> int:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud
+    from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud, export_ply
 
     kind = args.to or args.output.suffix.lstrip(".") or "colmap"
-    if kind not in CLOUD_FORMATS:
-        raise InputError(f"export: a cloud is written as {', '.join(CLOUD_FORMATS)}, not as '{kind}'; use --to")
+    is_ply = args.source.suffix == ".ply"
+    known = PLY_FORMATS if is_ply else CLOUD_FORMATS
+    if kind not in known:
+        what = "a PLY" if is_ply else "a cloud"
+        raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
     options = ExportCloudOptions(output=args.output, kind=kind, pair=args.pair, method=args.method, force=args.force)
+    if is_ply:
+        print(f"{args.output}: {len(export_ply(args.source, options))} points")
+        return 0
     r = export_cloud(args.source, options, progress=progress_on_stderr())
     print(f"{args.output}: {len(r.cloud)} points of pair '{r.pair_id}'")
     return 0

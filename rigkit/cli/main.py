@@ -26,7 +26,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "board": ("rigkit.cli.board", "a board to print, true to scale"),
     "calibrate": ("rigkit.cli.calibrate", "calibrate a camera, or several on one mount, from images of boards"),
     "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
-    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, npz or a COLMAP model"),
+    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, LAS, npz or a COLMAP model"),
     "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
     "coach": ("rigkit.cli.coach", "a guided capture on a local page: says what to shoot next and when it is enough"),
     "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),

@@ -6,13 +6,15 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.colmap_model import colmap_model
+from rigkit.interop.las import las_bytes
 from rigkit.io.files import ensure_writable
 from rigkit.io.manifest import Dataset, load_dataset
 from rigkit.io.npz import cloud_npz
-from rigkit.io.ply import ply_bytes
+from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras
 from rigkit.workflows.pairs import match_images, reconstruct_with
@@ -28,7 +30,7 @@ class ExportCloudOptions:
     output: Path
     """File to write; a folder for a COLMAP model."""
     kind: str
-    """Format: ply, npz or colmap."""
+    """Format: ply, npz, las or colmap."""
     pair: str | None = None
     """Name of the pair; None: the only one."""
     method: str = "3SDIR"
@@ -74,6 +76,22 @@ def export_cloud(
             _log.info(words)
     else:
         folder = options.output.parent
-        files[options.output.name] = ply_bytes(r.cloud) if options.kind == "ply" else cloud_npz(r)
+        files[options.output.name] = cloud_npz(r) if options.kind == "npz" else _cloud_bytes(r.cloud, options.kind)
     write_results(folder, files, force=options.force, inputs=known.inputs)
     return r
+
+
+def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
+    """Write the cloud of a PLY file in another format, and return it.
+
+    Raises InputError for a file that cannot be read or written.
+    """
+    ensure_writable(options.output, force=options.force, inputs=(source,))
+    cloud = read_ply(source)
+    files: dict[str, str | bytes] = {options.output.name: _cloud_bytes(cloud, options.kind)}
+    write_results(options.output.parent, files, force=options.force, inputs=(source,))
+    return cloud
+
+
+def _cloud_bytes(cloud: OrientedCloud, kind: str) -> bytes:
+    return las_bytes(cloud) if kind == "las" else ply_bytes(cloud)

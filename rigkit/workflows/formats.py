@@ -13,4 +13,6 @@ FOREIGN_ENDINGS = {
 """Other tools' formats of cameras, and how the names of their files end."""
 CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
 READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib")
-CLOUD_FORMATS = ("ply", "npz", "colmap")
+CLOUD_FORMATS = ("ply", "npz", "las", "colmap")
+PLY_FORMATS = ("ply", "las")
+"""Of a cloud that is there as PLY."""

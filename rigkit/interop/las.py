@@ -1,0 +1,52 @@
+"""Clouds as LAS 1.4, which surveyors' programs and CloudCompare read, by laspy (`pip install "rigkit[las]"`)."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from rigkit.core.cloud import OrientedCloud
+from rigkit.core.errors import InputError, InstallationError
+
+POINT_FORMAT = 7
+"""With colours."""
+LAS_STEPS = 2.0**30
+"""Of a coordinate from one end of the cloud to the other: LAS has whole numbers of 32 bits."""
+LEVELS_OF_16_BITS = 257
+"""Of one level of 8 bits."""
+NORMALS = ("NormalX", "NormalY", "NormalZ")
+"""As CloudCompare calls them."""
+
+
+def las_bytes(cloud: OrientedCloud) -> bytes:
+    """Return the file's content, lengths as in the cloud, with the normals and `sigma_mm` as further columns.
+
+    Raises
+    ------
+    InputError
+        An empty cloud.
+    InstallationError
+        laspy is not installed.
+    """
+    try:
+        import laspy
+    except ImportError as error:
+        raise InstallationError('LAS files need laspy; install it with `pip install "rigkit[las]"`') from error
+    if not len(cloud):
+        raise InputError("LAS: the cloud has no points")
+    size = float(np.ptp(cloud.points_mm, axis=0).max())
+    header = laspy.LasHeader(point_format=POINT_FORMAT, version="1.4")
+    header.generating_software = "rigkit"
+    header.offsets = cloud.points_mm.min(axis=0)
+    header.scales = np.full(3, (size or 1.0) / LAS_STEPS)
+    columns = dict(zip((*NORMALS, "sigma_mm"), np.column_stack([cloud.normals, cloud.sigma_mm]).T, strict=True))
+    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=np.float32) for name in columns])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.points_mm.T
+    las.red, las.green, las.blue = LEVELS_OF_16_BITS * cloud.colours.astype(np.uint16).T
+    for name, values in columns.items():
+        las[name] = values.astype(np.float32)
+    out = io.BytesIO()
+    las.write(out)
+    return out.getvalue()
