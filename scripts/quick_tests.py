@@ -1,13 +1,14 @@
 """Choose the tests that `./scripts/test` leaves to `./scripts/test --thorough`, and write them to tests/thorough.txt.
 
-    python scripts/quick_tests.py [--seconds 0.5] [--data FILE] [PYTEST_ARGUMENT...]
+    python scripts/quick_tests.py [--total 200] [--data FILE ...] [--tests PATH ...]
 
-Runs all tests but the slow ones under coverage (twice as long as without), each a context of its own. A test may be
-left out of the quick run where it takes more than --seconds of processor time and the quick ones reach every line and
-every branch of rigkit that it reaches. Of the tests that take longer, the quick run keeps those that together reach
-what is missing, chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4,
-1979). It also keeps `KEPT`, and tests that start processes: what these reach is not seen. Prints seconds, lines and
-branches of both.
+Runs all tests but the slow ones under coverage (a quarter of an hour of one quiet core), each a context of its own. The
+quick run can do without a test where its other tests reach every line and every branch of rigkit that it reaches. Left
+out are the dearest of these, until the rest takes --total seconds of processor time: of the tests that take longer than
+a limit, which falls until that is so, the quick run keeps those that together reach what the shorter ones do not,
+chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979). It also
+keeps `KEPT`, and tests that fail or start processes under coverage: what these reach is not seen. Prints seconds,
+lines and branches of both.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ import os
 import resource
 import sqlite3
 import sys
-from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import coverage
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
 CHOSEN = ROOT / "tests" / "thorough.txt"
@@ -33,22 +36,16 @@ KEPT = (
     # Branches of C are not counted.
     "tests/kernels/",
 )
-MAY_BE_MISSING = (
-    "tests/real/",
-    "tests/interop/test_own_readers.py",
-    "_in_browser.py",
-    "tests/report/test_accessible.py",
-)
+MAY_BE_MISSING = ("tests/real/", "test_own_readers.py", "_in_browser.py", "test_accessible.py")
 """Tests that are skipped where captures, a browser or another program are missing: others have to reach their lines."""
 HEAD = """\
 # The tests that the quick run leaves out: scripts/quick_tests.py chose them, ./scripts/test --thorough runs them too.
-# Each takes long, and the quick tests reach every line and branch of rigkit that it reaches.
+# The quick tests reach every line and branch of rigkit that these reach.
 """
+LIMITS_S = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1)
 MAX_STARTED_S = 0.05
 """Of a test's processes: even one of Python takes so much."""
 WHOSE = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-Place = tuple[str, int, int]
-"""A step from one line of a file to the next; to or from -n is the entry or exit of what begins in line n."""
 
 
 def _processor_s(who: int) -> float:
@@ -58,7 +55,7 @@ def _processor_s(who: int) -> float:
 
 class Recorder:
     """Of pytest: every test is a context of the coverage, and is timed: processor seconds here, and of processes that
-    it started."""
+    it started. Of a test that failed these are infinite."""
 
     def __init__(self, measured: coverage.Coverage) -> None:
         self.measured, self.seconds = measured, dict[str, tuple[float, float]]()
@@ -69,77 +66,122 @@ class Recorder:
         begun = [_processor_s(who) for who in WHOSE]
         yield
         here, started = (_processor_s(who) - then for who, then in zip(WHOSE, begun, strict=True))
-        self.seconds[item.nodeid] = round(here, 3), round(started, 3)
+        self.seconds.setdefault(item.nodeid, (round(here, 3), round(started, 3)))
         self.measured.switch_context("")
 
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self.seconds[report.nodeid] = (0.0, float("inf"))
 
-def record(data: Path, arguments: list[str]) -> None:
+
+def record(data: Path, tests: Sequence[str]) -> None:
     """Run the tests; write what they reach to `data`, and what they take to `data`.json."""
     measured = coverage.Coverage(data_file=str(data))
     # As `python -m pytest` has it: processes that a test starts import its module.
     sys.path.insert(0, str(ROOT))
     measured.start()
     recorder = Recorder(measured)
-    code = pytest.main(["--rootdir", str(ROOT), "-q", *(arguments or [str(ROOT / "tests")])], plugins=[recorder])
+    pytest.main(["--rootdir", str(ROOT), "-q", *(tests or ["tests"])], plugins=[recorder])
     measured.stop()
     measured.save()
     data.with_suffix(".json").write_text(json.dumps(recorder.seconds))
-    if code:
-        sys.exit(f"the tests failed ({code}): nothing is chosen")
 
 
-def reached(data: Path) -> dict[str, set[Place]]:
-    """Return by test the steps that it reaches."""
-    found: dict[str, set[Place]] = defaultdict(set)
-    query = (
-        "select context.context, file.path, fromno, tono from arc "
-        "join context on context.id = context_id join file on file.id = file_id"
-    )
-    with sqlite3.connect(data) as base:
-        for test, path, start, end in base.execute(query):
-            found[test].add((path, start, end))
-    return found
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """What each test takes and reaches.
 
+    Attributes
+    ----------
+    tests : their names.
+    seconds : (T, 2) of processor time, here and in processes that it started.
+    steps : (T, S), whether the test makes the step from one line of a file to the next.
+    imported : (S,), steps that are made before the first test.
+    lines : (S,), a number for the line that each step leads to.
+    """
 
-def left_out(seconds: Mapping[str, tuple[float, float]], places: Mapping[str, set[Place]], limit_s: float) -> list[str]:
-    """Return the tests that the quick run can do without."""
-    took = {test: here for test, (here, started) in seconds.items() if started < MAX_STARTED_S}
-    dear = {test for test, s in took.items() if s > limit_s and not test.startswith(KEPT)}
-    # What is reached before the first test, by imports, is reached in any run.
-    there = set().union(*(steps for test, steps in places.items() if test not in dear and not _may_be_missing(test)))
-    wanted = set().union(*places.values()) - there
-    adds = {test: places.get(test, set()) & wanted for test in dear if not _may_be_missing(test)}
-    while best := max(adds, key=lambda test: len(adds[test]) / took[test], default=None):
-        new = adds.pop(best)
-        if not new:
-            break
-        dear.discard(best)
-        adds = {test: steps - new for test, steps in adds.items()}
-    return sorted(dear)
+    tests: tuple[str, ...]
+    seconds: NDArray[np.float64]
+    steps: NDArray[np.bool_]
+    imported: NDArray[np.bool_]
+    lines: NDArray[np.int64]
 
+    @classmethod
+    def of(cls, paths: Sequence[Path]) -> Reach:
+        seconds: dict[str, tuple[float, float]] = {}
+        made: list[tuple[str, tuple[str, int, int]]] = []
+        query = (
+            "select context.context, file.path, fromno, tono from arc "
+            "join context on context.id = context_id join file on file.id = file_id"
+        )
+        for path in paths:
+            seconds |= json.loads(path.with_suffix(".json").read_text())
+            with sqlite3.connect(path) as base:
+                made += ((test, (str(file), start, end)) for test, file, start, end in base.execute(query))
+        tests = {test: k for k, test in enumerate(seconds)}
+        steps = {step: k for k, step in enumerate(dict.fromkeys(step for _, step in made))}
+        reached = np.zeros((len(tests) + 1, len(steps)), dtype=bool)
+        # Whatever is no test stands last.
+        reached[[tests.get(test, len(tests)) for test, _ in made], [steps[step] for _, step in made]] = True
+        lines = {line: k for k, line in enumerate(dict.fromkeys((file, abs(end)) for file, _, end in steps))}
+        return cls(
+            tuple(tests),
+            np.array(list(seconds.values()), dtype=np.float64),
+            reached[:-1],
+            reached[-1],
+            np.array([lines[file, abs(end)] for file, _, end in steps]),
+        )
 
-def _may_be_missing(test: str) -> bool:
-    return any(part in test for part in MAY_BE_MISSING)
+    def left_out(self, limit_s: float) -> NDArray[np.bool_]:
+        """Return the mask of the tests, of those that take more than `limit_s`, that the others make needless."""
+        missing = np.array([any(part in test for part in MAY_BE_MISSING) for test in self.tests])
+        fixed = np.array([test.startswith(KEPT) for test in self.tests]) | (self.seconds[:, 1] > MAX_STARTED_S)
+        out = (self.seconds[:, 0] > limit_s) & ~fixed
+        wanted = self.steps.any(axis=0) & ~self.imported & ~self.steps[~out & ~missing].any(axis=0)
+        open_tests = np.flatnonzero(out & ~missing)
+        while wanted.any() and len(open_tests):
+            adds = self.steps[open_tests][:, wanted].sum(axis=1)
+            best = open_tests[(adds / self.seconds[open_tests, 0]).argmax()]
+            if not adds.any():
+                break
+            out[best] = False
+            wanted &= ~self.steps[best]
+            open_tests = open_tests[open_tests != best]
+        return out
+
+    def describe(self, name: str, chosen: NDArray[np.bool_]) -> str:
+        """Return in words what tests take and reach."""
+        steps = self.steps[chosen].any(axis=0) | self.imported
+        total = self.total_s(chosen)
+        return f"{name}: {chosen.sum()} tests, {total:.0f} s, {len(set(self.lines[steps]))} lines, {steps.sum()} steps"
+
+    def total_s(self, chosen: NDArray[np.bool_]) -> float:
+        """Return the seconds of tests, but for those that failed."""
+        seconds = self.seconds[chosen]
+        return float(seconds[np.isfinite(seconds)].sum())
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=0.5, help="shorter tests stay (default 0.5)")
-    parser.add_argument("--data", type=Path, default=ROOT / "out" / "quick-tests.db", help="kept; used again if there")
-    args, arguments = parser.parse_known_args()
+    parser.add_argument("--total", type=float, default=200.0, help="seconds that the quick tests may take, of one core")
+    parser.add_argument("--data", type=Path, nargs="+", default=[ROOT / "out" / "quick-tests.db"], help="used if there")
+    parser.add_argument("--tests", nargs="+", default=[], help="instead of all: into the first of --data")
+    args = parser.parse_args()
     os.chdir(ROOT)
-    if not args.data.exists():
-        args.data.parent.mkdir(parents=True, exist_ok=True)
-        record(args.data, arguments)
-    seconds, places = json.loads(args.data.with_suffix(".json").read_text()), reached(args.data)
-    out = left_out(seconds, places, args.seconds)
-    CHOSEN.write_text(HEAD + "".join(f"{test}\n" for test in out), encoding="utf-8")
-    tests = {"quick": set(seconds) - set(out), "thorough": set(seconds)}
-    for name, chosen in tests.items():
-        steps = set().union(*(places.get(test, set()) for test in (*chosen, "")))
-        lines = {(path, line) for path, *ends in steps for line in ends if line > 0}
-        total = sum(sum(seconds[test]) for test in chosen)
-        print(f"{name}: {len(chosen)} tests, {total:.0f} s under coverage, {len(lines)} lines, {len(steps)} steps")
+    if not args.data[0].exists():
+        args.data[0].parent.mkdir(parents=True, exist_ok=True)
+        record(args.data[0], args.tests)
+    reach = Reach.of(args.data)
+    for limit in LIMITS_S:
+        out = reach.left_out(limit)
+        if reach.total_s(~out) <= args.total:
+            break
+    names = sorted(test for test, is_out in zip(reach.tests, out, strict=True) if is_out)
+    CHOSEN.write_text(HEAD + "".join(f"{name}\n" for name in names), encoding="utf-8")
+    failed = [test for test, (_, started) in zip(reach.tests, reach.seconds, strict=True) if not np.isfinite(started)]
+    print(f"tests of more than {limit} s; {len(failed)} failed under coverage and stay {' '.join(failed)}")
+    print(reach.describe("thorough", np.ones(len(reach.tests), dtype=bool)))
+    print(reach.describe("quick", ~out))
 
 
 if __name__ == "__main__":

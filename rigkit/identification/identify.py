@@ -234,7 +234,6 @@ def _result(
     for k, board_id in enumerate(both):
         start[board_id] = pose.cam1_from_board[k]
     corners = np.array([[len(d[i].grid) for d in detections] for i in both])
-    per_board = np.sqrt(pose.squared_px.sum(axis=1) / corners.sum(axis=1))
     contradicting = [s for s in tied if s.differs_from(winner)]
     lost = [_why_left_over(v, views[v], n) for v, n in left_over]
     ordered = [[*both, *(b.board_id for b in boards if b.board_id in d and b.board_id not in both)] for d in detections]
@@ -245,7 +244,6 @@ def _result(
         cam1_from_board={i: Rigid3.from_matrix(m) for i, m in start.items()},
         residual_px=float(np.sqrt(pose.squared_px.sum() / corners.sum())),
         runner_up_px=runner_up_px,
-        board_residual_px=dict(zip(both, per_board.tolist(), strict=True)),
         ambiguous=bool(contradicting),
         missing=_missing(boards, detections, both),
         notes=(

@@ -22,7 +22,6 @@ class PairIdentity:
     residual_px : rms distance (2-D per corner, both images) of the corners from the rigid scene of the winner.
     runner_up_px : the same for the best clearly different assignment of as many boards, however badly it fits;
         infinite where there is none.
-    board_residual_px : `residual_px` board by board.
     ambiguous : whether geometry alone cannot tell the winner from another assignment; the one with the smallest roll
         between the cameras was then taken, and `notes` says so.
     missing : why a listed board is not in both lists, by board id.
@@ -35,7 +34,6 @@ class PairIdentity:
     cam1_from_board: Mapping[str, Rigid3]
     residual_px: float
     runner_up_px: float
-    board_residual_px: Mapping[str, float]
     ambiguous: bool
     missing: Mapping[str, str]
     notes: tuple[str, ...] = ()

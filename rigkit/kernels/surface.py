@@ -11,7 +11,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
 from rigkit.kernels.declarations import header
 
-SURFACE_DEGREE, SURFACE_TERMS = (header().constants[name] for name in ("SURFACE_DEGREE", "SURFACE_TERMS"))
+SURFACE_DEGREE = header().constants["SURFACE_DEGREE"]
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
 
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(SURFACE_DEGREE + 1))

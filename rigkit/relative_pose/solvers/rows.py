@@ -21,7 +21,8 @@ import numpy as np
 from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
 
 PLANAR_ENTRIES = (1, 3, 5, 7)
-"""Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]."""
+"""Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]. Of a rotation by
+theta about y and t = (sin phi, 0, cos phi): e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi)."""
 
 
 def point_rows(rays1: Rays, rays2: Rays) -> FloatArray:
@@ -43,15 +44,6 @@ def essential_from_planar(e: FloatArray) -> FloatArray:
     out = np.zeros((*e.shape[:-1], 9))
     out[..., PLANAR_ENTRIES] = e
     return out.reshape(*e.shape[:-1], 3, 3)
-
-
-def planar_angles(e: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (theta, phi) of planar entries (..., 4): R = rotation by theta about y, t = (sin phi, 0, cos phi).
-
-    e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi). The opposite e has the same theta and phi + pi.
-    """
-    phi = np.arctan2(e[..., 3], -e[..., 0])
-    return phi - np.arctan2(-e[..., 2], e[..., 1]), phi
 
 
 def right_singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
