@@ -111,7 +111,7 @@ def render_capture(name: str, folder: Path) -> None:
 
 def render_laboratory(folder: Path) -> None:
     """Render the pairs of the laboratory, and its manifest."""
-    exposure, rng = Exposure(), np.random.default_rng(77)
+    exposure, rng = Exposure(samples=64), np.random.default_rng(77)
     scene = blender.new_scene(exposure)
     furnish_corner(rng)
     paint, places = blender.print_materials(exposure), laboratory.places()
