@@ -3,6 +3,8 @@
     python scripts/compare_circles.py --board circles.toml IMAGE...     real images
     python scripts/compare_circles.py                                   rendered ones, with the errors of the centres
 
+Rendered ones stand beside the Cramer-Rao bound of each circle; then boards 60 degrees off the axis of a fisheye and 60
+degrees slanted, without noise: by how much centres are off in the mean, and at most, along any direction of the image.
 OpenCV is told the size, as rigkit is. It knows no hexagonal grids.
 """
 
@@ -15,15 +17,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rigkit.benchmark.scenes import one_board
+from rigkit.benchmark.circle_bound import circle_information
+from rigkit.benchmark.corner_bound import position_bound
+from rigkit.benchmark.scenes import LENSES, BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
 from rigkit.io.board_file import load_board
 from rigkit.io.images import read_image
+from rigkit.synthetic.photometry import Photometry
+from rigkit.synthetic.render import Optics
+from rigkit.synthetic.scene import PlacedBoard
 
+BLUR_PX, NOISE_LEVELS = 0.7, 2.0
+OBLIQUE_DEG, SLANTED_SIZE_PX, DISTANCE_SQUARES = 60.0, (1280, 960), 9.0
 FLAGS = {"regular": cv2.CALIB_CB_SYMMETRIC_GRID, "asymmetric": cv2.CALIB_CB_ASYMMETRIC_GRID}
 RENDERED = (
     Board("regular", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0)),
@@ -79,24 +90,65 @@ def compare_real(paths: Sequence[Path], board: Board) -> None:
 
 def compare_rendered(count: int) -> None:
     for board in RENDERED:
-        for lens in ("regular", "fisheye"):
+        for lens in LENSES:
             off: dict[str, list[FloatArray]] = {name: [] for name in FINDERS}
+            squared, bounds, relative = [], [], []
             for seed in range(count):
                 rng = np.random.default_rng(seed)
                 scene = one_board(rng, lens=lens, board=board)
-                image = np.asarray(scene.render(noise_levels=2.0, rng=rng))
+                image = np.asarray(scene.render(blur_px=BLUR_PX, noise_levels=NOISE_LEVELS, rng=rng))
                 truth = scene.truth()[0].pixels
                 for name, finder in FINDERS.items():
                     centres = finder(image, board)
                     if centres is not None:
                         nearest = np.linalg.norm(centres[:, None] - truth, axis=2).argmin(axis=1)
                         off[name].append(centres - truth[nearest])
+                covariance = position_bound(circle_information(scene, BLUR_PX), NOISE_LEVELS)
+                least = np.trace(covariance, axis1=1, axis2=2)
+                for item in detect_boards(image, [board]):
+                    nearest = np.linalg.norm(item.pixels[:, None] - truth, axis=2).argmin(axis=1)
+                    error, known = item.pixels - truth[nearest], np.isfinite(least[nearest])
+                    squared.append((error[known] ** 2).sum(axis=1))
+                    bounds.append(least[nearest][known])
+                    relative.append((error / item.sigma_px[:, None]) ** 2)
             words = (
                 f"{name} {len(parts)} of {count}, rms {np.sqrt((np.concatenate(parts) ** 2).mean()):.4f} px"
                 for name, parts in off.items()
                 if parts
             )
-            print(f"{board.board_id:10s} {lens:7s}", "; ".join(words))
+            ratio = np.sqrt(np.concatenate(squared).mean() / np.concatenate(bounds).mean())
+            told = np.sqrt(np.concatenate(relative).mean())
+            print(f"{board.board_id:10s} {lens:7s}", "; ".join(words), end="")
+            print(f"; rigkit {ratio:.2f} bounds, errors over sigmas {told:.2f}")
+
+
+def compare_slanted(count: int) -> None:
+    """Print by how much centres are off, without noise, at OBLIQUE_DEG off the axis and of slant."""
+    camera = bench_camera("fisheye", SLANTED_SIZE_PX)
+    for board in RENDERED:
+        off = []
+        for seed in range(count):
+            rng = np.random.default_rng(seed)
+            angle, turn = rng.uniform(0.0, 2.0 * np.pi, 2)
+            # Facing the camera there, then slanted.
+            facing = exp_so3(np.radians(OBLIQUE_DEG) * np.array([-np.sin(angle), np.cos(angle), 0.0]))
+            axis = np.array([np.cos(turn), np.sin(turn), 0.0])
+            rotation = facing @ exp_so3(np.radians(OBLIQUE_DEG) * axis)
+            place = DISTANCE_SQUARES * board.square_x_mm * facing[:, 2] - rotation @ board.points().mean(axis=0)
+            placed = PlacedBoard(board, Rigid3(rotation, place))
+            scene = BenchScene("slanted", (placed,), (), camera, bench_field_deg("fisheye"))
+            image = scene.render(optics=Optics(BLUR_PX), photometry=Photometry(bits=16))
+            truth = scene.truth()[0]
+            for item in detect_boards(image, [board]):
+                nearest = np.linalg.norm(item.pixels[:, None] - truth.pixels, axis=2).argmin(axis=1)
+                off.append(item.pixels - truth.pixels[nearest])
+        every = np.concatenate(off)
+        print(
+            f"{board.board_id:10s} {OBLIQUE_DEG:g} degrees off the axis and slanted: {len(off)} of {count} boards, "
+            f"{len(every)} circles, mean {np.linalg.norm(every.mean(axis=0)):.4f} px, "
+            f"median {np.median(np.linalg.norm(every, axis=1)):.4f} px, "
+            f"99 % {np.quantile(np.linalg.norm(every, axis=1), 0.99):.4f} px"
+        )
 
 
 def main() -> None:
@@ -109,6 +161,7 @@ def main() -> None:
         compare_real(args.images, load_board(args.board))
     else:
         compare_rendered(args.count)
+        compare_slanted(args.count)
 
 
 if __name__ == "__main__":

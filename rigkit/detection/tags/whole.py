@@ -26,6 +26,7 @@ from rigkit.detection.subpixel.edge_fit import (
     VALID_MOVE_PX,
 )
 from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, SHARP_BLUR_PX
+from rigkit.detection.subpixel.subpixel import LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tags import TagRules, fit_tags
@@ -53,8 +54,8 @@ WHOLE_RULES = TagRules.of(
     most_blur_change=MAX_BLUR_CHANGE,
     light_sigma=LIGHT_SIGMA_PER_PX,
     least_variance=ROUNDING_VARIANCE,
-    converged_px=1e-3,
-    iterations=8,
+    converged_px=LAST_PASS[2],
+    iterations=LAST_PASS[1],
 )
 
 TAG_CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
