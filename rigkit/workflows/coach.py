@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, video_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
-from rigkit.core.findings import worst
+from rigkit.core.findings import Severity, worst
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
@@ -106,16 +106,15 @@ def finished_words(folder: Path) -> str:
     )
     if isinstance(done, SessionCalibration):
         what, c = done.calibration.camera.model, done.calibration
-        return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written[0])
+        return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written)
     rig = done.rig
-    return _finished(
-        f"{len(rig.cameras)} cameras", rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written[0]
-    )
+    return _finished(f"{len(rig.cameras)} cameras", rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written)
 
 
-def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: object, written: Path) -> str:
-    held = rms_px if heldout_px is None else heldout_px
-    return f"Done: {what}, held-out {held:.3f} px, {verdict}; {written.name} written"
+def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Severity, written: Sequence[Path]) -> str:
+    error = f"rms {rms_px:.3f} px" if heldout_px is None else f"held-out {heldout_px:.3f} px"
+    why = "" if verdict is Severity.GOOD else f" ({written[-1].name} says why)"
+    return f"Done: {what}, {error}, {verdict}{why}; {written[0].name} written"
 
 
 def coach_frames(

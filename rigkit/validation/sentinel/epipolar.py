@@ -24,7 +24,7 @@ from rigkit.geometry.rotation import skew
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
 from rigkit.validation.sentinel.whitened import NULL_RANK
 
@@ -35,8 +35,6 @@ PARTS = 4
 """Columns and rows of the parts of an image that are taken as independent."""
 FIT_ROUNDS, FIT_RANK = 15, 1e-5
 """Of the fit of everything to the matches; directions that move them by less beside others are none."""
-MIN_MATCH_PX = 0.01
-"""No match is better."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
 
@@ -144,11 +142,11 @@ def _unexplained(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray
         step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_RANK)[0]
         left = residual - design @ step
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
-    return left, _weights(left, sigma), max(sigma, MIN_MATCH_PX)
+    return left, _weights(left, sigma), max(sigma, MIN_SIGMA_PX)
 
 
 def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
-    return np.asarray(1.0 / (1.0 + (left / (CAUCHY_SIGMAS * max(sigma_px, MIN_MATCH_PX))) ** 2))
+    return np.asarray(1.0 / (1.0 + (left / (CAUCHY_SIGMAS * max(sigma_px, MIN_SIGMA_PX))) ** 2))
 
 
 def _distances(watched: Watched, pair: PairMatches) -> FloatArray:
