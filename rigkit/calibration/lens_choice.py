@@ -91,7 +91,13 @@ def lenses_on_boards(found: Solved, tried: Lenses, names: Sequence[str], how: Ho
     for option in options:
         if all(option.fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
             judged.append(replace(option, heldout=heldout_squares(observations, option.fit, how.folds)))
-    return Lenses(observations, judged)
+    return Lenses(observations, settled(judged))
+
+
+def settled(options: list[Option]) -> list[Option]:
+    """Return the options whose solver converged, where any did. The others creep along a ridge: a model with more
+    numbers than the lens has (a double sphere for a lens without distortion) shows the images with many of them."""
+    return [option for option in options if option.fit.convergence.converged] or options
 
 
 def choose_lenses(cameras: Sequence[Lenses]) -> list[Choice]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
@@ -11,9 +13,10 @@ from rigkit.calibration.between_models import rival_fits
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.fit import Fit, fit_model
-from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
+from rigkit.calibration.lens_choice import Lenses, choose_lenses, settled, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Convergence
 from rigkit.calibration.uncertainty import FarProjection, followed, projection_design
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model
@@ -82,6 +85,17 @@ def test_twins_have_images_of_one_size_and_nearly_one_focal_length() -> None:
     assert twins([reg, wide, near]) == [[0, 2], [1]]
     small = KannalaBrandt((800, 600), wide.parameters)
     assert twins([wide, small]) == [[0], [1]]
+
+
+def test_a_lens_whose_solver_was_stopped_is_none_where_another_one_is_found(
+    fits: dict[str, tuple[Observations, Fit]],
+) -> None:
+    """Of a lens without distortion on bent boards a double sphere was taken, and called bad as it did not converge."""
+    one, other = lenses(fits, np.zeros(IMAGES)).options
+    stopped = Convergence(iterations=60, converged=False, reason="stopped after 60 iterations")
+    creeping = replace(other, fit=replace(other.fit, convergence=stopped))
+    assert settled([creeping, one]) == [one]
+    assert settled([creeping]) == [creeping]
 
 
 def test_another_lens_is_followed_where_the_model_can() -> None:
