@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from rigkit.calibration.clustered import with_block
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.usable import views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView, grid_turned
+from rigkit.core.detections import BoardDetection, BoardView, grid_turned
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress, silent
@@ -213,18 +213,24 @@ def _views(
     """Return the boards in all images; what has none goes to `left_out`, what cannot be used to `unreadable`."""
     out: list[FreshView] = []
     total = sum(len(frame) for frame in frames)
+    seen: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in watched.cameras]
     for k, frame in enumerate(frames):
-        name = f"{k:04d}"
         for c, path in enumerate(frame):
             progress("corners", k * len(frame) + c, total)
             image = _image_of(watched.cameras[c], source, path, unreadable)
-            if image is None:
+            if image is not None:
+                seen[c][str(path)] = detect_boards(image, boards, camera=watched.cameras[c])
+    progress("corners", total, total)
+    own = [without_lookalikes(found, boards) for found in seen]
+    for k, frame in enumerate(frames):
+        name = f"{k:04d}"
+        for c, path in enumerate(frame):
+            if str(path) not in own[c]:
                 continue
-            found, reason = views_of_image(path.name, detect_boards(image, boards, camera=watched.cameras[c]), boards)
-            out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in found]
+            views, reason = views_of_image(path.name, own[c][str(path)], boards)
+            out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
-    progress("corners", total, total)
     if not out:
         if not left_out:
             raise InputError(f"check: {unreadable[0]}")

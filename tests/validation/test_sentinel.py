@@ -163,6 +163,18 @@ def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: n
     assert "another camera" in " ".join(check_words(check).sentences)
 
 
+def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
+    """Such as of a patterned box that passed for a part of the board: it leaves no pose to solve for."""
+    camera, poses = lens("reg"), _held("reg", 4)
+    views = [_view(camera, pose, f"{k}", rng) for k, pose in enumerate(poses)]
+    box = _view(camera, poses[0], "box", rng)
+    box = replace(box, pixels=np.clip(box.pixels + 12.0 * rng.standard_normal(box.pixels.shape), 0.0, [1623.0, 1239.0]))
+    watched = watched_camera(calibration, "cam")
+    alone = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate(views)])
+    beside = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate([*views, box])])
+    assert beside.holds and beside.rms_px == pytest.approx(alone.rms_px, rel=0.05)
+
+
 def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:
     with pytest.raises(InputError, match="no board was found"):
         check_views(watched_camera(calibration, "cam"), [])

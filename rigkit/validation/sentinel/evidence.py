@@ -139,7 +139,9 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
     for _ in range(POSE_ROUNDS):
         products = found.products(watched)
         n = watched.size
-        step = np.linalg.solve(products[:, n : n + 6, n : n + 6], products[:, n : n + 6, -1:])[..., 0]
+        # Of a board nearly all of whose corners stray, too few are left for a pose: what they leave open stays.
+        inverse = np.linalg.pinv(products[:, n : n + 6, n : n + 6], hermitian=True)
+        step = (inverse @ products[:, n : n + 6, -1:])[..., 0]
         found = found.moved(np.asarray(step, dtype=np.float64))
     information, score = reduced_by_cluster(found.products(watched), watched.size, found.frame)
     squares, count, left_out = found.residual_squares(watched)
