@@ -14,7 +14,7 @@ from rigkit.calibration.uncertainty import pose_covariance_of_lens
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
+from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
@@ -137,8 +137,15 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
     """
     known, lens = board_of_words(str(board)), import_camera(camera)
-    view = _view(Path(image), known, lens, camera)
+    seen = _boards_in(Path(image), known, lens, camera)
+    view = _view_of(Path(image), seen, known)
     if view is None:
+        alike = sum(frozenset((d.columns, d.rows)) == frozenset(known.size) for d in seen)
+        if alike > 1:
+            raise CheckFailed(
+                f"'{image}' shows {alike} grids of the size of board '{known.board_id}', and nothing tells which of "
+                "them it is; cover what else is tiled"
+            )
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; check focus and the board's file")
     rays, valid = lens.unproject(view.pixels)
     unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
@@ -180,8 +187,15 @@ def _one_way_up(board: Board) -> Board:
 
 
 def _view(path: Path, board: Board, camera: Camera, calibration: str | Path) -> BoardView | None:
-    image = read_image_of(path, camera.size_px, calibration)
-    found = [d for d in detect_boards(image, [board], camera=camera) if d.board_id == board.board_id]
+    return _view_of(path, _boards_in(path, board, camera, calibration), board)
+
+
+def _boards_in(path: Path, board: Board, camera: Camera, calibration: str | Path) -> Sequence[BoardDetection]:
+    return detect_boards(read_image_of(path, camera.size_px, calibration), [board], camera=camera)
+
+
+def _view_of(path: Path, seen: Sequence[BoardDetection], board: Board) -> BoardView | None:
+    found = [d for d in seen if d.board_id == board.board_id]
     return BoardView.from_detection(path.name, max(found, key=lambda d: len(d.grid)), [board]) if found else None
 
 
