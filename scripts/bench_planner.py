@@ -300,9 +300,13 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
     mask = covered_by_boards(full, grid_pixels(size, GRID))
     covered = grid_pixels(size, GRID)[mask]
 
-    def error(chosen: list[int]) -> float:
+    def errors(chosen: list[int]) -> list[float]:
+        """Where boards were, over the whole image, and what the covariance promises."""
         part = of_images(views, chosen, size, how)
-        return np.inf if part is None else compare_cameras(camera, part.camera, grid=GRID, mask=mask).rms_px
+        found = [np.inf] * 2
+        if part is not None:
+            found = [compare_cameras(camera, part.camera, grid=GRID, mask=m).rms_px for m in (mask, None)]
+        return [*found, promised(chosen)]
 
     known = Knowledge.unseen(full)
     information, goal = np.array([of_image(view, known) for view in views]), projection_goal(camera, pixels=covered)
@@ -316,16 +320,19 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
     for count in (8, 10) if len(views) > FEW_IMAGES else (len(views) // 2,):
         rng = np.random.default_rng(count)
         anyhow = [rng.choice(len(views), count, replace=False).tolist() for _ in range(draws)]
-        free, free_promised = np.array([[error(c), promised(c)] for c in anyhow]).T
+        free, free_whole, free_promised = np.array([errors(c) for c in anyhow]).T
         starts = [rng.choice(len(views), 2, replace=False).tolist() for _ in range(max(draws // 4, 4))]
         chosen = [choose_images(views, size, how, start, count, covered) for start in starts]
-        own, own_promised = np.array([[error(c), promised(c)] for c in chosen]).T
-        better = np.mean([np.mean(free > e) for e in own])
+        own, own_whole, own_promised = np.array([errors(c) for c in chosen]).T
+        better, better_whole = (
+            100.0 * np.mean([np.mean(f > e) for e in o]) for f, o in ((free, own), (free_whole, own_whole))
+        )
         print(
             f"{name:20s} {camera.model}, board {full.boards[0].kind}, {count:2d} of {len(views)}: planner "
             f"{np.median(own):.3f} px, random {np.median(free):.3f}, ratio {np.median(own) / np.median(free):.2f} "
-            f"(promised {np.median(own_promised) / np.median(free_promised):.2f}); better than {100 * better:.0f} % of "
-            f"random choices",
+            f"(promised {np.median(own_promised) / np.median(free_promised):.2f}); better than {better:.0f} % of "
+            f"random choices; over the whole image {np.median(own_whole) / np.median(free_whole):.2f}, "
+            f"{better_whole:.0f} %",
             flush=True,
         )
 

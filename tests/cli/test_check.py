@@ -15,8 +15,10 @@ from rigkit.cameras.brown import Brown
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_camera, save_calibration
+from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
@@ -35,12 +37,11 @@ def _poses(count: int) -> list[Rigid3]:
     return [view.cam_from_board for view in plan_views(known, [BOARD], projection_goal(CAMERA), count).views]
 
 
-def _pictures(folder: Path, camera: Camera, rng: np.random.Generator) -> Path:
+def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: PlacedBoard) -> Path:
     folder.mkdir()
     for k, pose in enumerate(_poses(3)):
-        image = render(
-            [PlacedBoard(BOARD, pose)], camera, Rigid3.identity(), photometry=Photometry(noise_levels=1.0), rng=rng
-        )
+        placed = [PlacedBoard(BOARD, pose), *others]
+        image = render(placed, camera, Rigid3.identity(), photometry=Photometry(noise_levels=1.0), rng=rng)
         cv2.imwrite(str(folder / f"{k}.png"), image)
     return folder
 
@@ -60,6 +61,16 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     moved[:2] *= 1.0 + 0.01 * FOCUS_PERCENT
     _pictures(root / "moved", CAMERA.with_parameters(moved), rng)
     return root
+
+
+def test_a_patterned_box_in_the_room_is_no_board(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # Its fields are no squares; it stands behind the board, beside it in some pictures.
+    box = PlacedBoard(Board("box", 5, 4, 30.0, 24.0), Rigid3(np.eye(3), [80.0, 60.0, 800.0]))
+    pictures = _pictures(home / "tiled", CAMERA, np.random.default_rng(7), box)
+    found = [detect_boards(read_image(path), [BOARD]) for path in sorted(pictures.iterdir())]
+    assert any(len(own) > 1 for own in found)
+    assert main(["check", str(home / "cam.json"), str(pictures), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rms_px"] < 0.05
 
 
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
