@@ -97,7 +97,7 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
     """Return in words which size the boards of a session's images (name -> detections) have, where it is clearly none
     of those listed.
 
-    Where most of the grids are whole and of one size that is not listed, and hardly any reaches from end to end of a
+    Where most images show a whole grid of one size that is not listed, and hardly any grid reaches from end to end of a
     listed board, the boards are of that size: a smaller board passes for part of a listed one. And where images show
     whole grids that are larger than a listed board, and that board nowhere, part of a larger board was taken for it in
     the others.
@@ -113,7 +113,7 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
         return None
     reaching = [own for own in found if any(frozenset(seen.reach) in listed for seen in own)]
     if len(reaching) <= MAX_SHARE_REACHING * len(found):
-        return words if 2 * count > sum(len(own) for own in found) else None
+        return words if 2 * count > len(found) else None
     larger = any(max(board.size) <= size[0] and min(board.size) <= size[1] for board in boards)
     return words if larger and count >= MIN_SHARE_LARGER * len(found) else None
 

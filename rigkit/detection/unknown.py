@@ -156,7 +156,8 @@ def difference(guess: Board, declared: Board) -> str | None:
     seen, said = guess.pattern, declared.pattern
     size = f"{guess.columns // seen.points_per_count} x {guess.rows // seen.points_per_count} {seen.count_word}"
     if type(seen) is not type(said):
-        return f'the images show {_article(seen.type)} board of {size}; set type = "{seen.type}"'
+        word = "" if seen.type.endswith("board") else " board"
+        return f'{_article(seen.type)}{word} of {size} is seen; set type = "{seen.type}"'
     if isinstance(seen, Charuco) and isinstance(said, Charuco):
         if seen.legacy != said.legacy and guess.rows % 2 == 1:
             words = "this is the legacy pattern" if seen.legacy else "this is not the legacy pattern"

@@ -61,6 +61,9 @@ def test_a_smaller_board_that_passes_for_part_of_the_stated_one() -> None:
     reaching = grid(9, 7, corners=55)
     smaller = {f"{k}.png": [one] for k, one in enumerate([part] * 7 + [as_part] * 3 + [reaching])}
     assert other_size(smaller, STATED) == "9 x 6 inner corners are seen in 7 of 11 images, 9 x 7 are declared"
+    # Tiles beside it, larger and smaller ones, are no reason to doubt that.
+    tiled = {name: [*own, grid(4, 3), grid(8, 4)] for name, own in smaller.items()}
+    assert other_size(tiled, STATED) == other_size(smaller, STATED)
     seen = {f"{k}.png": [one] for k, one in enumerate([part] * 7 + [reaching] * 3)}
     assert other_size(seen, STATED) is None
 

@@ -140,4 +140,4 @@ def test_what_is_wrong_with_a_board_is_said() -> None:
     assert difference(dark, dark) is None
     grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
     assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images"
-    assert difference(grids[0], new) == 'the images show an aprilgrid board of 6 x 5 tags; set type = "aprilgrid"'
+    assert difference(grids[0], new) == 'an aprilgrid board of 6 x 5 tags is seen; set type = "aprilgrid"'
