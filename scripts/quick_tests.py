@@ -14,6 +14,7 @@ lines and branches of both.
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import resource
@@ -26,6 +27,7 @@ from pathlib import Path
 import coverage
 import numpy as np
 import pytest
+from coverage.parser import PythonParser
 from numpy.typing import NDArray
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,10 +44,16 @@ HEAD = """\
 # The tests that the quick run leaves out: scripts/quick_tests.py chose them, ./scripts/test --thorough runs them too.
 # The quick tests reach every line and branch of rigkit that these reach.
 """
-LIMITS_S = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1)
+LIMITS_S = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.3, 0.2)
 MAX_STARTED_S = 0.05
 """Of a test's processes: even one of Python takes so much."""
 Fixture = pytest.FixtureDef[object]
+STEPS = (
+    "select context.context, file.path, fromno, tono from arc "
+    "join context on context.id = context_id join file on file.id = file_id"
+)
+Part = tuple[str, int] | tuple[str, int, int]
+"""A line of a file, or the branch from one line to another."""
 WHOSE = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
 
 
@@ -110,6 +118,33 @@ def _name_of(fixture: Fixture, param: object) -> str:
     return f"{fixture.baseid}::{fixture.argname}[{param}]"
 
 
+class Source:
+    """A file of rigkit: which of its lines and branches coverage counts.
+
+    What a process runs once, at import or by the first call of a function with a cache, counts for no test: whichever
+    comes first would have it.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.parser = PythonParser(filename=path)
+        self.parser.parse_source()
+        tree = ast.parse(Path(path).read_text(encoding="utf-8"))
+        functions = [node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
+        called = [f for f in functions if not any("cache" in ast.unparse(one) for one in f.decorator_list)]
+        self.lines = self.parser.statements & {
+            line for f in called for line in range(f.body[0].lineno, (f.end_lineno or f.lineno) + 1)
+        }
+        exits = self.parser.exit_counts()
+        self.branches = {arc for arc in self.parser.arcs() if arc[0] in self.lines and exits[arc[0]] > 1}
+
+    def parts(self, start: int, end: int) -> list[Part]:
+        """Return what the step from one line to the next (negative: from or to outside) reaches."""
+        branch = (self.parser.first_line(start), self.parser.first_line(end))
+        out: list[Part] = [(self.path, *branch)] if branch in self.branches else []
+        return [*out, (self.path, branch[1])] if branch[1] in self.lines else out
+
+
 def record(data: Path, tests: Sequence[str]) -> None:
     """Run the tests; write what they reach to `data`, and what they take to `data`.json."""
     measured = coverage.Coverage(data_file=str(data))
@@ -134,49 +169,43 @@ class Reach:
     seconds : (T, 2) of processor time, here and in processes that it started; see `Recorder`.
     shared : (F,) of the fixtures that several tests use.
     uses : (T, F), which test uses which.
-    steps : (T, S), whether the test makes the step from one line of a file to the next.
-    imported : (S,), steps that are made before the first test.
-    lines : (S,), a number for the line that each step leads to.
+    parts : (T, P), whether the test reaches the line or branch.
+    is_line : (P,), whether it is a line.
     """
 
     tests: tuple[str, ...]
     seconds: NDArray[np.float64]
     shared: NDArray[np.float64]
     uses: NDArray[np.bool_]
-    steps: NDArray[np.bool_]
-    imported: NDArray[np.bool_]
-    lines: NDArray[np.int64]
+    parts: NDArray[np.bool_]
+    is_line: NDArray[np.bool_]
 
     @classmethod
     def of(cls, paths: Sequence[Path]) -> Reach:
         seconds: dict[str, tuple[float, float]] = {}
         shared: dict[str, float] = {}
         used: dict[str, list[str]] = {}
-        made: list[tuple[str, tuple[str, int, int]]] = []
-        query = (
-            "select context.context, file.path, fromno, tono from arc "
-            "join context on context.id = context_id join file on file.id = file_id"
-        )
-        for path in paths:
-            told = json.loads(path.with_suffix(".json").read_text())
+        steps: list[tuple[str, str, int, int]] = []
+        for data in paths:
+            told = json.loads(data.with_suffix(".json").read_text())
             seconds, shared, used = seconds | told["seconds"], shared | told["shared"], used | told["uses"]
-            with sqlite3.connect(path) as base:
-                made += ((test, (str(file), start, end)) for test, file, start, end in base.execute(query))
+            with sqlite3.connect(data) as base:
+                steps += base.execute(STEPS)
         tests = {test: k for k, test in enumerate(seconds)}
-        steps = {step: k for k, step in enumerate(dict.fromkeys(step for _, step in made))}
-        reached = np.zeros((len(tests) + 1, len(steps)), dtype=bool)
-        # Whatever is no test stands last.
-        reached[[tests.get(test, len(tests)) for test, _ in made], [steps[step] for _, step in made]] = True
-        uses = np.array([[name in used.get(test, ()) for name in shared] for test in seconds], dtype=bool)
-        lines = {line: k for k, line in enumerate(dict.fromkeys((file, abs(end)) for file, _, end in steps))}
+        sources = {path: Source(path) for path in {path for _, path, *_ in steps}}
+        of_step = {step: sources[step[0]].parts(*step[1:]) for step in {step[1:] for step in steps}}
+        columns = {part: k for k, part in enumerate({part for parts in of_step.values() for part in parts})}
+        reached = np.zeros((len(tests), len(columns)), dtype=bool)
+        for test, path, start, end in steps:
+            if test in tests:
+                reached[tests[test], [columns[part] for part in of_step[path, start, end]]] = True
         return cls(
             tuple(tests),
             np.array(list(seconds.values()), dtype=np.float64),
             np.array(list(shared.values()), dtype=np.float64),
-            uses,
-            reached[:-1],
-            reached[-1],
-            np.array([lines[file, abs(end)] for file, _, end in steps]),
+            np.array([[name in used.get(test, ()) for name in shared] for test in seconds], dtype=bool),
+            reached,
+            np.array([len(part) == 2 for part in columns]),
         )
 
     def left_out(self, limit_s: float) -> NDArray[np.bool_]:
@@ -186,23 +215,23 @@ class Reach:
         fixed = np.array([test.startswith(KEPT) for test in self.tests]) | (self.seconds[:, 1] > MAX_STARTED_S)
         each_s = self.seconds[:, 0] + self.uses @ (self.shared / np.maximum(self.uses.sum(axis=0), 1))
         out = (each_s > limit_s) & ~fixed
-        wanted = self.steps.any(axis=0) & ~self.imported & ~self.steps[~out & ~missing].any(axis=0)
+        wanted = self.parts.any(axis=0) & ~self.parts[~out & ~missing].any(axis=0)
         open_tests = np.flatnonzero(out & ~missing)
         while wanted.any() and len(open_tests):
-            adds = self.steps[open_tests][:, wanted].sum(axis=1)
+            adds = self.parts[open_tests][:, wanted].sum(axis=1)
             best = open_tests[(adds / each_s[open_tests]).argmax()]
             if not adds.any():
                 break
             out[best] = False
-            wanted &= ~self.steps[best]
+            wanted &= ~self.parts[best]
             open_tests = open_tests[open_tests != best]
         return out
 
     def describe(self, name: str, chosen: NDArray[np.bool_]) -> str:
         """Return in words what tests take and reach."""
-        steps = self.steps[chosen].any(axis=0) | self.imported
-        total = self.total_s(chosen)
-        return f"{name}: {chosen.sum()} tests, {total:.0f} s, {len(set(self.lines[steps]))} lines, {steps.sum()} steps"
+        found = self.parts[chosen].any(axis=0)
+        lines, branches = (found & self.is_line).sum(), (found & ~self.is_line).sum()
+        return f"{name}: {chosen.sum()} tests, {self.total_s(chosen):.0f} s, {lines} lines and {branches} branches"
 
     def total_s(self, chosen: NDArray[np.bool_]) -> float:
         """Return the seconds of tests, but for those that failed, and of what they use."""
