@@ -1,7 +1,8 @@
-"""Clouds of real pairs against truth: points, depth, normals, meshes and poses, beside OpenCV's semi-global matching.
+"""Clouds of pairs against truth: points, ranges, normals, meshes and poses, beside OpenCV's semi-global matching.
 
 python scripts/bench_clouds.py ../shared/data/scenes            every pair of pairs.json
 python scripts/bench_clouds.py ../shared/data/scenes motorcycle --known-pose
+python scripts/bench_clouds.py rooms                            of scripts/path_traced_rooms.py
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from rigkit.affine.features import grey_of, match_affine_features
 from rigkit.cameras.base import Camera
@@ -36,17 +39,24 @@ NEAR_REL = 0.02
 PLANE_PX = 3
 MAX_UNEVEN_PX = 0.15
 """Where truth is a plane: over 7 x 7 pixels, to this part of a disparity."""
+EDGE_REL = 0.03
+"""By which the inverse range jumps from pixel to pixel at an edge; twice what it does beside it."""
+BESIDE_PX = (0.0, 2.5, 5.0, 10.0, np.inf)
+"""From an edge, between which errors are told apart."""
+FLYING_SIGMAS = 5.0
+"""A point that is off by more, and by NEAR_REL, flies."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A pair with its truth."""
+    """A pair with its truth; `surface`: range, normals and where these are known, (H, W, ...), of image 1."""
 
     name: str
     kind: str
     images: tuple[Any, Any]
     cameras: tuple[Camera, Camera]
     pose: Rigid3
+    surface: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 def cases(folder: Path, names: list[str]) -> list[Case]:
@@ -61,7 +71,14 @@ def cases(folder: Path, names: list[str]) -> list[Case]:
         )
         t = entry["baseline"] * unit(np.array(entry["cam2_from_cam1_t_direction"]))
         pose = Rigid3(np.array(entry["cam2_from_cam1_R"]), t)
-        out.append(Case(entry["name"], entry["set"], images, (first, second), pose))
+        case = Case(entry["name"], entry["set"], images, (first, second), pose)
+        if "surface" in entry:
+            with np.load(folder / entry["surface"]) as stored:
+                distance, normals = (stored[name].astype(np.float64) for name in ("range", "normals"))
+            case = replace(case, surface=(distance, normals, np.isfinite(distance)))
+        elif (folder / "middlebury" / f"{case.name}_disp.npz").exists():
+            case = replace(case, surface=disparity_truth(folder, case))
+        out.append(case)
     return out
 
 
@@ -100,14 +117,16 @@ def pose_errors(dense: DenseScene, truth: Rigid3) -> tuple[float, float, float]:
 
 
 def disparity_truth(folder: Path, case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return depth, normals and where these are known, (H, W, ...), of a rectified pair with its disparities."""
+    """Return range, normals and where these are known, (H, W, ...), of a rectified pair with its disparities."""
     with np.load(folder / "middlebury" / f"{case.name}_disp.npz") as stored:
         disparity = stored[stored.files[0]].astype(np.float64)
     f, _, cx1, cy = (float(value) for value in case.cameras[0].parameters[:4])
     shift = case.cameras[1].parameters[2] - cx1
     disparity[~np.isfinite(disparity)] = np.nan
     inverse = (disparity + shift) / (f * np.linalg.norm(case.pose.translation_mm))
-    return depth_and_normals(inverse, f, cx1, cy)
+    depth, normals, smooth = depth_and_normals(inverse, f, cx1, cy)
+    v, u = np.indices(depth.shape)
+    return depth * np.sqrt(1.0 + ((u - cx1) / f) ** 2 + ((v - cy) / f) ** 2), normals, smooth
 
 
 def depth_and_normals(inverse: np.ndarray, f: float, cx: float, cy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,17 +154,67 @@ def depth_and_normals(inverse: np.ndarray, f: float, cx: float, cy: float) -> tu
 def against_truth(
     points: np.ndarray, normals: np.ndarray, pixels: np.ndarray, truth: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> str:
-    depth, true_normals, smooth = truth
-    height, width = depth.shape
+    distance, true_normals, smooth = truth
+    height, width = distance.shape
     u, v = np.clip(np.rint(pixels).astype(int), 0, [width - 1, height - 1]).T
-    good = np.isfinite(depth[v, u]) & np.isfinite(points[:, 2])
-    off = np.abs(points[:, 2] / depth[v, u] - 1.0)[good]
+    good = np.isfinite(distance[v, u]) & np.isfinite(points[:, 2])
+    off = np.abs(np.linalg.norm(points, axis=1) / distance[v, u] - 1.0)[good]
     compared = good & smooth[v, u]
     angle = np.degrees(angle_between(normals[compared], true_normals[v, u][compared]))
-    return f"{len(points)} points, depth {100 * np.median(off):.3f} %, normals {np.median(angle):.2f} deg"
+    return f"{len(points)} points, range {100 * np.median(off):.3f} %, normals {np.median(angle):.2f} deg"
 
 
-def mesh_share(cloud: OrientedCloud, camera: Camera, depth: np.ndarray) -> float:
+def from_edges(distance: np.ndarray) -> np.ndarray:
+    """Return how far (H, W) pixels are from the next edge of depth, px."""
+    inverse = 1.0 / distance
+    edge = np.zeros(distance.shape, bool)
+    for step in (inverse, inverse.T):
+        at = edge if step is inverse else edge.T
+        change, least = np.abs(np.diff(step, axis=1)), np.minimum(step[:, 1:], step[:, :-1])
+        padded = np.pad(change, ((0, 0), (1, 1)), mode="edge")
+        # A slope is no edge: its neighbours are as steep.
+        jump = (change > EDGE_REL * least) & (np.maximum(padded[:, :-2], padded[:, 2:]) < 0.5 * change)
+        at[:, 1:] |= jump
+        at[:, :-1] |= jump
+    return np.asarray(cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+
+
+def errors_in_sigmas(dense: DenseScene, distance: np.ndarray) -> list[str]:
+    """Return what 68 and 95 % of the ranges are off by, in their sigmas, and which share flies: by edges of depth.
+
+    A point within 2.5 px of an edge may be on either surface within a pixel.
+    """
+    r = dense.scene.reconstruction
+    swept = dense.grown.swept.ravel()[dense.nodes]
+    size = np.linalg.norm(r.cloud.points_mm, axis=1)
+    height, width = distance.shape
+    u, v = np.clip(np.rint(r.pixels1).astype(int), 0, [width - 1, height - 1]).T
+    away = from_edges(distance)[v, u]
+    inverse = 1.0 / distance
+    between = map_coordinates(inverse, r.pixels1.T[::-1], order=1, mode="nearest")
+    there = np.where((away < BESIDE_PX[1]) | ~np.isfinite(between), inverse[v, u], between)
+    off = np.abs(size - 1.0 / there)
+    for dv in (-1, 0, 1):
+        for du in (-1, 0, 1):
+            other = inverse[np.clip(v + dv, 0, height - 1), np.clip(u + du, 0, width - 1)]
+            off = np.where(away < BESIDE_PX[1], np.fmin(off, np.abs(size - 1.0 / other)), off)
+    sigmas = off / r.cloud.sigma_mm
+    flies = (sigmas > FLYING_SIGMAS) & (off * there > NEAR_REL)
+    lines = []
+    for words, which in (("patches", ~swept), ("sweep", swept)):
+        told = []
+        for near, far in pairwise(BESIDE_PX):
+            k = which & np.isfinite(off) & (away >= near) & (away < far)
+            if k.any():
+                most = "/".join(f"{q:.1f}" for q in np.quantile(sigmas[k], [0.68, 0.95]))
+                told.append(f"{near:g}-{far:g} px {most} ({100 * flies[k].mean():.1f} % fly)")
+        lines.append(f"{words}, 68/95 % within sigmas, from edges: {', '.join(told)}")
+    known = np.isfinite(off)
+    lines.append(f"{100 * flies[known].mean():.2f} % off by over {FLYING_SIGMAS:g} sigmas and {100 * NEAR_REL:.0f} %")
+    return lines
+
+
+def mesh_share(cloud: OrientedCloud, camera: Camera, distance: np.ndarray) -> float:
     """Return the share of the true pixels that the Poisson mesh of the cloud is within NEAR_REL of."""
     import open3d
 
@@ -153,11 +222,10 @@ def mesh_share(cloud: OrientedCloud, camera: Camera, depth: np.ndarray) -> float
     tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
     scene.add_triangles(tensor(mesh.points.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
-    v, u = np.nonzero(np.isfinite(depth))
+    v, u = np.nonzero(np.isfinite(distance))
     rays, _ = camera.unproject(np.stack([u, v], axis=-1).astype(np.float64))
     hit = scene.cast_rays(tensor(np.concatenate([np.zeros_like(rays), rays], axis=1).astype(np.float32)))
-    found = hit["t_hit"].numpy() * rays[:, 2]
-    return float(np.mean(np.abs(found / depth[v, u] - 1.0) < NEAR_REL))
+    return float(np.mean(np.abs(hit["t_hit"].numpy() / distance[v, u] - 1.0) < NEAR_REL))
 
 
 def semi_global(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -195,12 +263,15 @@ def main() -> None:
         )
         axis = np.degrees(np.arccos(unit(cloud.points_mm)[:, 2]))
         print(f"  to {axis.max():.0f} deg off axis")
-        if (args.folder / "middlebury" / f"{case.name}_disp.npz").exists():
-            truth = disparity_truth(args.folder, case)
+        truth = case.surface
+        if truth is not None:
             print(
                 f"  rigkit: {against_truth(cloud.points_mm, cloud.normals, dense.scene.reconstruction.pixels1, truth)}"
             )
-            print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
+            for line in errors_in_sigmas(dense, truth[0]):
+                print(f"    {line}")
+            if case.kind == "middlebury":
+                print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
             shares = [mesh_share(c, case.cameras[0], truth[0]) for c in (cloud, with_lines_of_sight(cloud))]
             print(
                 f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * shares[0]:.0f} % of true pixels, "
