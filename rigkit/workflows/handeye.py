@@ -152,8 +152,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     points = view.points()[valid]
     with about(camera, image):
         found = board_poses(rays[valid], points, view.sigma_px[valid] * unit)
-        seen, _ = lens.project(found[0].cam_from_board.apply(points))
-        rms = float(np.sqrt(((seen - view.pixels[valid]) ** 2).sum(axis=1).mean()))
+        projected, _ = lens.project(found[0].cam_from_board.apply(points))
+        rms = float(np.sqrt(((projected - view.pixels[valid]) ** 2).sum(axis=1).mean()))
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
             raise DegenerateError("the lens does not see the board where it stands; check the numbers of its file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
