@@ -60,8 +60,11 @@ class Departures:
     def of(cls, calibration: Calibration) -> Departures:
         """Return what the images of a calibration leave open."""
         sigmas = calibration.parameter_sigmas
-        products, freedom = _products(calibration, sigmas)
         p = len(sigmas)
+        products, freedom = _products(calibration, sigmas)
+        if not (np.isfinite(products).all() and products[-1, -1] >= 0.0):
+            # A lens beyond all numbers, as a damaged file may have it.
+            products = np.zeros_like(products)
         of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
         followed = np.linalg.solve(of_parameters, products[:p, p:])
         left = products[p:, p:] - products[p:, :p] @ followed
@@ -106,6 +109,9 @@ def _displace(out: FloatArray, u: FloatArray, v: FloatArray, size_px: tuple[int,
 def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     """Return E[a a^T] (J, J) of amounts a of which the images give the information (J, J) and the score (J,), averaged
     over the sizes that those along the radius, and the others, may have beforehand."""
+    # Where nothing is known, rounding may say less than nothing.
+    values, axes = np.linalg.eigh(information)
+    information = (axes * np.maximum(values, 0.0)) @ axes.T
     # The middles of so many equal parts.
     sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, 2 * SIZES_TRIED + 1)[1::2]
     along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
@@ -126,13 +132,15 @@ def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray,
     """Return the sums of products (K, K) of derivatives by the parameters in units of `sigmas` (P,), the displacements
     and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the parameters."""
     views = [view for view in calibration.views if view.kept.any()]
+    each = len(sigmas) + DISPLACEMENTS + 1
+    if not views:
+        return np.zeros((each, each)), 0
     kept = [np.flatnonzero(view.kept) for view in views]
     # Of very many corners some tell enough.
     fewest, total = min(len(own) for own in kept), sum(len(own) for own in kept)
     every = max(1, min(total // ENOUGH_CORNERS, fewest // CORNERS_OF_VIEW))
     used = [own[::every] for own in kept]
     count = np.array([len(own) for own in used])
-    each = len(sigmas) + DISPLACEMENTS + 1
     out, with_pose = np.zeros((each, each)), np.empty((len(views), each + 6, 6))
     block = np.cumsum(count) // CORNERS_AT_A_TIME
     for number in np.unique(block):

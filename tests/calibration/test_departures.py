@@ -11,7 +11,7 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.departures import DISPLACEMENTS, displacements
+from rigkit.calibration.departures import DISPLACEMENTS, Departures, displacements
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_design, projection_uncertainty
 from rigkit.cameras.base import Camera
@@ -95,3 +95,17 @@ def test_rivals_that_agree_on_the_boards_differ_elsewhere(tmp_path: Path) -> Non
     assert (stated_px > alone_px).any()
     assert (error_px < 4.0 * stated_px).all()
     assert 0.2 < np.exp(np.log(error_px / stated_px).mean()) < 1.4
+
+
+def test_what_tells_nothing_leaves_all_open(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=REACH_DEG["reg"])
+    found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+    none = replace(found, views=tuple(replace(v, kept=np.zeros_like(v.kept)) for v in found.views))
+    parameters = np.array(found.camera.parameters)
+    parameters[4] = -9e14
+    far = replace(found, camera=found.camera.with_parameters(parameters))
+    sizes = [np.sqrt(np.diag(Departures.of(one).covariance)) for one in (found, none, far)]
+    assert np.isfinite(sizes).all()
+    # Of all sizes beforehand the largest weigh most.
+    assert sizes[1] == pytest.approx(sizes[1][0]) and 0.1 < sizes[1][0] < 0.5
+    assert sizes[0].min() < 0.5 * sizes[1][0]
