@@ -24,28 +24,23 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from rigkit.benchmark.corner_bound import position_bound
 from rigkit.benchmark.scenes import LENSES, one_board
 from rigkit.benchmark.tag_bound import tag_information
-from rigkit.core.arrays import FloatArray
+from rigkit.calibration.hand_eye import hand_eye
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.io.board_file import load_board
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.images import read_image
 
 BLUR_PX, NOISE_LEVELS = 0.7, 2.0
-REPEATS, STARTS = 5, 5
-RAD_PER_MM = 1e-3
-"""A board a metre away turns by so much where an end of it moves by a millimetre."""
+REPEATS = 5
 
 
 def rendered(count: int) -> None:
@@ -127,29 +122,11 @@ def tracked(paths: Sequence[Path], board: Board, calibration: Path, body: Path, 
         for item in detect_boards(grey_image(read_image(path)), [board], camera=camera)
     ]
     moments = [float(Path(view.image).stem) for view in views]
-    seen = []
-    for view in views:
-        rays, valid = camera.unproject(view.pixels)
-        seen.append(board_pose(rays[valid], view.points()[valid]).cam_from_board)
-    told = [hand.at(t).inverse() @ stand.at(t) for t in moments]
-
-    def residuals(unknown: FloatArray) -> FloatArray:
-        """Turns, in units of RAD_PER_MM, and places of the boards, mm."""
-        cam_from_body, target_from_board = (Rigid3(exp_so3(x[:3]), x[3:]) for x in np.split(unknown, 2))
-        off = [(cam_from_body @ t @ target_from_board).inverse() @ s for t, s in zip(told, seen, strict=True)]
-        return np.array([[*(log_so3(x.rotation) / RAD_PER_MM), *x.translation_mm] for x in off]).ravel()
-
-    fits = []
-    for start in range(STARTS):
-        turns = np.random.default_rng(start).normal(0.0, 1.5, (2, 3))
-        unknown = np.concatenate([[*turn, 0.0, 0.0, 0.0] for turn in turns])
-        fits.append(least_squares(residuals, unknown, loss="soft_l1", f_scale=3.0, max_nfev=60))
-    best = residuals(min(fits, key=lambda fit: float(fit.cost)).x).reshape(-1, 2, 3)
-    angles, distances = np.linalg.norm(best, axis=2).T
-    angles = np.degrees(angles * RAD_PER_MM)
+    fitted = hand_eye(camera, views, [hand.at(t).inverse() @ stand.at(t) for t in moments])
+    angles = np.degrees(fitted.apart_rad)
     print(
-        f"{len(moments)} images: median {np.median(distances):.2f} mm, {np.median(angles):.3f} deg; "
-        f"largest {distances.max():.2f} mm, {angles.max():.3f} deg"
+        f"{len(moments)} images: median {np.median(fitted.apart_mm):.2f} mm, {np.median(angles):.3f} deg; "
+        f"largest {fitted.apart_mm.max():.2f} mm, {angles.max():.3f} deg"
     )
 
 

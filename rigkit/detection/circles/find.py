@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.fit import CircleFit, fit_circles
-from rigkit.detection.circles.local_map import PlaneMap, local_maps
+from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_bends
 from rigkit.detection.saddles.response import GreyImage
 
 if TYPE_CHECKING:
@@ -246,6 +246,7 @@ def _again(grey: GreyImage, draft: _Draft) -> _Draft:
     """Return the draft fitted with maps through the circles as they are now."""
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
+    around = with_smooth_bends(around, draft.label, fit.pixels, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
     fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px)
     return _judged(replace(draft, fit=fresh, around=around, radius=radius))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import factorial
 
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.detection.tags.surface import SmoothMap
 
 SQUARE_BASIS = np.eye(2)
 HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
@@ -27,6 +28,8 @@ MIN_RIDGE = 1e-9
 """Keeps the equations solvable where there are fewer neighbours than terms."""
 SLIGHT = 1e-4
 """Pull on the perspective of a homography, as a part of its neighbours' weight: few neighbours leave it open."""
+MIN_SMOOTH, MIXED_STEP = 20, 0.3
+"""Circles that a map of the whole board is told by at least, and half the step of its mixed derivative."""
 POWERS = tuple((order - k, k) for order in range(len(TYPICAL_DERIVATIVES)) for k in range(order + 1))
 
 
@@ -106,6 +109,23 @@ def local_maps(
         (known | centre)[:, np.hypot(x, y) < NEXT].all(axis=1),
         gain,
     )
+
+
+def with_smooth_bends(around: PlaneMap, label: IntArray, pixels: FloatArray, *, hexagonal: bool) -> PlaneMap:
+    """Return the map `around` the circles of a lattice, (N, 2) each, with second derivatives of one map through all.
+
+    Neighbours are on one side only at the rim, and leave the curvature there to their scatter; a smooth map of the
+    board knows it better. As it is where there are few circles.
+    """
+    if len(label) < MIN_SMOOTH:
+        return around
+    places = label @ plane_basis(hexagonal).T
+    smooth = SmoothMap(places, pixels)
+    here, below, above = (smooth.at(places + np.array([0.0, off])) for off in (0.0, MIXED_STEP, -MIXED_STEP))
+    mixed = (below.sides[:, 0] - above.sides[:, 0]) / (2.0 * MIXED_STEP)
+    second = np.stack([here.bends[:, 0], mixed, here.bends[:, 1]], axis=2)
+    known = np.isfinite(second).all(axis=(1, 2), keepdims=True)
+    return replace(around, second=np.where(known, second, around.second))
 
 
 def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
