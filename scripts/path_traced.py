@@ -7,7 +7,7 @@
 A SET is a folder with the pictures (8 bit, sRGB, shot and read noise), board.toml and truth.json: the lens's formula,
 the cameras' and boards' poses, the board's points. `laboratory` is a data set for `rigkit validate`, with its
 dataset.toml; its cameras are those of `narrow` and `fisheye`, which are calibrated first. The same names give the same
-pictures again. A picture of 800 x 600 takes some 6 s of one core.
+pictures again. A picture of 800 x 600 takes some 20 s of one core.
 
 Lenses and boards stand in traced/captures.py, the laboratory in traced/laboratory.py.
 """
@@ -111,7 +111,7 @@ def render_capture(name: str, folder: Path) -> None:
 
 def render_laboratory(folder: Path) -> None:
     """Render the pairs of the laboratory, and its manifest."""
-    exposure, rng = Exposure(samples=64), np.random.default_rng(77)
+    exposure, rng = Exposure(), np.random.default_rng(77)
     scene = blender.new_scene(exposure)
     furnish_corner(rng)
     paint, places = blender.print_materials(exposure), laboratory.places()
