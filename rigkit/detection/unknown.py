@@ -134,9 +134,9 @@ def _in_most(plain: Sequence[Sequence[BoardDetection]]) -> bool:
 
 def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[BoardDetection]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
-    circles = CircleSightings()
+    circles, settled = CircleSightings(), _in_most(plain)
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
-        if not (found and _in_most(plain)):
+        if not (found and settled):
             circles.look(k, image)
     # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
     counts = Counter(size for found in plain for size in _sizes(found))
