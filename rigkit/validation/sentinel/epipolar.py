@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from rigkit.affine.features import match_affine_features
-from rigkit.calibration.fit import CAUCHY_SIGMAS
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.progress import Progress, silent
@@ -33,6 +32,9 @@ MIN_FRAME_MATCHES = 40
 """Fewer matches of a frame may be of one surface, or wrong."""
 PARTS = 4
 """Columns and rows of the parts of an image that are taken as independent."""
+WELSCH_SIGMAS = 2.985
+"""Matches that lie farther off hardly count (J. E. Dennis, R. E. Welsch, 1978; of Gaussian noise 95 % is used): up to a
+quarter of them is wrong where things repeat, and not by far."""
 FIT_ROUNDS, FIT_RANK = 15, 1e-5
 """Of the fit of everything to the matches; directions that move them by less beside others are none."""
 REACH_SIGMAS = 0.2
@@ -137,16 +139,19 @@ def _unexplained(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray
     rank = int(np.count_nonzero(values > FIT_RANK * values[0]))
     freedom = max(len(residual) - rank, 1) / len(residual)
     left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
+    # A wrong match far from all others bends the fit to itself: what lies out before it counts no more after it.
+    weight = before = _weights(residual, sigma)
     for _ in range(FIT_ROUNDS):
-        root = np.sqrt(_weights(left, sigma))
+        root = np.sqrt(weight)
         step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_RANK)[0]
         left = residual - design @ step
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
-    return left, _weights(left, sigma), max(sigma, MIN_SIGMA_PX)
+        weight = np.minimum(before, _weights(left, sigma))
+    return left, weight, max(sigma, MIN_SIGMA_PX)
 
 
 def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
-    return np.asarray(1.0 / (1.0 + (left / (CAUCHY_SIGMAS * max(sigma_px, MIN_SIGMA_PX))) ** 2))
+    return np.asarray(np.exp(-((left / (WELSCH_SIGMAS * max(sigma_px, MIN_SIGMA_PX))) ** 2)))
 
 
 def _distances(watched: Watched, pair: PairMatches) -> FloatArray:
