@@ -7,8 +7,8 @@ quick run can do without a test where its other tests reach every line and every
 out are the dearest of these, until the rest takes --total seconds of processor time: of the tests that take longer than
 a limit, which falls until that is so, the quick run keeps those that together reach what the shorter ones do not,
 chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979). It also
-keeps `KEPT`, and tests that fail or start processes under coverage: what these reach is not seen. Prints seconds,
-lines and branches of both.
+keeps one of every file, `KEPT`, and tests that fail or start processes under coverage: what these reach is not seen.
+Prints seconds, lines and branches of both.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ KEPT = (
     "tests/real/",
     # Branches of C are not counted.
     "tests/kernels/",
+    # These look at the code, they do not run it.
+    "tests/test_",
 )
 MAY_BE_MISSING = ("tests/real/", "test_own_readers.py", "_in_browser.py", "test_accessible.py")
 """Tests that are skipped where captures, a browser or another program are missing: others have to reach their lines."""
@@ -225,6 +227,11 @@ class Reach:
             out[best] = False
             wanted &= ~self.parts[best]
             open_tests = open_tests[open_tests != best]
+        # Of every file at least one stays: what it is about is looked at.
+        files = np.array([test.partition("::")[0] for test in self.tests])
+        for file in set(files) - set(files[~out]):
+            own = np.flatnonzero(files == file)
+            out[own[each_s[own].argmin()]] = False
         return out
 
     def describe(self, name: str, chosen: NDArray[np.bool_]) -> str:
