@@ -5,8 +5,8 @@
 - one model by least squares: `state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`,
   `solver`, `fit`
 - which model and board shape: `models_tried`, `choice`, `lens_choice`, `one_model`
-- how sure that is: `repeats`, `clustered`, `uncertainty`, `between_models`
-- what to think of it: `captured`, `coverage`, `neighbours`, `departures`, `moved`, `changing`, `mixed`, `verdicts`
+- how sure that is: `repeats`, `clustered`, `uncertainty`, `between_models`, `departures`
+- what to think of it: `captured`, `coverage`, `neighbours`, `moved`, `changing`, `mixed`, `verdicts`
 - what comes out: `assemble`, `result`
 
 `compare` tells two calibrations apart; `posed`, `held_lens` and `hand_eye` are for a camera that is known. `rig` does
