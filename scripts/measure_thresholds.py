@@ -298,8 +298,9 @@ def main() -> None:
                 f"| {c.evidence.score:.2f} | {c.image} | {c.corners} |", " | ".join(f"{v:.4f}" for v in c.evidence), "|"
             )
     lowest = min(c.evidence.score for c in found if c.board)
-    highest = max((c.evidence.score for c in found if not c.board), default=float("nan"))
-    print(f"\nmargin: boards from {lowest:.2f} upwards, other patterns up to {highest:.2f}; the limit is 0")
+    others = [c.evidence.score for c in found if not c.board]
+    below = f"other patterns up to {max(others):.2f}" if others else "no other pattern reaches the judgement"
+    print(f"\nmargin: boards from {lowest:.2f} upwards, {below}; the limit is 0")
 
 
 if __name__ == "__main__":
