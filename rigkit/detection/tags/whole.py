@@ -32,9 +32,9 @@ from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tags import TagRules, fit_tags
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
-"""A border narrower than this, s, has the code in all windows of its corners. Of 30 real images of a grid, made
+"""A border narrower than this, s, has the code in all windows of its corners. On real images of a grid, made
 smaller and blurred until borders were 3.3 s wide, held-out errors fall from 0.097 to 0.079 px; at 3.7 s they are 0.097
-px either way. Wider ones are better alone (0.19 px; 0.22 px whole): printed modules and saturated paper are no model to
+px either way. Wider ones are better alone (0.19 px; 0.24 px whole): printed modules and saturated paper are no model to
 a pixel."""
 
 BEND_SIGMAS = 0.3
