@@ -88,6 +88,8 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
     squares, left_squares, count, parts = 0.0, 0.0, 0, 0
     for pair in matches:
         residual, jacobian, good = _linearised(watched, pair)
+        if len(residual) == 0:
+            raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
         left, weight, sigma = _unexplained(residual, jacobian)
         by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
@@ -111,7 +113,7 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         corners=count,
         left_out=0,
         overdispersion=float(np.sqrt(np.median(disagreements))),
-        freedom=float(parts - len(matches)),
+        freedom=float(max(parts - len(matches), 1)),
     )
 
 
