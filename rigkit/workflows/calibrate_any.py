@@ -56,6 +56,10 @@ def calibrate_sources(
     if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
     if is_told:
+        if not first.exists():
+            raise InputError(
+                f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file"
+            )
         raise InputError(
             f"calibrate: '{first}' says itself what board and model it has; leave out --board, --square-mm and --model"
         )

@@ -296,3 +296,11 @@ def test_a_square_that_says_nothing_is_refused(
 ) -> None:
     assert main(["calibrate", str(pictures), *told]) == 2
     assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [(), ("--board", "9x6x30"), ("--square-mm", "25")])
+def test_a_folder_that_is_not_there_is_said_to_be_missing(
+    options: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["calibrate", str(tmp_path / "photos"), *options]) == 2
+    assert f"'{tmp_path / 'photos'}' does not exist" in capsys.readouterr().err
