@@ -171,9 +171,11 @@ def read_ply(path: str | Path) -> OrientedCloud:
 def _unit_normals(normals: FloatArray) -> FloatArray:
     """Return normals (N, 3) of length one: some files' lengths say how sure they are. Zero ones stay."""
     largest = np.abs(normals).max(axis=1, keepdims=True, initial=0.0)
-    # Squares of these would overflow, or vanish.
-    normals = normals / np.where((largest > 0.0) & ((largest < 1e-100) | (largest > 1e100)), largest, 1.0)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # What is no number is refused with the cloud.
+    with np.errstate(over="ignore", invalid="ignore"):
+        # Squares of these would overflow, or vanish.
+        normals = normals / np.where((largest > 0.0) & ((largest < 1e-100) | (largest > 1e100)), largest, 1.0)
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
     # Those that are of length one but for rounding are as they were written.
     whole = (np.abs(length - 1.0) < 1e-6) | ~(length > 0.0)
     return np.asarray(normals / np.where(whole, 1.0, length))
