@@ -14,7 +14,7 @@ from mathutils import Matrix
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
-from traced.captures import PAPER_MARGIN, Exposure
+from traced.captures import CIRCLES_BEFORE_MM, PAPER_MARGIN, Exposure
 from traced.lenses import Lens
 
 M_PER_MM = 1e-3
@@ -24,8 +24,6 @@ AMBIENT = 0.35
 """Every surface gives so much of its colour as light: what the room would throw back, without rays and their noise."""
 WHITE, BLACK = 0.8, 0.04
 CIRCLE_SIDES = 128
-CIRCLES_BEFORE_MM = 0.02
-"""Circles lie so far before the paper; rectangles are cut out of it."""
 BACKING_MM = 5.0
 MARGIN_PX = 12
 """All samples are taken so far around the boards, too."""
