@@ -43,7 +43,7 @@ RIGHT_FROM_LEFT = Rigid3(
 CHESSBOARD = Board("chessboard", 9, 6, 25.0, 25.0)
 GRID = Board("grid", 10, 8, 30.0, 30.0, pattern=AprilGrid(spacing=0.3))
 CIRCLES_BEFORE_MM = 0.002
-"""Circles are drawn so far before the paper (rectangles are cut out of it): shadows of 0.02 mm moved them by 0.02 px."""
+"""Circles are drawn so far before the paper (rectangles are cut out of it): shadows of 0.02 mm move them by 0.02 px."""
 CIRCLES = Board("circles", 4, 11, 36.0, 36.0, pattern=Circles(layout="asymmetric", diameter_mm=15.0))
 CHARUCO = Board("charuco", 8, 5, 28.0, 28.0, pattern=Charuco(dictionary="DICT_5X5_100", marker_mm=21.0))
 
