@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, picture
-from report.test_page_in_browser import chromium
+from helpers.browser import chromium
 
 from rigkit.cameras.compare import compare_cameras
 from rigkit.geometry.rigid3 import Rigid3

@@ -10,17 +10,16 @@ import html
 import json
 import os
 import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calibration.test_rig import rig_views
+from helpers.browser import loaded
 from helpers.calibration_scenes import lens
 from helpers.data import REPOSITORY
 from report.test_first_screen import page_of, reported
-from report.test_page_in_browser import QUIET, chromium
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.core.tables import Cell, Column, Table
@@ -86,14 +85,6 @@ def test_axe_finds_no_fault(axe: str, make: Callable[[], str], tmp_path: Path) -
     page = tmp_path / "page.html"
     page.write_text(make().replace("</body>", RUN % axe.replace("</script>", "<\\/script>")), encoding="utf-8")
     for scheme, setting in SCHEMES.items():
-        profile = f"--user-data-dir={tmp_path / scheme}"
-        done = subprocess.run(
-            [chromium(), *QUIET, setting, profile, "--dump-dom", page.as_uri()],
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=True,
-        )
-        told = dict(re.findall(r'data-(faults|checked|scheme)="([^"]*)"', done.stdout))
+        told = dict(re.findall(r'data-(faults|checked|scheme)="([^"]*)"', loaded(page, setting, seconds=240.0)))
         assert told["scheme"] == scheme and int(told["checked"]) >= MIN_CHECKED
         assert json.loads(html.unescape(told["faults"])) == []

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.browser import probed
 from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
-from report.test_page_in_browser import MIN_FONT_PX, QUIET, chromium, measured_at_widths
+from report.test_page_in_browser import MIN_FONT_PX, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -53,24 +53,12 @@ def page(calibration: Calibration) -> str:
 
 
 def test_works_without_network(calibration: Calibration, tmp_path: Path) -> None:
-    browser = chromium()
     text = page(calibration)
     assert not re.search(r"""(src|href)=["']?https?:""", text)
     assert len(text) < MAX_BYTES
     assert "&lt;b&gt;.jpg" in text and "<b>.jpg" not in text
-    path = tmp_path / "calibration.html"
-    path.write_text(text.replace("</body>", PROBE).replace('loading="lazy"', ""), encoding="utf-8")
-    done = subprocess.run(
-        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
-    assert probe is not None
-    assert probe[1] == f"8|true|{IMAGES}|true|true"
+    told = probed(text.replace("</body>", PROBE).replace('loading="lazy"', ""), tmp_path)
+    assert told == ["8", "true", str(IMAGES), "true", "true"]
 
 
 def test_fits_a_phone_a_tablet_and_a_screen(calibration: Calibration, tmp_path: Path) -> None:
@@ -96,18 +84,7 @@ document.body.dataset.probe = told.join("|");
 
 
 def test_tables_sort_pictures_enlarge_and_the_view_turns(calibration: Calibration, tmp_path: Path) -> None:
-    path = tmp_path / "calibration.html"
-    path.write_text(page(calibration).replace("</body>", SORT_PROBE), encoding="utf-8")
-    done = subprocess.run(
-        [chromium(), *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
-    assert probe is not None
-    up, down, names, open_, view = probe[1].split("|")
+    up, down, names, open_, view = probed(page(calibration).replace("</body>", SORT_PROBE), tmp_path)
     assert (up, down, open_) == ("true", "true", "true")
     images = sorted((v.image for v in calibration.views), key=lambda n: int(re.sub(r"\D", "", n)))
     assert names.split(",") == images

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
-from report.test_page_in_browser import QUIET, chromium
+from helpers.browser import probed
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.report.cloud_page import MAX_DRAWN, build_cloud_page
@@ -47,24 +46,11 @@ def sheets(count: int, rng: np.random.Generator) -> OrientedCloud:
 
 
 def test_a_cloud_is_drawn_near_points_before_far_ones_and_turns(tmp_path: Path, rng: np.random.Generator) -> None:
-    browser = chromium()
     page = build_cloud_page("A < B", sheets(60_000, rng), {"rigkit": "x"}, unit="mm")
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "A &lt; B" in page
     assert "half of them known to 0.25 mm or better" in page
-    path = tmp_path / "cloud.html"
-    path.write_text(page.replace("</body>", PROBE), encoding="utf-8")
-    done = subprocess.run(
-        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
-    assert probe is not None
-    first, second, red, blue, differ, coloured = probe[1].split("|")
+    first, second, red, blue, differ, coloured = probed(page.replace("</body>", PROBE), tmp_path)
     assert abs(float(first.split()[0]) - float(second.split()[0])) > 0.05
     assert int(red) > 20_000
     assert 0 < int(blue) < 0.5 * int(red)

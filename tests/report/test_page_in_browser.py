@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import base64
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
-import pytest
+from helpers.browser import probed
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.truth import MeasuredAngle, PairTruth
@@ -18,20 +16,6 @@ from rigkit.report.page import build_page
 from rigkit.report.validation_page import pair_section, summary_table
 from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.checks import validate
-
-QUIET = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--enable-logging=stderr",
-    "--virtual-time-budget=3000",
-    "--window-size=1366,900",
-]
 
 PROBE = """<script>
 const canvas = document.querySelector("canvas[data-scene]");
@@ -45,16 +29,7 @@ document.body.dataset.probe = [before, canvas.dataset.view, painted, document.bo
 </script></body>"""
 
 
-def chromium() -> str:
-    for name in ("chromium", "chromium-browser", "google-chrome"):
-        found = shutil.which(name)
-        if found:
-            return found
-    pytest.skip("no Chromium on this machine (apt-get install chromium)")
-
-
 def test_the_page_works_without_network(tmp_path: Path) -> None:
-    browser = chromium()
     reconstruction = make_reconstruction()
     truth = PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set <square>"),))
     report = validate(reconstruction, truth)
@@ -65,19 +40,7 @@ def test_the_page_works_without_network(tmp_path: Path) -> None:
     )
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "set &lt;square&gt;" in page
-    path = tmp_path / "report.html"
-    path.write_text(page.replace("</body>", PROBE), encoding="utf-8")
-    done = subprocess.run(
-        [browser, *QUIET, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    probe = re.search(r'data-probe="([^"]*)"', done.stdout)
-    assert probe is not None
-    before, after, painted, fits = probe[1].split("|")
+    before, after, painted, fits = probed(page.replace("</body>", PROBE), tmp_path)
     assert painted == "true"
     assert fits == "true"
     first, second = (np.array([float(v) for v in text.split()]) for text in (before, after))
@@ -115,20 +78,9 @@ for (const width of widths) {
 
 def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
     """Return by width of the window how wide the page gets, and its smallest words, px."""
-    path = folder / "frames.html"
     coded = base64.b64encode(page.encode()).decode()
-    path.write_text(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), encoding="utf-8")
-    done = subprocess.run(
-        [chromium(), *QUIET, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    found = re.search(r'data-probe="([^"]*)"', done.stdout)
-    assert found is not None
-    rows = [text.split() for text in found[1].split("|")]
+    told = probed(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), folder)
+    rows = [text.split() for text in told]
     return {int(width): (int(wide), float(small)) for width, wide, small in rows}
 
 
