@@ -145,18 +145,9 @@ static double linearise(const circle_t *at, const spot_t *spots, int64_t count, 
             level * y};
         const double off = spots[k].value - light * level;
         sum += off * off;
-        for (int i = 0; i < PARAMETERS; i++) {
-            right[i] += row[i] * off;
-            for (int j = 0; j <= i; j++)
-                N[i * PARAMETERS + j] += row[i] * row[j];
-        }
+        add_residual(N, right, row, PARAMETERS, off);
     }
     return sum;
-}
-
-INLINE double limited(double x, double most)
-{
-    return x > most ? most : x < -most ? -most : x;
 }
 
 static void moved(circle_t *at, const double step[PARAMETERS], const circle_rules_t *rules)

@@ -241,6 +241,21 @@ INLINE double quick_median(double *values, int64_t count)
     return 0.5 * (ranked(values, count, (count - 1) / 2) + ranked(values, count, count / 2));
 }
 
+INLINE double limited(double x, double most)
+{
+    return x > most ? most : x < -most ? -most : x;
+}
+
+/* Add a residual `off` with its derivatives `row` to the lower triangle of `N` (n x n) and to `right`. */
+INLINE void add_residual(double *N, double *right, const double *row, int n, double off)
+{
+    for (int i = 0; i < n; i++) {
+        right[i] += row[i] * off;
+        for (int j = 0; j <= i; j++)
+            N[i * n + j] += row[i] * row[j];
+    }
+}
+
 /* Return whether the lower triangle of the symmetric `N` (n x n) could be made its Cholesky factor. */
 INLINE int cholesky(double *N, int n)
 {

@@ -182,18 +182,9 @@ static double tag_equations(
         row[GX] = level * x;
         row[GY] = level * y;
         sum += off * off;
-        for (int i = 0; i < PARAMETERS; i++) {
-            right[i] += row[i] * off;
-            for (int j = 0; j <= i; j++)
-                N[i * PARAMETERS + j] += row[i] * row[j];
-        }
+        add_residual(N, right, row, PARAMETERS, off);
     }
     return sum;
-}
-
-INLINE double no_more(double x, double most)
-{
-    return x > most ? most : x < -most ? -most : x;
 }
 
 void fit_tags(
@@ -235,14 +226,14 @@ void fit_tags(
             double largest = 0.0;
             for (int i = 0; i < MOVES; i++) {
                 largest = fabs(step[i]) > largest ? fabs(step[i]) : largest;
-                tag.moves[i] += no_more(step[i], rules->most_move_px);
+                tag.moves[i] += limited(step[i], rules->most_move_px);
             }
-            tag.s += no_more(step[S], rules->most_blur_change * tag.s);
+            tag.s += limited(step[S], rules->most_blur_change * tag.s);
             tag.s = tag.s < rules->least_blur ? rules->least_blur : tag.s > rules->most_blur ? rules->most_blur : tag.s;
             tag.a += step[A];
             tag.b += step[B];
-            tag.g[0] = no_more(tag.g[0] + step[GX], 1.0);
-            tag.g[1] = no_more(tag.g[1] + step[GY], 1.0);
+            tag.g[0] = limited(tag.g[0] + step[GX], 1.0);
+            tag.g[1] = limited(tag.g[1] + step[GY], 1.0);
             settled = largest <= rules->converged_px;
         }
         if (!solved || !settled)
