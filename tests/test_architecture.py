@@ -66,6 +66,10 @@ def imports_of(tree: ast.AST) -> list[str]:
     return found
 
 
+def names_in(tree: ast.AST) -> set[str]:
+    return {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+
+
 def module_of(path: Path) -> str:
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
@@ -225,6 +229,21 @@ def test_what_begins_with_an_underscore_stays_in_its_module() -> None:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rigkit."):
                 taken += [place_of(path, alias.name) for alias in node.names if alias.name.startswith("_")]
     assert not taken
+
+
+def test_a_fault_of_the_installation_is_never_taken_for_a_fault_of_the_data() -> None:
+    """Who drops an error names those of data: stale kernels are not "no board is seen"."""
+    of_rigkit = {"RigkitError", "InstallationError", "InternalError"}
+    dropped = [
+        f"{path.relative_to(PACKAGE)}:{node.lineno}"
+        for path in MODULES
+        for node in nodes_of(path)
+        if isinstance(node, ast.ExceptHandler)
+        and node.name is None
+        and node.type is not None
+        and of_rigkit & names_in(node.type)
+    ]
+    assert not dropped, f"name the errors of data (InputError, DegenerateError): {dropped}"
 
 
 def test_a_class_name_means_one_thing() -> None:

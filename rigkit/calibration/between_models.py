@@ -28,7 +28,7 @@ from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Rays
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import log_so3, skew
 
 MIN_LIKELY = 0.05
@@ -64,7 +64,7 @@ def rival_fits(
         try:
             # The scatter that priors are weighed by is known after the first round.
             fit = fit_kept(observations, fit_kept(observations, start, chosen.kept).state, chosen.kept)
-        except RigkitError:
+        except (InputError, DegenerateError):
             continue
         found.append(RivalFit(Rival(option.name, fit.state.camera, likely[option.name]), fit.state))
     return found

@@ -20,7 +20,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.state import State
 from rigkit.core.arrays import FloatArray
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3
 from rigkit.optim import levenberg_marquardt
 from rigkit.optim.damping import Damping, Stop, StopReason
@@ -144,7 +144,7 @@ def _moved(state: State, step: SchurStep) -> State | None:
     p = state.camera.parameters.size
     try:
         camera = state.camera.with_parameters(state.camera.parameters + step.globals[:p])
-    except RigkitError:
+    except (InputError, DegenerateError):
         return None
     return replace(
         state,

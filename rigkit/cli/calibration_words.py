@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import gravest_first
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
 
     try:
         return camera_facts(calibration, next_views(calibration, boards))
-    except RigkitError:
+    except (InputError, DegenerateError):
         return camera_facts(calibration)
 
 

@@ -15,7 +15,7 @@ from rigkit.coach.look import Glance
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
@@ -228,7 +228,7 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:
     rays, valid = camera.unproject(view.pixels)
     try:
         return board_pose(rays[valid], view.points()[valid]).cam_from_board
-    except RigkitError:
+    except (InputError, DegenerateError):
         return None
 
 
@@ -248,7 +248,7 @@ def _calibrated(views: Sequence[BoardView], size_px: tuple[int, int]) -> Calibra
         for model, degree in MODELS_TRIED:
             try:
                 found = calibrate(named, size_px, model=model, degree=degree, board=board, folds=0)
-            except RigkitError:
+            except (InputError, DegenerateError):
                 continue
             if best is None or found.rms_px < best.rms_px:
                 best = found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.relative_pose.refinement.select import pose_type_evidence
@@ -47,5 +47,5 @@ def seen_as_rectified(matches: Matches) -> bool:
     """Say whether matches that agree with one pose speak for a baseline along the rows and no rotation."""
     try:
         return pose_type_evidence(matches).choice is PoseType.STANDARD
-    except RigkitError:
+    except (InputError, DegenerateError):
         return False

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
@@ -102,7 +102,7 @@ def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> No
     """Raise DegenerateError where another pose explains far more of the matches than the measured one."""
     try:
         other = _search(matches, PoseType.GENERAL, np.random.default_rng(0)).refined.cam2_from_cam1
-    except RigkitError:
+    except (InputError, DegenerateError):
         # The matches alone do not determine a pose; nothing speaks against the measured one.
         return
     better = np.abs(_in_sigmas(matches, other)) < QUANTILE * MAX_NOISE

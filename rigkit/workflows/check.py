@@ -15,7 +15,7 @@ from rigkit.calibration.usable import views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView, grid_turned
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
@@ -250,7 +250,7 @@ def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before
     rays, valid = watched.cameras[first.camera].unproject(first.view.pixels)
     try:
         pose = board_pose(rays[valid], first.view.points()[valid]).cam_from_board
-    except RigkitError:
+    except (InputError, DegenerateError):
         return view
     here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose
     turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))

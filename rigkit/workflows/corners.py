@@ -15,7 +15,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.usable import BESIDE, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
@@ -202,7 +202,7 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
             first = calibrate(views, size_px, model="auto", board="flat")
         return first.camera
-    except RigkitError:
+    except (InputError, DegenerateError):
         return None
 
 

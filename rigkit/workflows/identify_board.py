@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.core.boards import Board
-from rigkit.core.errors import CheckFailed, InputError, RigkitError
+from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
@@ -143,7 +143,7 @@ def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | N
     try:
         pictures = [image for _, image in _pictures(paths, EXPLAINING_IMAGES)]
         return guess_board([image for image in pictures if not isinstance(image, InputError)], progress)
-    except RigkitError:
+    except (InputError, DegenerateError):
         return None
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.io.corner_cache import image_hash
 from rigkit.io.images import read_image
 from rigkit.io.rig_session import RigSession
@@ -54,7 +54,7 @@ def _section(name: str, session: Session, calibration: Calibration) -> Calibrati
     """Return one camera with thumbnails, and with the pictures to take next where there are any to be found."""
     try:
         plan = next_views(calibration, session.boards)
-    except RigkitError:
+    except (InputError, DegenerateError):
         plan = None
     return CalibrationSection(name, calibration, _thumbnails(session, calibration), plan)
 

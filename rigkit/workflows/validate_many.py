@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.core.errors import ExitCode, InputError, RigkitError
+from rigkit.core.errors import DegenerateError, ExitCode, InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.manifest import load_dataset
@@ -114,7 +114,7 @@ def _name_of(path: str | Path) -> str:
     """Return the name in the manifest; of one that cannot be read, that of its folder: it fails in its own turn."""
     try:
         return load_dataset(path).name
-    except RigkitError:
+    except (InputError, DegenerateError):
         whole = Path(path).resolve()
         return (whole.parent if whole.suffix == ".toml" else whole).name
 

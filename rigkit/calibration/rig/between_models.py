@@ -18,7 +18,7 @@ from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Mat3, Rays
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import log_so3
 
 RIVAL_TOLERANCE = 1e-6
@@ -46,7 +46,7 @@ def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: F
             turns = _turns(here, start, rays, sigmas, joint)[1]
             there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, RIVAL_TOLERANCE).state
             way = _way(here, there, rays, sigmas, joint)
-        except RigkitError:
+        except (InputError, DegenerateError):
             continue
         likely = [r.likely for r in own if r is not None]
         out += np.mean(likely) * np.outer(way, way)

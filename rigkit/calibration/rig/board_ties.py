@@ -11,7 +11,7 @@ from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
 from rigkit.calibration.rig.observations import FrameObservations, frame_observations
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import silent
 
@@ -42,7 +42,7 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     try:
         named, places, notes = board_places([group], [seen], boards)
         joint = solve_jointly(["camera"], named, [flat], places, silent)
-    except RigkitError:
+    except (InputError, DegenerateError):
         return ()
     if notes or joint.left_out or joint.shared_count < MIN_IMAGES_OF_TIE or joint.cost_sigmas > TIED_SIGMAS:
         return ()

@@ -19,7 +19,7 @@ from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
@@ -138,7 +138,7 @@ class RigState:
         for camera, own in zip(self.cameras, layout.cameras, strict=True):
             try:
                 cameras.append(camera.with_parameters(camera.parameters + step.globals[own]))
-            except RigkitError:
+            except (InputError, DegenerateError):
                 return None
         mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
         return RigState(

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
-from rigkit.core.errors import DegenerateError, InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
@@ -125,12 +125,12 @@ def robust_pose(
     for start, plausible in _poses(matches, rows, finalists, kind, noise, max_noise):
         try:
             found, qualities = finished(start, plausible)
-        except RigkitError:
+        except (InputError, DegenerateError):
             continue
         for alternative in other_ambiguous_poses(matches, found.inliers, noise / MIN_NOISE, _pose(found)):
             try:
                 other, others = finished(alternative, _plausible(matches, alternative, max_noise))
-            except RigkitError:
+            except (InputError, DegenerateError):
                 continue
             if not compare_poses(_pose(found), _pose(other))[1]:
                 found, qualities = _preferred((found, qualities), (other, others))
