@@ -5,9 +5,12 @@ How a table looks as text is the business of `rigkit.report.tables`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from rigkit.core.errors import InputError
+
+HEAD = re.compile(r"(?P<label>.*?)(?: \[(?P<unit>.*)\])?(?: \.(?P<decimals>\d))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,3 +57,20 @@ class Table:
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise InputError(f"table '{self.title}': {len(row)} cells in a row of {len(self.columns)} columns")
+
+
+def columns(heads: str) -> tuple[Column, ...]:
+    """Return the columns of their heads, such as "pair | points .0 | angle error [deg] | baseline [mm] .2": label, unit
+    and decimals. Labels that a person chose are no part of such words: they make a `Column`."""
+    found = [HEAD.fullmatch(head.strip()) for head in heads.split("|")]
+    return tuple(Column(m["label"], m["unit"] or "", int(m["decimals"] or 3)) for m in found if m is not None)
+
+
+def cells(*values: float | str | Cell | None) -> tuple[Cell, ...]:
+    """Return bare values as cells; those that are cells already stay."""
+    return tuple(v if isinstance(v, Cell) else Cell(v if v is None or isinstance(v, str) else float(v)) for v in values)
+
+
+def verdict_cell(passed: bool, otherwise: str = "FAIL") -> Cell:
+    """Return "pass", or what is said `otherwise`, marked as failed."""
+    return Cell("pass" if passed else otherwise, failed=not passed)

@@ -12,7 +12,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import FarProjection, uncertainty_map
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Severity, gravest_first, worst
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_drawings import MAP_GRID
 from rigkit.report.page_facts import PageFacts
@@ -34,8 +34,7 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
     """Return what the page says of one camera; `plan`: the pictures that would help most next."""
     tables = [_parameters(c), _candidates(c), _boards(c), _images(c)]
     if c.dropped:
-        rows = tuple((Cell(image), Cell(reason)) for image, reason in c.dropped)
-        tables.append(Table(LEFT_OUT, "Left out", (Column("image"), Column("why")), rows))
+        tables.append(Table(LEFT_OUT, "Left out", columns("image | why"), tuple(cells(*entry) for entry in c.dropped)))
     sentences = [*map(str, gravest_first(c.verdicts))]
     if plan is not None:
         sentences += [next_words(plan), *plan_words(plan)]
@@ -104,66 +103,48 @@ def _reach(c: Calibration) -> str:
 
 def _parameters(c: Calibration) -> Table:
     rows = tuple(
-        (Cell(name), Cell(rounded_words(float(value), float(sigma))), Cell("px" if name in IN_PX else ""))
+        cells(name, rounded_words(float(value), float(sigma)), "px" if name in IN_PX else "")
         for name, value, sigma in zip(c.camera.parameter_names(), c.camera.parameters, c.parameter_sigmas, strict=True)
     )
-    columns = (Column("name"), Column("value and standard deviation"), Column("unit"))
-    return Table("parameters", "Parameters", columns, rows, "The file has every digit.")
+    heads = columns("name | value and standard deviation | unit")
+    return Table("parameters", "Parameters", heads, rows, "The file has every digit.")
 
 
 def _candidates(c: Calibration) -> Table:
-    columns = (
-        Column("tried"),
-        Column("numbers", "", 0),
-        Column("held-out RMS", "px", 4),
-        Column("training RMS", "px", 4),
-        Column("taken"),
-        Column("why"),
-    )
     rows = tuple(
-        (
-            Cell(option.name),
-            Cell(float(option.parameter_count) if option.parameter_count else None),
+        cells(
+            option.name,
+            option.parameter_count or None,
             Cell(option.heldout_rms_px, best=option.chosen),
-            Cell(option.rms_px),
-            Cell("taken" if option.chosen else ""),
-            Cell(option.reason),
+            option.rms_px,
+            "taken" if option.chosen else "",
+            option.reason,
         )
         for option in c.candidates
     )
-    none = (Cell("nothing but what was asked for"), *[Cell(None)] * 3, Cell(""), Cell(""))
-    return Table("candidates", "Models and board shapes tried", columns, rows or (none,))
+    none = cells("nothing but what was asked for", None, None, None, "", "")
+    heads = columns("tried | numbers .0 | held-out RMS [px] .4 | training RMS [px] .4 | taken | why")
+    return Table("candidates", "Models and board shapes tried", heads, rows or (none,))
 
 
 def _boards(c: Calibration) -> Table:
-    columns = (Column("board"), Column("shape"), Column("off a plane by", "mm"), Column("x longer than y by", "%"))
-    rows = tuple((Cell(b.board_id), Cell(b.kind), Cell(b.bow_mm), Cell(100.0 * b.aspect)) for b in c.boards)
-    return Table("boards", "Boards as the solution has them", columns, rows)
+    rows = tuple(cells(b.board_id, b.kind, b.bow_mm, 100.0 * b.aspect) for b in c.boards)
+    heads = columns("board | shape | off a plane by [mm] | x longer than y by [%]")
+    return Table("boards", "Boards as the solution has them", heads, rows)
 
 
 def _images(c: Calibration) -> Table:
     """Return every view: where the board was, and how well it is shown."""
     middle_mm = {board.board_id: board.points_mm.mean(axis=0) for board in c.boards}
-    columns = (
-        Column("image"),
-        Column("board"),
-        Column("RMS", "px"),
-        Column("corners used", "", 0),
-        Column("left out", "", 0),
-        Column("distance", "mm", 0),
-        Column("tilt", "deg", 0),
-        Column("remark"),
-    )
     rows = []
     for view in c.views:
         remarks = " ".join(found.text for found in c.verdicts if found.image == view.image)
         upright = float(np.clip(abs(view.cam_from_board.rotation[2, 2]), 0.0, 1.0))
         far: FloatArray = view.cam_from_board.apply(middle_mm[view.board_id])
-        figures = (float(view.kept.sum()), float((~view.kept).sum()), float(np.linalg.norm(far)))
-        cells = (
-            Cell(view.rms_px, failed=bool(remarks)),
-            *map(Cell, figures),
-            Cell(float(np.degrees(np.arccos(upright)))),
-        )
-        rows.append((Cell(view.image), Cell(view.board_id), *cells, Cell(remarks)))
-    return Table(IMAGES, "Images", columns, tuple(rows), "Tilt: between the board and the image plane.")
+        figures = (view.kept.sum(), (~view.kept).sum(), np.linalg.norm(far), np.degrees(np.arccos(upright)))
+        rms = Cell(view.rms_px, failed=bool(remarks))
+        rows.append(cells(view.image, view.board_id, rms, *map(float, figures), remarks))
+    heads = columns(
+        "image | board | RMS [px] | corners used .0 | left out .0 | distance [mm] .0 | tilt [deg] .0 | remark"
+    )
+    return Table(IMAGES, "Images", heads, tuple(rows), "Tilt: between the board and the image plane.")

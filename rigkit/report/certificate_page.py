@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.core.findings import Severity
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Table, cells, columns
 from rigkit.report.certificate_figure import bound_figure, sheet_pdf
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import as_png
@@ -58,21 +58,13 @@ def causes_table(certificate: Certificate) -> Table:
     unit, shares = certificate.task.unit, certificate.shares()
     row, column = certificate.worst_place
     rows = tuple(
-        (
-            Cell(cause),
-            Cell(float(np.nanmedian(sigma))),
-            Cell(float(sigma[row, column])),
-            Cell(100.0 * shares[cause]),
-        )
+        cells(cause, float(np.nanmedian(sigma)), float(sigma[row, column]), 100.0 * shares[cause])
         for cause, sigma in certificate.sigma.items()
     )
-    columns = (
-        Column("cause"),
-        Column("median sigma", unit, 4),
-        Column("sigma where worst", unit, 4),
-        Column("part of the variance there", "%", 1),
+    heads = columns(
+        f"cause | median sigma [{unit}] .4 | sigma where worst [{unit}] .4 | part of the variance there [%] .1"
     )
-    return Table("causes", "What the error is made of", columns, rows)
+    return Table("causes", "What the error is made of", heads, rows)
 
 
 def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:

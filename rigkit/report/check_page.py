@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import HistoryEntry
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
@@ -100,35 +100,23 @@ def _frames_needed(power: Power) -> str:
 
 def power_table(powers: Sequence[Power], title: str = "What these pictures would have found") -> Table:
     """Return how well changes are seen."""
-    columns = (
-        Column("change"),
-        Column("of"),
-        Column("found with chance", "", 2),
-        Column(f"{FOUND:.0%} found from"),
-        Column(f"frames for {FOUND:.0%}"),
-    )
+    heads = columns(f"change | of | found with chance .2 | {FOUND:.0%} found from | frames for {FOUND:.0%}")
     rows = tuple(
-        (
-            Cell(power.kind if power.camera is None else f"{power.kind} of {power.camera}"),
-            Cell(f"{power.size:g} {power.unit}"),
-            Cell(power.chance),
-            Cell(f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen"),
-            Cell(_frames_needed(power)),
+        cells(
+            power.kind if power.camera is None else f"{power.kind} of {power.camera}",
+            f"{power.size:g} {power.unit}",
+            power.chance,
+            f"{power.found_from:.2g} {power.unit}" if np.isfinite(power.found_from) else "not seen",
+            _frames_needed(power),
         )
         for power in powers
     )
-    none = (Cell("none can be told from these pictures"), Cell(""), Cell(None), Cell(""), Cell(""))
-    return Table("powers", title, columns, rows or (none,))
+    none = cells("none can be told from these pictures", "", None, "", "")
+    return Table("powers", title, heads, rows or (none,))
 
 
 def check_table(check: SentinelCheck) -> Table:
     """Return everything that may have happened, each as if it alone had."""
-    columns = (
-        Column("if this alone happened"),
-        Column("chance without it"),
-        Column("explains", "", 1),
-        Column("amount"),
-    )
     rows = []
     for change in check.tried:
         amounts = ", ".join(
@@ -136,11 +124,10 @@ def check_table(check: SentinelCheck) -> Table:
             for a, s, unit in zip(change.amounts, change.sigmas, change.cause.units, strict=True)
         )
         named = check.change is not None and change.cause is check.change.cause
-        rows.append(
-            (Cell(change.cause.words), Cell(f"{change.chance:.2g}"), Cell(change.gain, best=named), Cell(amounts))
-        )
-    none = (Cell("nothing can be told from these pictures"), Cell(""), Cell(None), Cell(""))
-    return Table("causes", "What may have happened", columns, tuple(rows) or (none,))
+        rows.append(cells(change.cause.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
+    none = cells("nothing can be told from these pictures", "", None, "")
+    heads = columns("if this alone happened | chance without it | explains .1 | amount")
+    return Table("causes", "What may have happened", heads, tuple(rows) or (none,))
 
 
 def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
@@ -288,15 +275,10 @@ def _of(entry: HistoryEntry, name: str) -> str:
 
 
 def _history_table(entries: Sequence[HistoryEntry]) -> Table:
-    columns = (
-        Column("date"), Column("what"), Column("frames", "", 0), Column("rms", "px"), Column("p"),
-        Column("temperature", "°C", 1), Column("verdict"),
-    )  # fmt: skip
+    heads = columns("date | what | frames .0 | rms [px] | p | temperature [°C] .1 | verdict")
     rows = tuple(
-        (
-            Cell(e.date[:16].replace("T", " ")), Cell(f"{e.kind} of {e.source}"), Cell(float(e.frames)), Cell(e.rms_px),
-            Cell(f"{e.chance:.2g}"), Cell(e.temperature_c), Cell(e.verdict, failed=not e.holds),
-        )
+        cells(e.date[:16].replace("T", " "), f"{e.kind} of {e.source}", e.frames, e.rms_px, f"{e.chance:.2g}")
+        + cells(e.temperature_c, Cell(e.verdict, failed=not e.holds))
         for e in entries
-    )  # fmt: skip
-    return Table("entries", "Entries", columns, rows)
+    )
+    return Table("entries", "Entries", heads, rows)

@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
@@ -64,15 +64,15 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
 
 def plan_table(plan: Plan) -> Table:
     """Return the error of the goal after each view."""
-    columns = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than before by", "%", 0))
+    heads = (Column("views more"), Column(plan.goal.what, plan.goal.unit), Column("less than before by", "%", 0))
     errors = [plan.error, *(view.error for view in plan.views)]
     # Before the first picture nothing is told of a change: its share is taken from the first error there is.
     first = next((k for k, error in enumerate(errors) if np.isfinite(error)), len(errors))
     rows = tuple(
-        (Cell(str(k)), Cell(float(f"{errors[k]:.4g}")), Cell(100.0 * (1.0 - errors[k] / errors[first])))
+        cells(str(k), float(f"{errors[k]:.4g}"), 100.0 * (1.0 - errors[k] / errors[first]))
         for k in range(first, len(errors))
     )
-    return Table("plan", "What the views bring", columns, rows)
+    return Table("plan", "What the views bring", heads, rows)
 
 
 def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:

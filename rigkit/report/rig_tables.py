@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
 from rigkit.report.tables import rounded_words
@@ -25,56 +25,41 @@ def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...
     tables.append(_intrinsics(rig))
     tables += [_angles(rig, target, checks) for target in rig.board_rigs]
     if rig.left_out:
-        columns = (Column("frame"), Column("board"), Column("why"))
-        rows = tuple((Cell(frame), Cell(board), Cell(reason)) for frame, board, reason in rig.left_out)
+        heads, rows = columns("frame | board | why"), tuple(cells(*entry) for entry in rig.left_out)
         note = "Each camera's own calibration uses these views; the mounts do not rest on them."
-        tables.append(Table("left-out", "Boards left out of the joint solution", columns, rows, note))
+        tables.append(Table("left-out", "Boards left out of the joint solution", heads, rows, note))
     return tuple(tables)
 
 
 def _cameras(rig: RigCalibration) -> Table:
-    columns = (
-        Column("camera"),
-        Column("model"),
-        Column("held-out RMS alone", "px"),
-        Column("training RMS alone", "px"),
-        Column("held-out RMS in the rig", "px"),
-        Column("training RMS in the rig", "px"),
-        *(Column(f"centre {axis}", "mm", 2) for axis in "xyz"),
-        Column("turned by", "deg"),
+    heads = columns(
+        "camera | model | held-out RMS alone [px] | training RMS alone [px] | held-out RMS in the rig [px] | "
+        "training RMS in the rig [px] | centre x [mm] .2 | centre y [mm] .2 | centre z [mm] .2 | turned by [deg]"
     )
     rows = []
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         centre = camera.cam_from_rig.inverse().translation_mm
         turned = float(np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation))))
-        rows.append(
-            (
-                Cell(camera.name),
-                Cell(camera.camera.model),
-                Cell(alone.heldout_rms_px),
-                Cell(alone.rms_px),
-                Cell(camera.calibration.heldout_rms_px),
-                Cell(camera.rms_px),
-                *(Cell(float(c)) for c in centre),
-                Cell(turned),
-            )
-        )
-    return Table("rig", "Cameras of the rig", columns, tuple(rows), "The frame is that of the first camera.")
+        errors = (alone.heldout_rms_px, alone.rms_px, camera.calibration.heldout_rms_px, camera.rms_px)
+        rows.append(cells(camera.name, camera.camera.model, *errors, *centre.tolist(), turned))
+    return Table("rig", "Cameras of the rig", heads, tuple(rows), "The frame is that of the first camera.")
 
 
 def _intrinsics(rig: RigCalibration) -> Table:
     """Return the intrinsics as the joint solution has them, a column a camera."""
     sigmas = np.sqrt(np.diag(rig.covariance))
-    columns: list[dict[str, str]] = []
+    own_words: list[dict[str, str]] = []
     start = 0
     for camera in rig.cameras:
         names, values = camera.camera.parameter_names(), camera.camera.parameters
         own = sigmas[start : start + values.size]
         start += values.size
-        columns.append({name: rounded_words(float(v), float(s)) for name, v, s in zip(names, values, own, strict=True)})
+        own_words.append(
+            {name: rounded_words(float(v), float(s)) for name, v, s in zip(names, values, own, strict=True)}
+        )
     rows = tuple(
-        (Cell(name), *(Cell(column.get(name, "–")) for column in columns))
-        for name in dict.fromkeys(name for column in columns for name in column)
+        cells(name, *(words.get(name, "–") for words in own_words))
+        for name in dict.fromkeys(name for words in own_words for name in words)
     )
     heads = (Column("parameter"), *(Column(f"{c.name} ({c.camera.model})") for c in rig.cameras))
     note = "As all cameras together have them, with one standard deviation; fx, fy, cx and cy in px."
@@ -84,19 +69,16 @@ def _intrinsics(rig: RigCalibration) -> Table:
 def _mounts(rig: RigCalibration) -> Table:
     """Return how the cameras stand against the first one."""
     sigmas = np.sqrt(np.diag(rig.covariance))
-    columns = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
-    columns += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
+    heads = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
+    heads += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
     rows = []
     for k, camera in enumerate(rig.cameras[1:], start=1):
         own = sigmas[rig.mount(k)]
         turned, turned_sigma = np.degrees(log_so3(camera.cam_from_rig.rotation)), np.degrees(own[:3])
-        cells = [Cell(float(v), sigma=float(s)) for v, s in zip(turned, turned_sigma, strict=True)]
-        cells += [
-            Cell(float(v), sigma=float(s)) for v, s in zip(camera.cam_from_rig.translation_mm, own[3:], strict=True)
-        ]
-        rows.append((Cell(camera.name), *cells))
+        values = zip([*turned, *camera.cam_from_rig.translation_mm], [*turned_sigma, *own[3:]], strict=True)
+        rows.append(cells(camera.name, *(Cell(float(v), sigma=float(s)) for v, s in values)))
     note = "cam_from_rig: rotation vector and translation, with one standard deviation."
-    return Table("mounts", "Mounts", columns, tuple(rows), note)
+    return Table("mounts", "Mounts", heads, tuple(rows), note)
 
 
 def rig_basis(rig: RigCalibration) -> str:
@@ -133,44 +115,24 @@ def rig_reach(rig: RigCalibration, checks: Sequence[Check]) -> str:
 
 
 def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:
-    columns = (
-        Column("baseline"),
-        Column("solved", "mm"),
-        Column("measured", "mm"),
-        Column("how"),
-        Column("verdict"),
-        Column("transfer", "px"),
-        Column("transfer at worst", "px"),
-    )
+    heads = columns("baseline | solved [mm] | measured [mm] | how | verdict | transfer [px] | transfer at worst [px]")
     rows = []
     for a, b in combinations([c.name for c in rig.cameras], 2):
         value, sigma = rig.baseline_mm(a, b)
         transfer = transfer_uncertainty(rig, a, b)
         sure = (None, None) if transfer is None else (transfer.median_px, transfer.worst_px)
-        rows.append(
-            (
-                Cell(f"{a} to {b}"),
-                Cell(value, sigma=sigma),
-                *_measured(checks, f"baseline {a}-{b}", f"baseline {b}-{a}"),
-                *(Cell(v) for v in sure),
-            )
-        )
+        measured = _measured(checks, f"baseline {a}-{b}", f"baseline {b}-{a}")
+        rows.append(cells(f"{a} to {b}", Cell(value, sigma=sigma), *measured, *sure))
     note = (
         "Transfer: one standard deviation of where a point that the one camera sees must appear in the other, at the "
         "middle and the worst of the boards' corners."
     )
-    return Table("baselines", "Distances between the cameras", columns, tuple(rows), note)
+    return Table("baselines", "Distances between the cameras", heads, tuple(rows), note)
 
 
 def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> Table:
-    columns = (
-        Column("boards"),
-        Column("angle", "deg"),
-        Column("measured", "deg"),
-        Column("how"),
-        Column("verdict"),
-        Column("between first corners", "mm"),
-        Column("between centres", "mm"),
+    heads = columns(
+        "boards | angle [deg] | measured [deg] | how | verdict | between first corners [mm] | between centres [mm]"
     )
     rows = []
     for a, b in combinations(target.names, 2):
@@ -181,15 +143,9 @@ def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> T
         if not any(board.looks_same_turned for board in both):
             corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
         centres = target.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
-        rows.append(
-            (
-                Cell(f"{a} and {b}"),
-                Cell(value, sigma=sigma),
-                *_measured(checks, f"angle {a}-{b}", f"angle {b}-{a}"),
-                Cell(corners[0], sigma=corners[1]),
-                Cell(centres[0], sigma=centres[1]),
-            )
-        )
+        measured = _measured(checks, f"angle {a}-{b}", f"angle {b}-{a}")
+        apart = (Cell(value, sigma=sigma) for value, sigma in (corners, centres))
+        rows.append(cells(f"{a} and {b}", Cell(value, sigma=sigma), *measured, *apart))
     distances = [c for c in checks if c.kind == "distance"]
     note = f"Solved from {target.image_count} images that show at least two of these boards."
     note += "".join(
@@ -198,7 +154,7 @@ def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> T
         for c in distances
     )
     key = f"boards-{target.names[0]}"
-    return Table(key, "Boards mounted to each other", columns, tuple(rows), note)
+    return Table(key, "Boards mounted to each other", heads, tuple(rows), note)
 
 
 def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:
@@ -206,5 +162,5 @@ def _measured(checks: Sequence[Check], *names: str) -> tuple[Cell, Cell, Cell]:
     known = next((c for c in checks if c.name in names), None)
     if known is None:
         return Cell(None), Cell(""), Cell("")
-    verdict = "pass" if known.passed else f"FAIL, off by {known.k:.1f} combined sigmas"
-    return Cell(known.measured, sigma=known.measured_sigma), Cell(known.how), Cell(verdict, failed=not known.passed)
+    verdict = verdict_cell(known.passed, f"FAIL, off by {known.k:.1f} combined sigmas")
+    return Cell(known.measured, sigma=known.measured_sigma), Cell(known.how), verdict

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table, cells, columns
 from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
@@ -12,42 +12,23 @@ def study_tables(found: StudyTable) -> tuple[Table, ...]:
     study = found.study
     tables = [_median_table(found, str(pose_type)) for pose_type in study.pose_types]
     if found.verdicts:
-        columns = (Column("statement"), Column("verdict"))
-        rows = tuple((Cell(v.text), Cell(v.words, best=True)) for v in found.verdicts)
-        tables.append(Table("statements", f"{study.title}: statements", columns, rows))
+        rows = tuple(cells(v.text, Cell(v.words, best=True)) for v in found.verdicts)
+        tables.append(Table("statements", f"{study.title}: statements", columns("statement | verdict"), rows))
     return tuple(tables)
 
 
 def cell_table(found: StudyTable) -> Table:
     """Return every statistic of every cell, one cell a row."""
-    angle = ("median", "lower quartile", "upper quartile", "lower whisker", "upper whisker", "mean")
-    columns = (
-        Column("pose type"),
-        Column("noise", found.study.unit),
-        Column("method"),
-        Column("plane"),
-        Column("estimates", "", 0),
-        Column("missing", "", 0),
-        *(Column(label, "deg") for label in angle),
+    heads = columns(
+        f"pose type | noise [{found.study.unit}] | method | plane | estimates .0 | missing .0 | median [deg] | "
+        "lower quartile [deg] | upper quartile [deg] | lower whisker [deg] | upper whisker [deg] | mean [deg]"
     )
     rows = tuple(
-        (
-            Cell(cell.pose_type),
-            Cell(cell.sigma),
-            Cell(cell.method),
-            Cell(_plane(cell.plane)),
-            Cell(float(cell.count)),
-            Cell(float(cell.missing)),
-            Cell(cell.median_deg),
-            Cell(cell.q25_deg),
-            Cell(cell.q75_deg),
-            Cell(cell.whisker_low_deg),
-            Cell(cell.whisker_high_deg),
-            Cell(cell.mean_deg),
-        )
-        for cell in found.cells
+        cells(c.pose_type, c.sigma, c.method, _plane(c.plane), c.count, c.missing)
+        + cells(c.median_deg, c.q25_deg, c.q75_deg, c.whisker_low_deg, c.whisker_high_deg, c.mean_deg)
+        for c in found.cells
     )
-    return Table("cells", found.study.title, columns, rows, study_setup(found.study))
+    return Table("cells", found.study.title, heads, rows, study_setup(found.study))
 
 
 def _median_table(found: StudyTable, pose_type: str) -> Table:
@@ -55,14 +36,14 @@ def _median_table(found: StudyTable, pose_type: str) -> Table:
     rows, missing = [], 0
     for sigma in study.sigmas:
         for plane in (*range(1, STUDY_PLANES + 1), ALL_PLANES):
-            cells = [found.cell(pose_type=pose_type, sigma=sigma, method=m, plane=plane) for m in study.methods]
-            rows.append((Cell(f"{sigma:g}"), Cell(_plane(plane)), *(Cell(_quartiles(cell)) for cell in cells)))
-            missing += sum(cell.missing for cell in cells) if plane == ALL_PLANES else 0
-    columns = (Column("noise", study.unit), Column("plane"), *(Column(method, "deg") for method in study.methods))
+            found_cells = [found.cell(pose_type=pose_type, sigma=sigma, method=m, plane=plane) for m in study.methods]
+            rows.append(cells(f"{sigma:g}", _plane(plane), *map(_quartiles, found_cells)))
+            missing += sum(cell.missing for cell in found_cells) if plane == ALL_PLANES else 0
+    heads = (Column("noise", study.unit), Column("plane"), *(Column(method, "deg") for method in study.methods))
     note = f"Angle between estimated and true normal: median (quartiles); {study_setup(study)}."
     if missing:
         note += f" {missing} estimates are missing: their directions do not determine an affinity."
-    return Table(f"medians-{pose_type}", f"{study.title}: {pose_type} motion", columns, tuple(rows), note)
+    return Table(f"medians-{pose_type}", f"{study.title}: {pose_type} motion", heads, tuple(rows), note)
 
 
 def _quartiles(cell: StudyCell) -> str | None:

@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.findings import Severity
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.page import PairSection, scene_of
 from rigkit.report.tables import measured_words
@@ -28,51 +28,28 @@ SUMMARY_WORDS = (
 
 def summary_table(reports: Sequence[ValidationReport]) -> Table:
     """Return one line a pair: what was measured, what came out, and whether it holds."""
-    columns = (
-        Column("pair"),
-        Column("pose type"),
-        Column("estimator"),
-        Column("points", "", 0),
-        Column("worst angle error", "deg"),
-        Column("mean normal error", "deg"),
-        Column("baseline measured", "mm", 1),
-        Column("baseline", "mm", 2),
-        Column("Sampson rms", "px"),
-        Column("verdict"),
+    heads = columns(
+        "pair | pose type | estimator | points .0 | worst angle error [deg] | mean normal error [deg] | "
+        "baseline measured [mm] .1 | baseline [mm] .2 | Sampson rms [px] | verdict"
     )
     rows = []
     for report in reports:
         known = next((c for c in report.checks if c.kind == "baseline"), None)
         angles = [a.error_deg for a in report.angles if a.error_deg is not None]
+        measured = None if known is None else Cell(known.measured, sigma=known.measured_sigma)
         rows.append(
-            (
-                Cell(report.pair_id),
-                Cell(report.pose_type),
-                Cell(report.affine_method),
-                Cell(float(report.count)),
-                Cell(max(angles) if angles else None),
-                Cell(mean_normal_error([report])),
-                Cell(None) if known is None else Cell(known.measured, sigma=known.measured_sigma),
-                Cell(report.baseline_mm, sigma=report.baseline_sigma_mm),
-                Cell(report.sampson_rms_px),
-                Cell("pass" if report.passed else "FAIL", failed=not report.passed),
-            )
+            cells(report.pair_id, report.pose_type, report.affine_method, report.count, max(angles, default=None))
+            + cells(mean_normal_error([report]), measured, Cell(report.baseline_mm, sigma=report.baseline_sigma_mm))
+            + cells(report.sampson_rms_px, verdict_cell(report.passed))
         )
-    return Table("summary", "Every pair with its best estimator", columns, tuple(rows))
+    return Table("summary", "Every pair with its best estimator", heads, tuple(rows))
 
 
 def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
     """Return one line a calibrated camera: what it rests on and how good it is."""
-    columns = (
-        Column("camera"),
-        Column("model"),
-        Column("images", "", 0),
-        Column("corners", "", 0),
-        Column("held-out RMS", "px"),
-        Column("training RMS", "px"),
-        Column("uncertainty, median", "px", 4),
-        Column("uncertainty, 95 %", "px", 4),
-        Column("remarks"),
+    heads = columns(
+        "camera | model | images .0 | corners .0 | held-out RMS [px] | training RMS [px] | "
+        "uncertainty, median [px] .4 | uncertainty, 95 % [px] .4 | remarks"
     )
     rows = []
     for name, c in calibrations.items():
@@ -80,24 +57,15 @@ def camera_table(calibrations: Mapping[str, Calibration]) -> Table:
         middle, high = np.nanquantile(uncertainty, [0.5, 0.95])
         remarks = sum(verdict.severity is not Severity.GOOD for verdict in c.verdicts)
         rows.append(
-            (
-                Cell(name),
-                Cell(c.camera.model),
-                Cell(float(len({view.image for view in c.views}))),
-                Cell(float(c.corner_count)),
-                Cell(c.heldout_rms_px),
-                Cell(c.rms_px),
-                Cell(float(middle)),
-                Cell(float(high)),
-                Cell(f"{remarks}, below" if remarks else "none"),
-            )
+            cells(name, c.camera.model, len({view.image for view in c.views}), c.corner_count, c.heldout_rms_px)
+            + cells(c.rms_px, float(middle), float(high), f"{remarks}, below" if remarks else "none")
         )
     note = (
         "Held out: on images that took no part, with the lens frozen and only the board's pose fitted. Training: on "
         "the images fitted. Both are sqrt(mean |residual|²) over corners. Uncertainty: of the projection where the "
         "boards were, standard deviation in the worst direction."
     )
-    return Table("cameras", "Calibrations", columns, tuple(rows), note)
+    return Table("cameras", "Calibrations", heads, tuple(rows), note)
 
 
 def camera_remarks(calibrations: Mapping[str, Calibration]) -> tuple[str, ...]:
@@ -139,53 +107,38 @@ def pair_section(
 
 def crosscheck_table(reports: Sequence[CrossCheckReport]) -> Table:
     """Return what every other method found of every pair, and whether it agrees with ours."""
-    columns = (
-        Column("pair"),
-        Column("method"),
-        Column("rotation difference", "deg", 4),
-        Column("direction difference", "deg", 4),
-        Column("baseline", "mm", 2),
-        Column("rms", "px"),
-        Column("used", "", 0),
-        Column("excluded", "", 0),
-        Column("disagrees in"),
+    heads = columns(
+        "pair | method | rotation difference [deg] .4 | direction difference [deg] .4 | baseline [mm] .2 | rms [px] | "
+        "used .0 | excluded .0 | disagrees in"
     )
     rows = []
     for report in reports:
         for method in report.methods:
             failed = [c.name for c in report.checks if c.how == method.name and not c.passed]
             compared = any(c.how == method.name for c in report.checks)
+            disagrees = Cell(", ".join(failed) or ("nothing" if compared else "-"), failed=bool(failed))
             rows.append(
-                (
-                    Cell(report.pair_id),
-                    Cell(method.name),
-                    Cell(method.rotation_difference_deg),
-                    Cell(method.direction_difference_deg),
-                    Cell(method.baseline_mm),
-                    Cell(method.rms_px),
-                    Cell(float(method.used)),
-                    Cell(float(method.excluded)),
-                    Cell(", ".join(failed) or ("nothing" if compared else "-"), failed=bool(failed)),
-                )
+                cells(report.pair_id, method.name, method.rotation_difference_deg, method.direction_difference_deg)
+                + cells(method.baseline_mm, method.rms_px, method.used, method.excluded, disagrees)
             )
     limits = sorted({c.limit_k for r in reports for c in r.checks})
     note = f"Agreement: within k = {', '.join(f'{k:g}' for k in limits)} combined sigmas."
-    return Table("crosscheck", "The same pairs by other methods", columns, tuple(rows), note)
+    return Table("crosscheck", "The same pairs by other methods", heads, tuple(rows), note)
 
 
 def _by_estimator(reports: Sequence[ValidationReport]) -> Table:
     """Return normal errors, flatness and baseline of one pair with a column an estimator: it fits a page."""
-    columns = (Column("normals"), *(Column(report.affine_method, "", 3) for report in reports))
+    heads = (Column("normals"), *(Column(report.affine_method, "", 3) for report in reports))
     ids = list(dict.fromkeys(board.board.board_id for report in reports for board in report.boards))
     boards = [{board.board.board_id: board for board in report.boards} for report in reports]
     rows: list[tuple[Cell, ...]] = []
     for statistic in ("mean", "median"):
         for board_id in ids:
             errors = [b[board_id].normal_errors if board_id in b else None for b in boards]
-            cells = [Cell(None if e is None else float(getattr(e, f"{statistic}_deg"))) for e in errors]
-            rows.append((Cell(f"{statistic} normal error of {board_id}, deg"), *cells))
+            values = [None if e is None else getattr(e, f"{statistic}_deg") for e in errors]
+            rows.append(cells(f"{statistic} normal error of {board_id}, deg", *values))
     for board_id in ids:
         flat = [b[board_id].plane.rms_mm if board_id in b else None for b in boards]
-        rows.append((Cell(f"flatness of {board_id}, rms mm"), *(Cell(value) for value in flat)))
-    rows.append((Cell("baseline, mm"), *(Cell(r.baseline_mm, sigma=r.baseline_sigma_mm) for r in reports)))
-    return Table("by_estimator", "Affine estimators", columns, tuple(rows))
+        rows.append(cells(f"flatness of {board_id}, rms mm", *flat))
+    rows.append(cells("baseline, mm", *(Cell(r.baseline_mm, sigma=r.baseline_sigma_mm) for r in reports)))
+    return Table("by_estimator", "Affine estimators", heads, tuple(rows))

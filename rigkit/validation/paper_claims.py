@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.posetype import PoseType
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.tables import PaperTables, mean_normal_error
 
@@ -73,15 +73,15 @@ def claim_table(reports: Sequence[ValidationReport], method: str, printed: Paper
         *_of_planes(_printed_planes(printed)),
     )
     rows = [
-        (Cell(text), Cell(_words(own), failed=own is not None and not own.holds), Cell(_words(other)))
+        cells(text, Cell(_words(own), failed=own is not None and not own.holds), _words(other))
         for text, own, other in zip(CLAIMS, ours, theirs, strict=True)
     ]
     note = (
         f"Planes and motions by mean normal errors with {method}; estimators by mean normal errors in our figures, by "
         "errors of the baseline in the printed ones."
     )
-    head = (Column("the paper says"), Column("our figures"), Column("the printed figures"))
-    return Table("claims", "What the paper says, judged", head, tuple(rows), note)
+    heads = columns("the paper says | our figures | the printed figures")
+    return Table("claims", "What the paper says, judged", heads, tuple(rows), note)
 
 
 def estimator_order_table(reports: Sequence[ValidationReport], printed: PaperTables) -> Table:
@@ -93,15 +93,9 @@ def estimator_order_table(reports: Sequence[ValidationReport], printed: PaperTab
         of_method = [r for r in reports if r.affine_method == method]
         baselines = [abs(c.difference) for r in of_method for c in r.checks if c.kind == "baseline"]
         paper = [errors[method] for errors in theirs.values() if method in errors]
-        cells = (mean_normal_error(of_method), _mean(baselines), _mean(paper))
-        rows.append((Cell(method), *(Cell(value) for value in cells)))
-    head = (
-        Column("estimator"),
-        Column("mean normal error", "deg", 4),
-        Column("mean baseline error", "mm", 3),
-        Column("printed baseline error", "mm", 3),
-    )
-    return Table("order", "The five estimators, over all pairs", head, tuple(rows))
+        rows.append(cells(method, mean_normal_error(of_method), _mean(baselines), _mean(paper)))
+    heads = columns("estimator | mean normal error [deg] .4 | mean baseline error [mm] | printed baseline error [mm]")
+    return Table("order", "The five estimators, over all pairs", heads, tuple(rows))
 
 
 def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
@@ -152,18 +146,18 @@ def _by_plane(report: ValidationReport) -> dict[int, float]:
 
 def _printed_planes(printed: PaperTables) -> Errors:
     out: dict[Capture, dict[int, float]] = {}
-    for row, cells in printed.planes.items():
+    for row, by_capture in printed.planes.items():
         kind, _, number = row.rpartition(" ")
         if kind == "mean normal error":
-            for name, value in cells.items():
+            for name, value in by_capture.items():
                 out.setdefault(Capture.of(name), {})[int(number)] = float(value)
     return out
 
 
 def _baseline_errors(printed: PaperTables) -> Iterator[tuple[str, dict[str, float]]]:
-    for name, cells in printed.baselines.items():
-        known = float(cells["measured"])
-        yield name, {m: abs(float(v) - known) for m, v in cells.items() if m != "measured"}
+    for name, by_method in printed.baselines.items():
+        known = float(by_method["measured"])
+        yield name, {m: abs(float(v) - known) for m, v in by_method.items() if m != "measured"}
 
 
 def _words(verdict: Verdict | None) -> str:

@@ -13,7 +13,7 @@ from itertools import combinations
 import numpy as np
 
 from rigkit.core.errors import InputError
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.validation.checks import ValidationReport
 
 TIE_MM = 1e-3
@@ -114,15 +114,15 @@ def plane_table(reports: Sequence[ValidationReport], method: str, paper: PaperTa
     rows: list[tuple[Cell, ...]] = []
     for a, b in combinations(ids, 2):
         label = f"orthogonality {number[a]}-{number[b]}"
-        cells = [Cell(_orthogonality(r, a, b), paper.plane(label, r.pair_id)) for r in chosen.values()]
-        rows.append((Cell(f"{_angle_error_label(chosen.values(), a, b)} {a}, {b}"), *cells))
+        own = [Cell(_orthogonality(r, a, b), paper.plane(label, r.pair_id)) for r in chosen.values()]
+        rows.append(cells(f"{_angle_error_label(chosen.values(), a, b)} {a}, {b}", *own))
     for kind in ("mean", "median"):
         for board_id in ids:
             label = f"{kind} normal error {number[board_id]}"
-            cells = [Cell(_normal_error(r, board_id, kind), paper.plane(label, r.pair_id)) for r in chosen.values()]
-            rows.append((Cell(f"{kind} normal error {board_id}"), *cells))
-    columns = (Column("deg"), *(Column(pair_id, "", 4) for pair_id in chosen))
-    return Table("planes", f"Angles between planes and normal errors, {method}", columns, tuple(rows))
+            own = [Cell(_normal_error(r, board_id, kind), paper.plane(label, r.pair_id)) for r in chosen.values()]
+            rows.append(cells(f"{kind} normal error {board_id}", *own))
+    heads = (Column("deg"), *(Column(pair_id, "", 4) for pair_id in chosen))
+    return Table("planes", f"Angles between planes and normal errors, {method}", heads, tuple(rows))
 
 
 def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
@@ -136,34 +136,26 @@ def angle_table(reports: Sequence[ValidationReport]) -> Table | None:
         for angle in report.angles:
             if angle.lattice_deg is None and angle.coplanar_deg is None:
                 continue
-            free = (Cell(angle.angle_deg, sigma=angle.sigma_deg), Cell(angle.error_deg))
-            coplanar = (Cell(angle.coplanar_deg, sigma=angle.coplanar_sigma_deg), Cell(angle.coplanar_error_deg))
-            lattice = (Cell(angle.lattice_deg, sigma=angle.lattice_sigma_deg), Cell(angle.lattice_error_deg))
+            free = (Cell(angle.angle_deg, sigma=angle.sigma_deg), angle.error_deg)
+            coplanar = (Cell(angle.coplanar_deg, sigma=angle.coplanar_sigma_deg), angle.coplanar_error_deg)
+            lattice = (Cell(angle.lattice_deg, sigma=angle.lattice_sigma_deg), angle.lattice_error_deg)
             normals = [report.lattice_normal_errors.get(name) for name in (angle.a, angle.b)]
-            means = [Cell(None if errors is None else errors.mean_deg) for errors in normals]
-            head = (Cell(report.pair_id), Cell(f"{angle.a}, {angle.b}"), Cell(angle.measured_deg))
-            rows.append((*head, *free, *coplanar, *lattice, *means))
+            means = [None if errors is None else errors.mean_deg for errors in normals]
+            head = (report.pair_id, f"{angle.a}, {angle.b}", angle.measured_deg)
+            rows.append(cells(*head, *free, *coplanar, *lattice, *means))
     if not rows:
         return None
-    columns = (
-        Column("pair"),
-        Column("boards"),
-        Column("measured", "deg", 2),
-        Column("points' planes", "deg", 4),
-        Column("error", "deg", 4),
-        Column("coplanar points", "deg", 4),
-        Column("error, coplanar", "deg", 4),
-        Column("lattice planes", "deg", 4),
-        Column("error, lattice", "deg", 4),
-        Column("mean normal error to lattice, first", "deg", 4),
-        Column("second", "deg", 4),
+    heads = columns(
+        "pair | boards | measured [deg] .2 | points' planes [deg] .4 | error [deg] .4 | coplanar points [deg] .4 | "
+        "error, coplanar [deg] .4 | lattice planes [deg] .4 | error, lattice [deg] .4 | "
+        "mean normal error to lattice, first [deg] .4 | second [deg] .4"
     )
     note = (
         "Points' planes: fitted to the triangulated corners. Coplanar points: maximum likelihood of relative pose and "
         "planes from the corners that both views show, those of a board in one plane. Lattice planes: of relative pose "
         "and boards' poses from all corners of both views, the boards' squares known. Sigmas include the calibrations."
     )
-    return Table("angles", "Angles between boards by free, coplanar and lattice planes", columns, tuple(rows), note)
+    return Table("angles", "Angles between boards by free, coplanar and lattice planes", heads, tuple(rows), note)
 
 
 def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> Table:
@@ -181,20 +173,20 @@ def baseline_table(reports: Sequence[ValidationReport], paper: PaperTables) -> T
         off = {method: abs(report.baseline_mm - known[0]) for method, report in found.items()}
         # Estimators that end in the same pose are all the nearest; where all do, there is nothing to mark.
         nearest = [m for m in off if off[m] <= min(off.values()) + TIE_MM]
-        cells = [Cell(pair_id), Cell(known[0], paper.baseline(pair_id, "measured"), known[1])]
+        row = [Cell(pair_id), Cell(known[0], paper.baseline(pair_id, "measured"), known[1])]
         for method in methods:
             printed = paper.baseline(pair_id, method)
             if method in found:
                 report = found[method]
                 failed = not report.check("baseline").passed
                 best = method in nearest and len(nearest) < len(found)
-                cells.append(Cell(report.baseline_mm, printed, report.baseline_sigma_mm, best, failed))
+                row.append(Cell(report.baseline_mm, printed, report.baseline_sigma_mm, best, failed))
             else:
-                cells.append(Cell(None, printed))
-        rows.append(tuple(cells))
-    columns = (Column("pair"), Column("measured", "mm", 1), *(Column(m, "mm", 2) for m in methods))
+                row.append(Cell(None, printed))
+        rows.append(tuple(row))
+    heads = (Column("pair"), Column("measured", "mm", 1), *(Column(m, "mm", 2) for m in methods))
     note = "The nearest to the measured one is marked where they differ."
-    return Table("baselines", "Baseline by estimator", columns, tuple(rows), note)
+    return Table("baselines", "Baseline by estimator", heads, tuple(rows), note)
 
 
 def average_table(
@@ -205,10 +197,10 @@ def average_table(
     Beside every ratio stand what `images` it is of, the paper's being real, and the `mode` of the pipeline.
     """
     rows = []
-    cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
+    known_cells = [(row[0], cell) for row in plane_table(reports, method, paper).rows for cell in row[1:]]
     for what in (RIGHT_ANGLE_ERROR, "mean normal error", "median normal error"):
         starts = (what, ANGLE_ERROR) if what == RIGHT_ANGLE_ERROR else (what,)
-        both = [(c.value, float(c.paper)) for head, c in cells if str(head.value).startswith(starts) and c.paper]
+        both = [(c.value, float(c.paper)) for head, c in known_cells if str(head.value).startswith(starts) and c.paper]
         rows.append(_average_row(f"{what}, {method}", "deg", [(v, p) for v, p in both if isinstance(v, float)]))
     differences = []
     for report in reports:
@@ -216,13 +208,12 @@ def average_table(
         if known is not None and printed is not None:
             differences.append((abs(report.baseline_mm - known[0]), abs(float(printed) - known[0])))
     rows.append(_average_row("baseline error, all estimators", "mm", differences))
-    full = tuple((*row, Cell(images or "not stated"), Cell(mode)) for row in rows if row is not None)
+    full = tuple(cells(*row, images or "not stated", mode) for row in rows if row is not None)
     if not full:
         return None
-    first = (Column("average"), Column("unit"), Column("cells", "", 0), Column("ours", "", 4), Column("paper", "", 4))
-    columns = (*first, Column("paper / ours", "", 1), Column("images"), Column("mode"))
+    heads = columns("average | unit | cells .0 | ours .4 | paper .4 | paper / ours .1 | images | mode")
     note = "The paper's images are real: with rendered ones the ratio is not like for like."
-    return Table("averages", "Averages over the cells that the paper has", columns, full, note)
+    return Table("averages", "Averages over the cells that the paper has", heads, full, note)
 
 
 def check_table(reports: Sequence[ValidationReport]) -> Table:
@@ -233,63 +224,50 @@ def check_table(reports: Sequence[ValidationReport]) -> Table:
     found: dict[tuple[str, tuple[Cell, ...]], list[str]] = {}
     for report in reports:
         for c in report.checks:
-            verdict = Cell("pass" if c.passed else "FAIL", failed=not c.passed)
             sigma = c.our_sigma if np.isfinite(c.our_sigma) else None
-            numbers = (Cell(c.measured, sigma=c.measured_sigma), Cell(c.ours, sigma=sigma), Cell(c.difference))
-            tail = (Cell(c.combined_sigma), Cell(c.k), verdict, Cell(float(c.count)), Cell(c.how))
-            row = (Cell(c.name), Cell(c.unit), *numbers, *tail)
+            numbers = (Cell(c.measured, sigma=c.measured_sigma), Cell(c.ours, sigma=sigma), c.difference)
+            row = cells(c.name, c.unit, *numbers, c.combined_sigma, c.k, verdict_cell(c.passed), c.count, c.how)
             found.setdefault((report.pair_id, row), []).append(report.affine_method)
         for lost in report.unchecked:
             name, _, why = lost.partition(": ")
-            nothing = (Cell(None),) * 5
-            row = (Cell(name), Cell(None), *nothing, Cell("NOT CHECKED", failed=True), Cell(0.0), Cell(why))
+            row = cells(name, *[None] * 6, verdict_cell(False, "NOT CHECKED"), 0.0, why)
             found.setdefault((report.pair_id, row), []).append(report.affine_method)
-    rows = [(Cell(pair_id), Cell(", ".join(methods)), *row) for (pair_id, row), methods in found.items()]
-    columns = (
-        Column("pair"),
-        Column("estimator"),
-        Column("quantity"),
-        Column("unit"),
-        Column("measured"),
-        Column("ours"),
-        Column("difference"),
-        Column("combined sigma"),
-        Column("k", "", 2),
-        Column("verdict"),
-        Column("points", "", 0),
-        Column("measured by"),
+    rows = [cells(pair_id, ", ".join(methods), *row) for (pair_id, row), methods in found.items()]
+    heads = columns(
+        "pair | estimator | quantity | unit | measured | ours | difference | combined sigma | k .2 | verdict | "
+        "points .0 | measured by"
     )
     limits = sorted({c.limit_k for r in reports for c in r.checks})
     note = (
         "k: the difference in combined sigmas (root of the sum of both variances). Passes up to k = "
         f"{', '.join(f'{k:.3g}' for k in limits)}."
     )
-    return Table("checks", "Checks against what was measured", columns, tuple(rows), note)
+    return Table("checks", "Checks against what was measured", heads, tuple(rows), note)
 
 
 def estimator_table(reports: Sequence[ValidationReport]) -> Table:
     """Return one row a pair and estimator: angles, normal errors, flatness, baseline, verdict."""
     ids = _board_ids(reports)
-    columns = [Column("pair"), Column("estimator"), Column("points", "", 0)]
-    columns += [Column(f"angle {a}, {b}", "deg") for a, b in combinations(ids, 2)]
+    heads = [*columns("pair | estimator | points .0")]
+    heads += [Column(f"angle {a}, {b}", "deg") for a, b in combinations(ids, 2)]
     for statistic in ("mean", "median", "lower quartile", "upper quartile"):
-        columns += [Column(f"{statistic} normal error {board_id}", "deg") for board_id in ids]
-    columns += [Column(f"flatness {board_id}", "mm") for board_id in ids]
-    columns += [Column("baseline", "mm", 2), Column("Sampson rms", "px"), Column("verdict")]
+        heads += [Column(f"{statistic} normal error {board_id}", "deg") for board_id in ids]
+    heads += [Column(f"flatness {board_id}", "mm") for board_id in ids]
+    heads += columns("baseline [mm] .2 | Sampson rms [px] | verdict")
     rows = []
     for report in reports:
-        row = [Cell(report.pair_id), Cell(report.affine_method), Cell(float(report.count))]
+        row: list[float | str | Cell | None] = [report.pair_id, report.affine_method, report.count]
         by_pair = {frozenset((angle.a, angle.b)): angle for angle in report.angles}
         for two in combinations(ids, 2):
             angle = by_pair.get(frozenset(two))
-            row.append(Cell(None) if angle is None else Cell(angle.angle_deg, sigma=angle.sigma_deg))
+            row.append(None if angle is None else Cell(angle.angle_deg, sigma=angle.sigma_deg))
         for statistic in ("mean", "median", "lower quartile", "upper quartile"):
-            row += [Cell(_normal_error(report, board_id, statistic)) for board_id in ids]
+            row += [_normal_error(report, board_id, statistic) for board_id in ids]
         flat = {board.board.board_id: board.plane.rms_mm for board in report.boards}
-        row += [Cell(flat.get(board_id)) for board_id in ids]
-        row += [Cell(report.baseline_mm, sigma=report.baseline_sigma_mm), Cell(report.sampson_rms_px)]
-        rows.append((*row, Cell("pass" if report.passed else "FAIL", failed=not report.passed)))
-    return Table("estimators", "Every pair with every estimator", tuple(columns), tuple(rows))
+        row += [flat.get(board_id) for board_id in ids]
+        baseline = Cell(report.baseline_mm, sigma=report.baseline_sigma_mm)
+        rows.append(cells(*row, baseline, report.sampson_rms_px, verdict_cell(report.passed)))
+    return Table("estimators", "Every pair with every estimator", tuple(heads), tuple(rows))
 
 
 def _capture(pair_id: str) -> str:
@@ -328,4 +306,4 @@ def _average_row(label: str, unit: str, both: Sequence[tuple[float, float]]) -> 
         return None
     ours, theirs = (float(np.mean(column)) for column in zip(*both, strict=True))
     ratio = theirs / ours if ours > 0.0 else None
-    return (Cell(label), Cell(unit), Cell(float(len(both))), Cell(ours), Cell(theirs), Cell(ratio))
+    return cells(label, unit, len(both), ours, theirs, ratio)

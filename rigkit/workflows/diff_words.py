@@ -10,7 +10,7 @@ from typing import Any
 
 from rigkit.calibration.compare import CameraVerdict
 from rigkit.calibration.rig.compare import RigDifference
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Table, cells, columns
 from rigkit.io.files import write_atomic
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import difference_png
@@ -78,43 +78,31 @@ def _cameras_of(pair: Pair) -> Mapping[str, CameraPair]:
 
 
 def _camera_table(cameras: Mapping[str, CameraPair]) -> Table:
-    columns = (
-        Column("camera"),
-        Column("difference rms", "px", 4),
-        Column("at most", "px", 4),
-        Column("expected of one camera", "px", 4),
-        Column("times as much", "", 2),
-        Column("chance of as much"),
-        Column("turned by", "deg", 4),
-        Column("of the image", "%", 0),
-        Column("verdict"),
+    heads = columns(
+        "camera | difference rms [px] .4 | at most [px] .4 | expected of one camera [px] .4 | times as much .2 | "
+        "chance of as much | turned by [deg] .4 | of the image [%] .0 | verdict"
     )
     rows = []
     for name, own in cameras.items():
         f = _camera_figures(own)
-        chance = "–" if f["chance"] is None else f"{f['chance']:.3g}"
         numbers = (f["rms_px"], f["max_px"], f["predicted_px"], f["ratio"])
-        tail = (Cell(f["rotation_deg"]), Cell(100.0 * f["coverage"]), Cell(f["verdict"] or "no covariance"))
-        rows.append((Cell(name or "camera"), *map(Cell, numbers), Cell(chance), *tail))
+        tail = (f["rotation_deg"], 100.0 * f["coverage"], f["verdict"] or "no covariance")
+        rows.append(cells(name or "camera", *numbers, _chance(f["chance"]), *tail))
     note = (
         "After the rotation that brings the two closest, where both had boards: a camera's own frame turns with every "
         "calibration. Chance: of at least as much between two calibrations of one camera."
     )
-    return Table("cameras", "Lenses", columns, tuple(rows), note)
+    return Table("cameras", "Lenses", heads, tuple(rows), note)
 
 
 def _mount_table(title: str, difference: RigDifference) -> Table:
-    columns = (Column("which"), Column("moved by", "mm"), Column("turned by", "deg", 4), Column("chance of as much"))
-    rows = tuple(
-        (
-            Cell(m.name),
-            Cell(m.shift_mm),
-            Cell(m.rotation_deg),
-            Cell("–" if m.chance is None else f"{m.chance:.3g}"),
-        )
-        for m in difference.mounts
-    )
-    return Table("mounts", title, columns, rows, "Against the first one.")
+    heads = columns("which | moved by [mm] | turned by [deg] .4 | chance of as much")
+    rows = tuple(cells(m.name, m.shift_mm, m.rotation_deg, _chance(m.chance)) for m in difference.mounts)
+    return Table("mounts", title, heads, rows, "Against the first one.")
+
+
+def _chance(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
 
 
 def _camera_figures(pair: CameraPair) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.core.errors import DegenerateError, ExitCode, InputError, RigkitError
 from rigkit.core.progress import Progress, silent
-from rigkit.core.tables import Cell, Column, Table
+from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.manifest import load_dataset
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
@@ -148,31 +148,18 @@ def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
 
 
 def _table(outcomes: Sequence[SetOutcome]) -> Table:
-    columns = (
-        Column("data set"),
-        Column("pairs", "", 0),
-        Column("checks failed", "", 0),
-        Column("worst angle error", "deg"),
-        Column("mean normal error", "deg"),
-        Column("worst baseline", "sigmas", 1),
-        Column("verdict"),
-        Column("why"),
+    heads = columns(
+        "data set | pairs .0 | checks failed .0 | worst angle error [deg] | mean normal error [deg] | "
+        "worst baseline [sigmas] .1 | verdict | why"
     )
     words = {ExitCode.WELL: "pass", ExitCode.CHECK_FAILED: "FAIL"}
+    verdicts = [Cell(words.get(ExitCode(o.code), "not validated"), failed=o.code != ExitCode.WELL) for o in outcomes]
     rows = tuple(
-        (
-            Cell(o.name),
-            Cell(float(o.pairs)),
-            Cell(float(o.checks_failed)),
-            Cell(o.worst_angle_deg),
-            Cell(o.mean_normal_deg),
-            Cell(o.worst_baseline_sigmas),
-            Cell(words.get(ExitCode(o.code), "not validated"), failed=o.code != ExitCode.WELL),
-            Cell(o.error),
-        )
-        for o in outcomes
+        cells(o.name, o.pairs, o.checks_failed, o.worst_angle_deg, o.mean_normal_deg, o.worst_baseline_sigmas)
+        + cells(verdict, o.error)
+        for o, verdict in zip(outcomes, verdicts, strict=True)
     )
-    return Table("datasets", "Data sets, each pair with its best estimator", columns, rows)
+    return Table("datasets", "Data sets, each pair with its best estimator", heads, rows)
 
 
 def _page(outcomes: Sequence[SetOutcome], table: Table) -> str:
