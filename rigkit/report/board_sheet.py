@@ -76,7 +76,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     inks = [board.ink(upright=upright) for upright in (False, True)]
     white_circles = inks[0].inverted and len(inks[0].circles) > 0
     ground = np.array([[*low, w, h]]) if white_circles else np.zeros((0, 4))
-    shapes = np.concatenate([ground, _black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
+    shapes = np.concatenate([ground, black_squares(board, inks[0]), *(ink.rectangles for ink in inks)])
     shapes[:, :2] += np.array([x0, y0]) - low
     circles = inks[0].circles + np.array([x0 - low[0], y0 - low[1], 0.0])
     rectangles = [(x, y, width, height) for x, y, width, height in shapes.tolist()]
@@ -106,7 +106,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     )
 
 
-def _black_squares(board: Board, ink: Ink) -> FloatArray:
+def black_squares(board: Board, ink: Ink) -> FloatArray:
     """Return the black squares of a board that has squares, as rectangles (M, 4) of `Ink`."""
     if ink.first_black is None:
         return np.zeros((0, 4))

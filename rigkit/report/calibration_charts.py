@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from itertools import takewhile
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,10 +14,12 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+from rigkit.report import svg
+from rigkit.report.svg import round_down, round_up
 
 WIDTH, HEIGHT = 600.0, 330.0
 LEFT, RIGHT, TOP, BOTTOM = 70.0, 24.0, 12.0, 46.0
-INK, MARK, SOFT, WORDS, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#333", "#5b6575"
+INK, MARK, SOFT, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#5b6575"
 MAX_RESIDUAL_DOTS = 4000
 BARS_NAMED = 24
 """More images are numbered only: their names would lie over each other."""
@@ -31,6 +34,10 @@ IMAGE_RINGS = 12
 """Rings of equal numbers of corners, each with its own RMS."""
 CURVE_POINTS = 120
 TICKS = (1.0, 2.0, 2.5, 5.0, 10.0)
+FINE = np.arange(1.0, 10.1, 0.5)
+
+
+Value = TypeVar("Value", float, FloatArray)
 
 
 class _Plot:
@@ -45,10 +52,7 @@ class _Plot:
         bottom: float = BOTTOM,
     ) -> None:
         self._x, self._y, self.floor = x, y, HEIGHT - bottom
-        self.parts = [
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" '
-            f'font-family="sans-serif" font-size="13"><title>{escape(title)}</title>'
-        ]
+        self.parts = [svg.opened(title, f"0 0 {WIDTH:g} {HEIGHT:g}")]
         for value in _ticks(*y):
             at = self.v(value)
             self.parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="#e3e7ee"/>')
@@ -56,17 +60,17 @@ class _Plot:
         self.words(0.5 * (LEFT + WIDTH - RIGHT), HEIGHT - 6, labels[0], "middle")
         self.parts.append(
             f'<text transform="translate(13 {0.5 * (TOP + self.floor):.1f}) rotate(-90)" text-anchor="middle" '
-            f'fill="{WORDS}">{escape(labels[1])}</text>'
+            f'fill="{svg.WORDS_COLOUR}">{escape(labels[1])}</text>'
         )
 
-    def u(self, x: float) -> float:
+    def u(self, x: Value) -> Value:
         return LEFT + (x - self._x[0]) / (self._x[1] - self._x[0]) * (WIDTH - LEFT - RIGHT)
 
-    def v(self, y: float) -> float:
+    def v(self, y: Value) -> Value:
         return self.floor - (y - self._y[0]) / (self._y[1] - self._y[0]) * (self.floor - TOP)
 
-    def words(self, x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS) -> None:
-        self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>')
+    def words(self, x: float, y: float, text: str, anchor: str = "start", colour: str = svg.WORDS_COLOUR) -> None:
+        self.parts.append(svg.words(x, y, text, anchor, colour))
 
     def below(self, values: Sequence[float]) -> None:
         for value in values:
@@ -78,7 +82,7 @@ class _Plot:
         self.parts.append(f'<polyline points="{places}" fill="none" stroke="{colour}" stroke-width="{width}"{dashed}/>')
 
     def done(self) -> str:
-        frame = f'<path d="M{LEFT} {TOP}V{self.floor}H{WIDTH - RIGHT}" fill="none" stroke="#b8c0cc"/></svg>'
+        frame = f'<path d="M{LEFT} {TOP}V{self.floor}H{WIDTH - RIGHT}" fill="none" stroke="{svg.RIM_COLOUR}"/></svg>'
         return "".join([*self.parts, frame])
 
 
@@ -86,7 +90,7 @@ def images_svg(calibration: Calibration) -> str:
     """Draw the RMS of every view as a bar, with the RMS of all as a line."""
     rms = np.array([view.rms_px for view in calibration.views])
     rms = np.where(np.isfinite(rms), rms, 0.0)
-    top = _round_up(max(1.1 * float(rms.max(initial=0.0)), 1e-6))
+    top = round_up(max(1.1 * float(rms.max(initial=0.0)), 1e-6))
     names = _short([view.image for view in calibration.views]) if len(rms) <= BARS_NAMED else []
     longest = max(map(len, names), default=0)
     upright = longest > LEVEL_NAME
@@ -106,7 +110,8 @@ def images_svg(calibration: Calibration) -> str:
             place = f"translate({plot.u(k):.1f} {plot.floor + 18:.1f})"
         anchor = "end" if upright else "middle"
         plot.parts.append(
-            f'<text transform="{place}" text-anchor="{anchor}" font-size="12.5" fill="{WORDS}">{escape(name)}</text>'
+            f'<text transform="{place}" text-anchor="{anchor}" font-size="12.5" fill="{svg.WORDS_COLOUR}">'
+            f"{escape(name)}</text>"
         )
     if not names:
         plot.below(_ticks(0.0, len(rms) - 1.0))
@@ -133,19 +138,16 @@ def radius_svg(calibration: Calibration) -> str:
     pixels, residuals = _kept(calibration)
     centre = 0.5 * (np.array(calibration.camera.size_px) - 1.0)
     radius, error = np.linalg.norm(pixels - centre, axis=1), np.linalg.norm(residuals, axis=1)
-    top = _round_up(float(np.quantile(error, 0.995)))
-    reach = _round_up(float(np.linalg.norm(centre)), fine=True)
+    top = round_up(float(np.quantile(error, 0.995)))
+    reach = round_up(float(np.linalg.norm(centre)), FINE)
     plot = _Plot(
         "error against radius", (0.0, reach), (0.0, top), ("distance from the image's centre, px", "error, px")
     )
     step = -(-len(radius) // MAX_RESIDUAL_DOTS)
     shown = error[::step] <= top
-    dots = "".join(
-        f"M{plot.u(float(r)):.1f} {plot.v(float(e)):.1f}h0"
-        for r, e in zip(radius[::step][shown], error[::step][shown], strict=True)
-    )
+    places = np.stack([plot.u(radius[::step][shown]), plot.v(error[::step][shown])], axis=-1)
     plot.parts.append(
-        f'<path d="{dots}" stroke="{INK}" stroke-opacity=".35" stroke-width="2.4" stroke-linecap="round"/>'
+        f'<path d="{svg.dots(places)}" stroke="{INK}" stroke-opacity=".35" stroke-width="2.4" stroke-linecap="round"/>'
     )
     order = np.array_split(np.argsort(radius), min(IMAGE_RINGS, max(len(radius) // 20, 1)))
     rings = np.array([[radius[o].mean(), np.sqrt(np.mean(error[o] ** 2))] for o in order])
@@ -160,12 +162,12 @@ def histogram_svg(calibration: Calibration) -> str:
     _, residuals = _kept(calibration)
     values = residuals.reshape(-1)
     sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
-    reach = _round_up(max(4.0 * sigma, 1e-6), fine=True)
+    reach = round_up(max(4.0 * sigma, 1e-6), FINE)
     counts, edges = np.histogram(values, BINS, (-reach, reach))
     step = edges[1] - edges[0]
     x = np.linspace(-reach, reach, CURVE_POINTS)
     curve = len(values) * step / (sigma * np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * (x / sigma) ** 2)
-    top = _round_up(float(max(counts.max(), curve.max())))
+    top = round_up(float(max(counts.max(), curve.max())))
     plot = _Plot("residuals", (-reach, reach), (0.0, top), ("residual along u or v, px", "how many"))
     for count, left in zip(counts, edges, strict=False):
         y, wide = plot.v(float(count)), plot.u(float(left + step)) - plot.u(float(left))
@@ -192,7 +194,7 @@ def lens_svg(calibration: Calibration) -> str:
     radius = np.linalg.norm(pixels - axis, axis=1)
     band = projection_uncertainty(calibration, pixels).worst_px
     focal = float(np.gradient(radius, np.radians(angle))[1])
-    reach, top = _round_up(float(angle.max()), fine=True), _round_up(float(radius.max()), fine=True)
+    reach, top = round_up(float(angle.max()), FINE), round_up(float(radius.max()), FINE)
     plot = _Plot("the lens", (0.0, reach), (0.0, top), ("angle off the axis, deg", "distance from its centre, px"))
     theta = np.linspace(0.0, reach, CURVE_POINTS)
     for curve, dashes in (
@@ -204,7 +206,7 @@ def lens_svg(calibration: Calibration) -> str:
     plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 26, "dotted: perspective", "end", FAINT_WORDS)
     plot.words(WIDTH - RIGHT, HEIGHT - BOTTOM - 10, "dashed: equidistant", "end", FAINT_WORDS)
     known = np.isfinite(band)
-    times = _round_down(0.1 * top / max(float(np.nanmedian(band)), 1e-9)) if known.any() else 1.0
+    times = round_down(0.1 * top / max(float(np.nanmedian(band)), 1e-9)) if known.any() else 1.0
     around = np.clip(np.nan_to_num(band) * times, 0.0, 0.5 * top)
     both = [*zip(angle, radius + around, strict=True), *zip(angle[::-1], (radius - around)[::-1], strict=True)]
     outline = " ".join(f"{plot.u(a):.1f},{plot.v(float(np.clip(r, 0.0, top))):.1f}" for a, r in both)
@@ -229,15 +231,3 @@ def _ticks(low: float, high: float) -> list[float]:
     power = 10.0 ** np.floor(np.log10(rough))
     step = next(m * power for m in TICKS if m * power >= rough)
     return [float(f"{k * step:.10g}") for k in range(int(np.ceil(low / step)), int(np.floor(high / step + 1e-9)) + 1)]
-
-
-def _round_up(value: float, *, fine: bool = False) -> float:
-    """Return the next round number: 1, 2, 5 times a power of ten, or with `fine` any tenth of the power above."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
-    steps = np.arange(1.0, 10.1, 0.5) if fine else np.array([1.0, 2.0, 5.0, 10.0])
-    return float(power * steps[np.searchsorted(steps * power, value * (1.0 - 1e-12))])
-
-
-def _round_down(value: float) -> float:
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
-    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= value * (1.0 + 1e-12)))

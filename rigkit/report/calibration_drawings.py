@@ -13,6 +13,8 @@ from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.report import svg
+from rigkit.report.svg import dots, round_down, strokes
 
 WIDTH = 600.0
 """Width of the drawn image, in units of the drawing."""
@@ -40,7 +42,7 @@ INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 def residuals_svg(calibration: Calibration) -> str:
     """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
     pixels, residuals, kept = _corners(calibration)
-    times = _magnification(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
+    times = round_down(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
     step = -(-int(kept.sum()) // MAX_VECTORS)
     q, d = pixels[kept][::step], residuals[kept][::step]
     words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"
@@ -49,8 +51,8 @@ def residuals_svg(calibration: Calibration) -> str:
     zoom = _zoom(calibration)
     out = [
         _open(calibration, words),
-        f'<path d="{_vectors(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
-        f'<path d="{_dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
+        f'<path d="{strokes(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
+        f'<path d="{dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
         f'<path d="{_crosses(zoom * crossed)}" stroke="{BAD}" stroke-width="1.2" fill="none"/>',
         _scale(calibration, times),
         _foot(
@@ -83,14 +85,14 @@ def pattern_svg(calibration: Calibration) -> str:
     row, column = np.divmod(np.flatnonzero(enough), CELLS_ACROSS)
     places = (np.stack([column, row], axis=-1) + 0.5) * size
     longest = float(np.linalg.norm(mean, axis=1).max(initial=1e-9))
-    times = _magnification(0.9 * size / longest)
+    times = round_down(0.9 * size / longest)
     words = f"mean residual by part of the image, magnified {times:g} times"
     zoom = _zoom(calibration)
-    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.4" fill="{SOFT}"/>' for x, y in zoom * places)
-    out = [_open(calibration, words), dots]
+    marks = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.4" fill="{SOFT}"/>' for x, y in zoom * places)
+    out = [_open(calibration, words), marks]
     for chosen, colour in ((~beyond, SOFT), (beyond, MARK)):
         start, by = zoom * places[chosen], zoom * times * mean[chosen]
-        path = _vectors(start, by) + _heads(start, by)
+        path = strokes(start, by) + _heads(start, by)
         out.append(f'<path d="{path}" stroke="{colour}" stroke-width="1.6" fill="none"/>')
     expected = f"{int(beyond.sum())} of {len(beyond)} coloured: beyond chance, which makes {CHANCE * len(beyond):.1f}"
     return "".join([*out, _scale(calibration, times), _foot(calibration, words, expected)])
@@ -114,7 +116,7 @@ def coverage_svg(calibration: Calibration) -> str:
             out.append(f'<rect {place} fill="{INK}" fill-opacity="{shade:.2f}"/>')
     step = -(-int(kept.sum()) // MAX_VECTORS)
     out.append(
-        f'<path d="{_dots(zoom * pixels[kept][::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>'
+        f'<path d="{dots(zoom * pixels[kept][::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>'
     )
     middles = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1) + 0.5) * size - 0.5
     seen = calibration.camera.unproject(middles)[1] | (count > 0)
@@ -162,8 +164,7 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
     for value in CONTOURS_PX:
         lines = [np.asarray(line) for line in generator.lines(float(np.log(value)))]
         for line in lines:
-            path = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in line)
-            out.append(f'<path d="{path}" fill="none" stroke="#fff" stroke-opacity=".75" stroke-width="1"/>')
+            out.append(f'<path d="{svg.line(line)}" fill="none" stroke="#fff" stroke-opacity=".75" stroke-width="1"/>')
         if lines:
             # Where the line is far from the figures that stand on the map.
             longest = max(lines, key=len)
@@ -175,11 +176,11 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
 def _scale(calibration: Calibration, times: float) -> str:
     """Return a stroke below the drawing as long as a round number of pixels, magnified as the residuals are."""
     per_px = _zoom(calibration) * times
-    length = _magnification(0.15 * WIDTH / per_px)
+    length = round_down(0.15 * WIDTH / per_px)
     y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, WIDTH - 4.0
     return (
         f'<path d="M{x - length * per_px:.1f} {y:.1f}H{x}m0 -4v8m{-length * per_px:.1f} 0v-8" stroke="#333"/>'
-        f'<text x="{x - length * per_px - 6:.1f}" y="{y + 4:.1f}" text-anchor="end" fill="#333">{length:g} px</text>'
+        + svg.words(x - length * per_px - 6, y + 4, f"{length:g} px", "end")
     )
 
 
@@ -202,10 +203,7 @@ def _colour_bar(y: float, low: float, high: float) -> str:
     strip = "".join(
         f'<rect x="{380 + 6 * k}" y="{y:.1f}" width="7" height="10" fill="{_colour(v)}"/>' for k, v in enumerate(levels)
     )
-    return (
-        f'<text x="374" y="{y + 10:.1f}" text-anchor="end" fill="#333">{low:.3g}</text>{strip}'
-        f'<text x="530" y="{y + 10:.1f}" fill="#333">{high:.3g} px</text>'
-    )
+    return svg.words(374, y + 10, f"{low:.3g}", "end") + strip + svg.words(530, y + 10, f"{high:.3g} px")
 
 
 def _numbers(calibration: Calibration) -> list[str]:
@@ -238,22 +236,8 @@ def _zoom(calibration: Calibration) -> float:
     return WIDTH / calibration.camera.size_px[0]
 
 
-def _magnification(wanted: float) -> float:
-    """Return the next of 1, 2, 5 times a power of ten below `wanted`."""
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= wanted))
-
-
 def _ordinal(number: int) -> str:
     return {2: "second", 3: "third"}.get(number, f"{number}th")
-
-
-def _vectors(start: FloatArray, by: FloatArray) -> str:
-    return "".join(f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(start, by, strict=True))
-
-
-def _dots(at: FloatArray) -> str:
-    return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in at)
 
 
 def _crosses(at: FloatArray, half: float = 4.0) -> str:
@@ -271,9 +255,8 @@ def _colour(level: float) -> str:
 def _open(calibration: Calibration, title: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {WIDTH + 2:g} {height + FOOT:.1f}" role="img" '
-        f'font-family="sans-serif" font-size="13"><title>{escape(title)}</title>'
-        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="#fbfcfd"/>'
+        svg.opened(title, f"-1 -1 {WIDTH + 2:g} {height + FOOT:.1f}")
+        + f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}"/>'
     )
 
 
@@ -283,5 +266,6 @@ def _foot(calibration: Calibration, *lines: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     words = "<br>".join(escape(line) for line in lines if line)
     return (
-        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="#b8c0cc"/></svg><p class="foot">{words}</p>'
+        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="{svg.RIM_COLOUR}"/></svg>'
+        f'<p class="foot">{words}</p>'
     )

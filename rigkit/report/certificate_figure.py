@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigkit.report.figures import as_pdf
+from rigkit.report.figures import DPI, as_pdf, new_figure
 from rigkit.validation.certificate.contracts import Certificate
 
 if TYPE_CHECKING:
@@ -24,11 +24,7 @@ LINE_CHARACTERS = 98
 
 def bound_figure(certificate: Certificate) -> Figure:
     """Draw the bound over the image of the first camera, and the causes in the middle and where it is worst."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 4.2), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 4.2, dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 1.15))
     _draw_map(left, certificate)
     _draw_causes(right, certificate)
@@ -37,11 +33,7 @@ def bound_figure(certificate: Certificate) -> Figure:
 
 def sheet_pdf(certificate: Certificate, title: str, statements: Sequence[str], facts: Sequence[str]) -> bytes:
     """Return one page of A4: what is stated, the map and the causes, what it rests on, and room for a signature."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=A4_INCHES)
-    FigureCanvasAgg(figure)
+    figure = new_figure(*A4_INCHES)
     figure.text(0.09, 0.945, title, fontsize=15, weight="bold", va="top")
     top = _write(figure, 0.905, statements, size=9.5)
     map_height = 0.34

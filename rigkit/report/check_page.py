@@ -14,6 +14,7 @@ import numpy as np
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import HistoryEntry
+from rigkit.report import svg
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck
@@ -188,17 +189,12 @@ def change_svg(check: SentinelCheck, c: int) -> str:
     zoom = DRAWN_WIDTH / before.size_px[0]
     times = ARROW_LENGTH * before.size_px[0] / longest if longest > 1e-6 else 0.0
     height = zoom * before.size_px[1]
-    path = "".join(
-        f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(zoom * start, zoom * times * by, strict=True)
-    )
-    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in zoom * start)
     words = f"{longest:.3g} px at most, drawn {times:.2g} times as long" if times else "nothing moves"
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {DRAWN_WIDTH + 2:g} {height + 2:.1f}" role="img" '
-        f'font-family="sans-serif" font-size="13"><title>{words}</title>'
-        f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="#fbfcfd" stroke="#b8c0cc"/>'
-        f'<path d="{path}" stroke="{LINE}" stroke-width="1.3" fill="none"/>'
-        f'<path d="{dots}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
+        svg.opened(words, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + 2:.1f}")
+        + f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}" stroke="{svg.RIM_COLOUR}"/>'
+        f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{LINE}" stroke-width="1.3" fill="none"/>'
+        f'<path d="{svg.dots(zoom * start)}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
         f'</svg><p class="foot">{words}</p>'
     )
 
@@ -240,19 +236,14 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     x = MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * ((days - days[0]) / span if len(own) > 1 else np.full(1, 0.5))
     middle = 0.5 * (DRIFT_HEIGHT - 24.0)
     y = middle * (1.0 - value / top)
-    out = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}" role="img" '
-        f'font-family="sans-serif" font-size="12"><title>{escape(name)}</title>'
-    ]
+    out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     for level, colour, dash in ((0.0, "#8a94a3", ""), (limit, LIMIT, "5 4"), (-limit, LIMIT, "5 4")):
         height = middle * (1.0 - level / top)
         out.append(
             f'<line x1="{MARGIN}" x2="{DRAWN_WIDTH - 6}" y1="{height:.1f}" y2="{height:.1f}" stroke="{colour}" '
-            f'stroke-dasharray="{dash}"/><text x="{MARGIN - 5}" y="{height + 4:.1f}" text-anchor="end" '
-            f'fill="#333">{level:.2g}</text>'
+            f'stroke-dasharray="{dash}"/>{svg.words(MARGIN - 5, height + 4, f"{level:.2g}", "end")}'
         )
-    line = "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
-    out.append(f'<path d="M{line}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
     for a, b, s, entry in zip(x, y, middle * sigma / top, own, strict=True):
         colour = LINE if entry.holds else ALARM
         out.append(
@@ -262,9 +253,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
         )
     ends = [(x[0], own[0], "start"), (x[-1], own[-1], "end")]
     for a, entry, anchor in ends if len(own) > 1 else [(x[0], own[0], "middle")]:
-        out.append(
-            f'<text x="{a:.1f}" y="{DRIFT_HEIGHT - 6:.1f}" text-anchor="{anchor}" fill="#333">{entry.date[:10]}</text>'
-        )
+        out.append(svg.words(a, DRIFT_HEIGHT - 6, entry.date[:10], anchor))
     return "".join([*out, "</svg>"])
 
 

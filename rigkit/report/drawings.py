@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import correct_rays_px
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report import svg
 from rigkit.report.figures import board_colour
 from rigkit.validation.checks import ValidationReport
 
@@ -43,7 +43,7 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
     """Draw groups of named samples as boxes (median, quartiles, whiskers, outliers) with one colour a name."""
     names = list(dict.fromkeys(name for _, boxes in groups for name, _ in boxes))
     highest = max((float(np.max(v)) for _, boxes in groups for _, v in boxes if len(v)), default=1.0)
-    top = _round_up(highest)
+    top = svg.round_up(highest)
     plot = HEIGHT - BOTTOM - TOP
     step = (WIDTH - LEFT - 10.0) / max(len(groups), 1)
     slot = step * 0.8 / max(len(names), 1)
@@ -51,21 +51,21 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
     def y(value: float) -> float:
         return TOP + plot * (1.0 - value / top)
 
-    out = [_head(WIDTH, HEIGHT, label)]
+    out = [svg.opened(label, f"0 0 {WIDTH:g} {HEIGHT:g}", size=12)]
     for tick in np.linspace(0.0, top, 5):
         out.append(f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" stroke="#e3e7ee"/>')
-        out.append(_text(LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
+        out.append(svg.words(LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
     for g, (group, boxes) in enumerate(groups):
         start = LEFT + g * step + 0.1 * step
-        out.append(_text(start + 0.4 * step, HEIGHT - BOTTOM + 18, group, "middle"))
+        out.append(svg.words(start + 0.4 * step, HEIGHT - BOTTOM + 18, group, "middle"))
         for name, values in boxes:
             index = names.index(name)
             out += _box(start + slot * (index + 0.5), 0.7 * slot, values, board_colour(index), y)
     for index, name in enumerate(names):
         x = LEFT + 110.0 * index
         out.append(f'<rect x="{x}" y="{HEIGHT - 18}" width="10" height="10" fill="{board_colour(index)}"/>')
-        out.append(_text(x + 15, HEIGHT - 9, name, "start"))
-    out.append(_text(LEFT, 14, label, "start"))
+        out.append(svg.words(x + 15, HEIGHT - 9, name, "start"))
+    out.append(svg.words(LEFT, 14, label, "start"))
     return "".join([*out, "</svg>"])
 
 
@@ -81,24 +81,23 @@ def residuals_svg(reconstruction: Reconstruction) -> str:
     height = max(width * c.size_px[1] / c.size_px[0] for c in (camera1, camera2))
     scale_of_arrows = RESIDUAL_LENGTH * width / max(rms, 1e-12)
     words = f"residuals, {rms:.4f} px rms, magnified {scale_of_arrows * camera1.size_px[0] / width:.0f} times"
-    out = [_head(2 * width + 20, height + 30, words)]
+    out = [svg.opened(words, f"0 0 {2 * width + 20:g} {height + 30:g}", size=12)]
     for offset, camera, pixels, moved in (
         (0.0, camera1, reconstruction.pixels1, moved1),
         (width + 20, camera2, reconstruction.pixels2, moved2),
     ):
         zoom = width / camera.size_px[0]
-        frame = (
+        out.append(
             f'<rect x="{offset:.1f}" y="0" width="{width}" height="{zoom * camera.size_px[1]:.1f}" fill="none" '
-            'stroke="#b8c0cc"/>'
+            f'stroke="{svg.RIM_COLOUR}"/>'
         )
-        out.append(frame)
         for q, d, board in zip(pixels, moved, reconstruction.matches.board_index, strict=True):
             x, y = offset + zoom * q[0], zoom * q[1]
             ex, ey = x + scale_of_arrows * d[0], y + scale_of_arrows * d[1]
             colour = board_colour(int(board))
             out.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{ex:.1f}" y2="{ey:.1f}" stroke="{colour}"/>')
             out.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1.6" fill="{colour}"/>')
-    out.append(_text(0.0, height + 20, words, "start"))
+    out.append(svg.words(0.0, height + 20, words, "start"))
     return "".join([*out, "</svg>"])
 
 
@@ -118,20 +117,3 @@ def _box(x: float, width: float, values: FloatArray, colour: str, y: Callable[[f
     ]
     outside = values[(values < low - reach) | (values > high + reach)]
     return [*out, *(f'<circle cx="{x:.1f}" cy="{y(v):.1f}" r="1.3" fill="{colour}"/>' for v in outside)]
-
-
-def _round_up(value: float) -> float:
-    """Return the next of 1, 2, 5 times a power of ten."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
-    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= value))
-
-
-def _head(width: float, height: float, title: str) -> str:
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {height:g}" '
-        f'font-family="sans-serif" font-size="12"><title>{escape(title)}</title>'
-    )
-
-
-def _text(x: float, y: float, words: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="#333">{escape(words)}</text>'

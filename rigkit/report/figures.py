@@ -54,6 +54,16 @@ DARK_GROUND, DARK_WORDS = "#14181f", "#c8cfda"
 """Of pages by night."""
 
 
+def new_figure(width: float, height: float, **options: Any) -> Figure:
+    """Return an empty figure of so many inches, without a display."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def board_colour(index: int) -> str:
     """Return the colour of a board, the same in every picture."""
     return BOARD_COLOURS[index % len(BOARD_COLOURS)]
@@ -136,11 +146,7 @@ def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pi
 
 def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
     """Render the oriented cloud: points and normals by board, both cameras as pyramids, from two directions."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 6), dpi=DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(13, 6, dpi=DPI)
     figure.subplots_adjust(left=0.0, right=0.97, bottom=0.02, top=0.94, wspace=0.0)
     cloud = reconstruction.cloud
     scene = cloud.points_mm
@@ -190,11 +196,7 @@ def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
 
 def difference_png(difference: CameraDifference) -> bytes:
     """Draw the difference of two cameras over the image: its length as colour, its direction as arrows."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5.6), dpi=DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 5.6, dpi=DPI)
     axis: Any = figure.subplots()
     u, v = difference.pixels[..., 0], difference.pixels[..., 1]
     # Below this there is only rounding, which must not look like a pattern.
@@ -272,12 +274,7 @@ def _draw_boards(axis: Any, reconstruction: Reconstruction, pixels: Pixels) -> N
 
 def pair_axes(image1: NDArray[Any], image2: NDArray[Any]) -> tuple[Figure, Sequence[Any]]:
     """Return a figure with both images side by side, and its axes, in which the images' pixels are the units."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    aspect = image1.shape[0] / image1.shape[1]
-    figure = Figure(figsize=(14, 7 * aspect + 0.35), dpi=DPI)
-    FigureCanvasAgg(figure)
+    figure = new_figure(14, 7 * image1.shape[0] / image1.shape[1] + 0.35, dpi=DPI)
     axes = figure.subplots(1, 2)
     figure.subplots_adjust(left=PAIR_RIM, right=1.0 - PAIR_RIM, bottom=PAIR_RIM, top=PAIR_TOP, wspace=0.01)
     for axis, image in zip(axes, (image1, image2), strict=True):

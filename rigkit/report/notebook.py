@@ -17,6 +17,7 @@ from rigkit.core.findings import Finding, Severity, gravest_first, worst
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report import svg
 from rigkit.report.page import scene_of
 from rigkit.report.rig_tables import rig_reach
 from rigkit.report.scene_view import boards_scene, rig_scene
@@ -71,31 +72,24 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
         return np.asarray((places @ VIEWED_FROM.T)[:, :2] - low) * zoom + RIM
 
     height = zoom * (high[1] - low[1]) + 2.0 * RIM
-    out = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH:g}" viewBox="0 0 {WIDTH:g} {height:.0f}" role="img" '
-        'style="background: #fff" font-family="sans-serif" font-size="11"><title>cameras and boards</title>'
-    ]
+    shown = f'width="{WIDTH:g}" style="background: #fff"'
+    out = [svg.opened("cameras and boards", f"0 0 {WIDTH:g} {height:.0f}", size=11, more=shown)]
     for plane, corners in zip(scene["planes"], planes, strict=True):
         colour = SHADES[plane["board"] % len(SHADES)]
-        outline = _path(drawn(corners))
+        outline = svg.line(drawn(corners))
         out.append(f'<path d="{outline}Z" fill="{colour}" fill-opacity="0.08" stroke="{colour}" stroke-opacity="0.6"/>')
     step = -(-len(points) // MAX_DRAWN_POINTS) or 1
     board = np.array(scene["board"], dtype=np.int64)
     for index in np.unique(board[::step]).tolist():
-        dots = drawn(points[::step][board[::step] == index])
-        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in dots)
+        path = svg.dots(drawn(points[::step][board[::step] == index]))
         out.append(f'<path d="{path}" stroke="{SHADES[index % len(SHADES)]}" stroke-width="3" stroke-linecap="round"/>')
     for camera, corners in zip(scene["cameras"], cameras, strict=True):
         tip, *base = drawn(corners)
         below = max(float(y) for _, y in (tip, *base)) + RIM - 3.0
-        wire = _path(np.array(base)) + "Z" + "".join(_path(np.array([tip, corner])) for corner in base)
+        wire = svg.line(np.array(base)) + "Z" + "".join(svg.line(np.array([tip, corner])) for corner in base)
         out.append(f'<path d="{wire}" fill="none" stroke="#333"/>')
-        out.append(f'<text x="{tip[0]:.1f}" y="{below:.1f}" fill="#333">{escape(camera["name"])}</text>')
+        out.append(svg.words(tip[0], below, camera["name"]))
     return "".join([*out, "</svg>"])
-
-
-def _path(places: FloatArray) -> str:
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
 
 
 def notebook_progress() -> Progress:

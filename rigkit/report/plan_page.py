@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -15,12 +14,14 @@ from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
+from rigkit.report import svg
+from rigkit.report.board_sheet import black_squares
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import drawing, render, shown_table
 
 VIEW_WIDTH = 320.0
 """Width of a drawn view, in units of the drawing."""
-PAPER, SEEN, FRAME = "#e6550d", "#1f4e8c", "#b8c0cc"
+PAPER, SEEN = "#e6550d", "#1f4e8c"
 CIRCLE_CORNERS = 12
 MAX_DOTS = 1500
 """More corners taken so far make the drawing black: of more, a part is drawn."""
@@ -80,21 +81,19 @@ def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
     view, camera = plan.views[index], plan.knowledge.camera
     zoom = VIEW_WIDTH / camera.size_px[0]
     height = zoom * camera.size_px[1]
-    title = escape(str(placement(camera, view.board, view.cam_from_board)))
+    where = placement(camera, view.board, view.cam_from_board)
     out = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="-1 -1 {VIEW_WIDTH + 2:g} {height + 2:.1f}" role="img">'
-        f'<title>{title}</title><rect width="{VIEW_WIDTH:g}" height="{height:.1f}" fill="#fbfcfd" stroke="{FRAME}"/>'
+        svg.opened(str(where), f"-1 -1 {VIEW_WIDTH + 2:g} {height + 2:.1f}")
+        + f'<rect width="{VIEW_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}" stroke="{svg.RIM_COLOUR}"/>'
     ]
     if taken is not None and len(taken):
-        dots = zoom * taken[:: -(-len(taken) // MAX_DOTS)]
-        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in dots)
+        path = svg.dots(zoom * taken[:: -(-len(taken) // MAX_DOTS)])
         out.append(f'<path d="{path}" stroke="{SEEN}" stroke-opacity="0.35" stroke-width="2" stroke-linecap="round"/>')
     out += [
         f'<path d="{_path(zoom * square)}Z" fill="{PAPER}" fill-opacity="0.75"/>'
         for square in printed_outlines(camera, view.board, view.cam_from_board)
     ]
-    outline = placement(camera, view.board, view.cam_from_board).outline_px
-    out.append(f'<path d="{_path(zoom * outline)}Z" fill="none" stroke="{PAPER}" stroke-width="2"/></svg>')
+    out.append(f'<path d="{_path(zoom * where.outline_px)}Z" fill="none" stroke="{PAPER}" stroke-width="2"/></svg>')
     return "".join(out)
 
 
@@ -102,15 +101,8 @@ def printed_outlines(camera: Camera, board: Board, cam_from_board: Rigid3) -> li
     """Return the outlines (K, 2) in the image of what is printed on a board, of what the lens sees whole."""
     ink = board.ink()
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    rectangles = [ink.rectangles]
-    if ink.first_black is not None:
-        row, column = np.mgrid[: board.rows + 1, : board.columns + 1].reshape(2, -1)
-        black = (row + column) % 2 == int(not ink.first_black)
-        side = np.array(board.squares_mm)
-        first = (np.stack([column[black], row[black]], axis=-1) - 1.0) * side
-        rectangles.append(np.concatenate([first, np.broadcast_to(side, first.shape)], axis=1))
     out = []
-    boxes = np.concatenate(rectangles)
+    boxes = np.concatenate([ink.rectangles, black_squares(board, ink)])
     turn = np.linspace(0.0, 2.0 * np.pi, CIRCLE_CORNERS, endpoint=False)
     round_ = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     for flat in (
@@ -124,8 +116,7 @@ def printed_outlines(camera: Camera, board: Board, cam_from_board: Rigid3) -> li
 
 
 def _path(pixels: Pixels) -> str:
-    seen = pixels[np.isfinite(pixels).all(axis=1)]
-    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in seen)
+    return svg.line(pixels[np.isfinite(pixels).all(axis=1)])
 
 
 def plan_facts(plan: Plan, found: Sequence[Table] = ()) -> PageFacts:

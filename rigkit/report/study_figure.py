@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.report.figures import new_figure
 from rigkit.study.study import STUDY_PLANES
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 METHOD_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee")
-FORMATS = ("png", "pdf", "svg")
 
 
 def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
@@ -20,16 +20,12 @@ def study_figure(table: StudyTable, file_format: str = "png") -> bytes:
     Boxes are grouped by noise level where there are several, one box a method; whiskers as in `StudyCell`.
     A study of one pose type and one method shows all planes together.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     study = table.study
     planes = [ALL_PLANES] if len(study.pose_types) == 1 else [*range(1, STUDY_PLANES + 1)]
     rows, columns = len(study.pose_types), len(planes)
     width = max(4.2, 0.28 * len(study.sigmas) * len(study.methods) + 1.5)
-    figure = Figure(figsize=(min(max(width * columns, 6.2), 13.0), 3.0 * rows + 0.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    figure = new_figure(min(max(width * columns, 6.2), 13.0), 3.0 * rows + 0.8, layout="constrained")
+    axes: Any = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for r, pose_type in enumerate(study.pose_types):
         for c, plane in enumerate(planes):
             axis = axes[r, c]

@@ -1,0 +1,58 @@
+"""Pieces of SVG that the drawings of pages share, and round numbers for their axes and scales."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray
+
+RIM_COLOUR, GROUND_COLOUR, WORDS_COLOUR = "#b8c0cc", "#fbfcfd", "#333"
+ROUND = (1.0, 2.0, 5.0, 10.0)
+
+
+def opened(title: str, box: str, *, size: float = 13, more: str = "") -> str:
+    """Return the start of a drawing with the viewBox `box`, letters of `size` and `more` attributes."""
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-family="sans-serif" '
+        f'font-size="{size:g}"{more and f" {more}"}><title>{escape(title)}</title>'
+    )
+
+
+def words(x: float, y: float, text: str, anchor: str = "start", colour: str = WORDS_COLOUR) -> str:
+    """Return a line of text."""
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{colour}">{escape(text)}</text>'
+
+
+def line(points: FloatArray | Sequence[FloatArray]) -> str:
+    """Return the path through points (N, 2)."""
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+
+
+def dots(at: FloatArray) -> str:
+    """Return a path of a dot at each of (N, 2), for strokes with round ends."""
+    return "".join(f"M{x:.1f} {y:.1f}h0" for x, y in at)
+
+
+def strokes(start: FloatArray, by: FloatArray) -> str:
+    """Return a path of a stroke from each `start` (N, 2), `by` (N, 2) long."""
+    return "".join(f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(start, by, strict=True))
+
+
+def round_up(value: float, steps: Sequence[float] | NDArray[np.float64] = ROUND) -> float:
+    """Return the next of `steps` (of one to ten) times a power of ten that is no less."""
+    power = _power(value)
+    return float(next(m * power for m in steps if m * power >= value * (1.0 - 1e-12)))
+
+
+def round_down(value: float) -> float:
+    """Return the next of 1, 2, 5 times a power of ten that is no more."""
+    power = _power(value)
+    return float(max(m * power for m in ROUND if m * power <= value * (1.0 + 1e-12)))
+
+
+def _power(value: float) -> float:
+    return float(10.0 ** np.floor(np.log10(max(value, 1e-12))))
