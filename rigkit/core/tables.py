@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from rigkit.core.errors import InputError
 
-HEAD = re.compile(r"(?P<label>.*?)(?: \[(?P<unit>.*)\])?(?: \.(?P<decimals>\d))?")
+COLUMN_HEAD = re.compile(r"(?P<label>.*?)(?: \[(?P<unit>.*)\])?(?: \.(?P<decimals>\d))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Table:
 def columns(heads: str) -> tuple[Column, ...]:
     """Return the columns of their heads, such as "pair | points .0 | angle error [deg] | baseline [mm] .2": label, unit
     and decimals. Labels that a person chose are no part of such words: they make a `Column`."""
-    found = [HEAD.fullmatch(head.strip()) for head in heads.split("|")]
+    found = [COLUMN_HEAD.fullmatch(head.strip()) for head in heads.split("|")]
     return tuple(Column(m["label"], m["unit"] or "", int(m["decimals"] or 3)) for m in found if m is not None)
 
 

@@ -34,7 +34,7 @@ IMAGE_RINGS = 12
 """Rings of equal numbers of corners, each with its own RMS."""
 CURVE_POINTS = 120
 TICKS = (1.0, 2.0, 2.5, 5.0, 10.0)
-FINE = np.arange(1.0, 10.1, 0.5)
+HALF_STEPS = np.arange(1.0, 10.1, 0.5)
 
 
 Value = TypeVar("Value", float, FloatArray)
@@ -139,7 +139,7 @@ def radius_svg(calibration: Calibration) -> str:
     centre = 0.5 * (np.array(calibration.camera.size_px) - 1.0)
     radius, error = np.linalg.norm(pixels - centre, axis=1), np.linalg.norm(residuals, axis=1)
     top = round_up(float(np.quantile(error, 0.995)))
-    reach = round_up(float(np.linalg.norm(centre)), FINE)
+    reach = round_up(float(np.linalg.norm(centre)), HALF_STEPS)
     plot = _Plot(
         "error against radius", (0.0, reach), (0.0, top), ("distance from the image's centre, px", "error, px")
     )
@@ -162,7 +162,7 @@ def histogram_svg(calibration: Calibration) -> str:
     _, residuals = _kept(calibration)
     values = residuals.reshape(-1)
     sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
-    reach = round_up(max(4.0 * sigma, 1e-6), FINE)
+    reach = round_up(max(4.0 * sigma, 1e-6), HALF_STEPS)
     counts, edges = np.histogram(values, BINS, (-reach, reach))
     step = edges[1] - edges[0]
     x = np.linspace(-reach, reach, CURVE_POINTS)
@@ -194,7 +194,7 @@ def lens_svg(calibration: Calibration) -> str:
     radius = np.linalg.norm(pixels - axis, axis=1)
     band = projection_uncertainty(calibration, pixels).worst_px
     focal = float(np.gradient(radius, np.radians(angle))[1])
-    reach, top = round_up(float(angle.max()), FINE), round_up(float(radius.max()), FINE)
+    reach, top = round_up(float(angle.max()), HALF_STEPS), round_up(float(radius.max()), HALF_STEPS)
     plot = _Plot("the lens", (0.0, reach), (0.0, top), ("angle off the axis, deg", "distance from its centre, px"))
     theta = np.linspace(0.0, reach, CURVE_POINTS)
     for curve, dashes in (
