@@ -8,7 +8,7 @@ changes from image to image is one of them far above the others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,8 +67,16 @@ WAYS = {
 
 
 NO_CHANGE = "columns"
-"""No camera reads its image column by column: what fits that as well as rows is neither, but a lens or board unlike its
+"""No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
 model."""
+MOTION = ("rows", NO_CHANGE)
+MOVED = _Way(
+    "boards or the camera moved while the image was read (rolling shutter)",
+    WAYS["rows"].remedy,
+)
+"""A pose that follows a sheared board leaves nearly the same of a motion over rows as of one over columns. Where rows
+are best, and both explain the images far better than all else, it was a motion, unless a bend of each board is the main
+part, too: a lens or board unlike its model shows as that."""
 
 
 def changing(calibration: Calibration, correlation: float) -> list[Finding]:
@@ -78,17 +86,30 @@ def changing(calibration: Calibration, correlation: float) -> list[Finding]:
     if not changes:
         return []
     best = min(changes, key=lambda way: changes[way].criterion)
-    found = changes[best]
-    others = [0.0, *(change.criterion for way, change in changes.items() if way != best)]
-    if (
-        best not in WAYS
-        or found.ratio < MIN_VARIANCE_RATIO
-        or found.share < MIN_SHARE_EXPLAINED
-        or min(others) - found.criterion < max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
+    if best in WAYS and _leads(changes, best):
+        way, share = WAYS[best], changes[best].share
+    elif (
+        best == "rows"
+        and all(_leads(changes, way, but=MOTION) for way in MOTION)
+        and changes["bend"].share < MIN_SHARE_EXPLAINED
     ):
+        way, share = MOVED, changes[best].share
+    else:
         return []
-    message = f"{WAYS[best].message}: that explains {100.0 * found.share:.0f} % of the squares of all residuals"
-    return [Finding(severity=Severity.LOOK, message=message, remedy=WAYS[best].remedy)]
+    message = f"{way.message}: that explains {100.0 * share:.0f} % of the squares of all residuals"
+    return [Finding(severity=Severity.LOOK, message=message, remedy=way.remedy)]
+
+
+def _leads(changes: Mapping[str, ViewChange], way: str, but: Collection[str] = ()) -> bool:
+    """Say whether a way to change is the main part of the residuals, far above all others but those of `but`."""
+    found = changes[way]
+    others = [0.0, *(change.criterion for name, change in changes.items() if name != way and name not in but)]
+    lead = max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
+    return (
+        found.ratio >= MIN_VARIANCE_RATIO
+        and found.share >= MIN_SHARE_EXPLAINED
+        and min(others) - found.criterion >= lead
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
@@ -223,7 +224,7 @@ def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
     [
         ("focus", "the focal length differs from image to image"),
         ("shift", "the picture is shifted on the sensor"),
-        ("rows", "row by row (rolling shutter)"),
+        ("rows", "(rolling shutter)"),
         ("bend", "the board is bent otherwise in every image"),
     ],
 )
@@ -234,6 +235,26 @@ def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.G
     named = [result for result in results if changing_in(result)]
     assert len(named) >= 3
     assert all(words in str(result.verdicts) for result in named), [str(result.verdicts[0]) for result in named]
+
+
+def test_boards_in_hand_that_move_while_rows_are_read(rng: np.random.Generator) -> None:
+    """Moved by 3 to 24 px, poses follow so much of it that columns fit nearly as well as rows: it is named all the same
+    in half of the sessions, and never something else."""
+    camera, named = Pinhole(SIZE, np.array([1364.0, 1364.0, 815.0, 617.0])), 0
+    for _ in range(8):
+        views = []
+        for view, turn, shift in zip(*random_views(camera, 14, rng, reach_deg=30.0, tilt_deg=(0.0, 35.0)), strict=True):
+            points, pixels = BOARD.points() @ turn.T + shift, view.pixels
+            way = rng.uniform(0.0, 2.0 * np.pi)
+            move = rng.uniform(3.0, 24.0) * shift[2] / 1364.0 * np.array([np.cos(way), np.sin(way), 0.0])
+            for _ in range(8):
+                pixels, _ = camera.project(points + (pixels[:, 1:] / SIZE[1] - 0.5) * move)
+            noisy = np.clip(pixels + 0.02 * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
+            views.append(replace(view, pixels=noisy))
+        found = changing_in(calibrate(views, SIZE))
+        assert all("(rolling shutter)" in finding.message for finding in found)
+        named += len(found)
+    assert named >= 4
 
 
 @pytest.mark.parametrize("way", ["focus", "shift", "rows", "bend"])
