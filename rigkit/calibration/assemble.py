@@ -15,7 +15,6 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.solver import with_priors
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Points
@@ -69,7 +68,7 @@ def assemble(
 def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tuple[FloatArray, Clustered]:
     """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
     the independent units, and what the images said."""
-    normal = solution_normal(fit)
+    normal = fit.normal
     p = fit.state.camera.parameters.size
     # A warp may hide in the lens: an aspect ratio of the board in that of the pixels.
     n = p + fit.state.shape.basis.shape[-1]
@@ -104,11 +103,6 @@ def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
     return tuple(out)
 
 
-def solution_normal(fit: Fit) -> NormalEquations:
-    """Return the normal equations at the solution, in px^-2, priors of the shape included."""
-    return with_priors(fit.data, fit.state, fit.sigma_px)
-
-
 def motion_of_world(translation_mm: Points) -> FloatArray:
     """Return how the motions (dw, dt) of boards at `translation_mm` (V, 3) become motions (W, T) of the world,
     (V, 6, 6).
@@ -129,7 +123,7 @@ def frame_covariance(normal: NormalEquations, state: State, count: int) -> Float
     The boards on average move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
     """
     p = count
-    globals_, back, own = normal.covariance()
+    globals_, back, own = normal.covariance
     used = normal.pp.trace(axis1=-2, axis2=-1) > 0.0
     lever = motion_of_world(state.translation_mm[used]) / max(int(used.sum()), 1)
     through = lever.transpose(1, 0, 2).reshape(6, -1) @ back[used].reshape(-1, len(globals_))
@@ -149,11 +143,10 @@ def identifiable(fit: Fit) -> bool:
     A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may look told when its tiny
     effects are compared with each other. Then its standard deviation leads out of the model on both sides.
     """
-    normal = solution_normal(fit)
-    if not normal.identifiable:
+    if not fit.normal.identifiable:
         return False
     camera = fit.state.camera
-    sigma = fit.sigma_px * np.sqrt(np.diag(normal.covariance()[0])[: camera.parameters.size])
+    sigma = fit.sigma_px * np.sqrt(np.diag(fit.normal.covariance[0])[: camera.parameters.size])
     # Models limit each parameter by itself: where all steps at once lead to a camera, each alone does.
     return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
 

@@ -94,6 +94,8 @@ def between_models(
     motion of the boards; `sigmas` (P,) are the standard deviations of the parameters without that."""
     p = chosen.state.camera.parameters.size
     out = np.zeros((p + 6, p + 6))
+    if not rivals:
+        return out
     points, _ = chosen.state.points_in_cam(observations)
     rays = spread_rays(points[chosen.kept])
     here = chosen.state

@@ -86,7 +86,7 @@ def _look(message: str, remedy: str) -> Finding:
 
 def _axes(c: Calibration, axis: int) -> FloatArray:
     """Return the axis of every board in the camera frame, (V, 3)."""
-    return np.array([v.cam_from_board.rotation[:, axis] for v in c.views])
+    return c.corners.rotation[:, :, axis]
 
 
 def _tilts(c: Calibration) -> list[Finding]:

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.core.arrays import FloatArray, IntArray
 
 MIN_CLUSTERS = 4
@@ -57,7 +58,7 @@ def reduced_by_cluster(products: FloatArray, count: int, cluster: IntArray) -> t
     `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) numbers the clusters.
     """
     coupling, pose = products[:, :count, count : count + 6], products[:, count : count + 6, count : count + 6]
-    back = coupling @ np.linalg.pinv(pose, hermitian=True)
+    back = coupling @ pose_inverses(pose)
     total = int(cluster.max()) + 1
     information, score = np.zeros((total, count, count)), np.zeros((total, count))
     np.add.at(information, cluster, products[:, :count, :count] - back @ np.swapaxes(coupling, -1, -2))

@@ -21,19 +21,15 @@ inadequacy as a random function beside its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
-from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.cameras.base import image_center
+from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
+from rigkit.kernels.departures import DISPLACEMENTS, POSE, RADIAL_POWERS, LensCorners, displacements
 
-RADIAL_POWERS = (2, 4, 6, 8, 10)
-"""Powers of the radius by which the image is stretched: no model has more terms that tell."""
-DISPLACEMENTS = len(RADIAL_POWERS) + 8
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
 """A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
 smaller than the first are rounding, and tell nothing."""
@@ -41,8 +37,6 @@ SIZES_TRIED = 8
 """So many sizes between them are tried."""
 ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
 """Of at least so many corners every second (third ...) is taken, where as many of each view are left."""
-CORNERS_AT_A_TIME = 8192
-"""Their derivatives then stay in the cache, and memory does not grow with the views."""
 RIDGE = 1e-12
 """Added to the information of parameters, as a part of its mean: those that do not move take up nothing."""
 
@@ -79,33 +73,6 @@ class Departures:
         return displacements(pixels, self.size_px) - np.swapaxes(np.swapaxes(own, 1, 2) @ self.followed, 1, 2)
 
 
-def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
-    """Return the displacements (2, J, M) at pixels (M, 2), px: of about one px in the corners of the image."""
-    out = np.zeros((2, DISPLACEMENTS, len(pixels)))
-    _displace(out, pixels[:, 0], pixels[:, 1], size_px)
-    return out
-
-
-def _displace(out: FloatArray, u: FloatArray, v: FloatArray, size_px: tuple[int, int]) -> None:
-    """Write the displacements at (u, v), (M,) each, into `out` (2, J, M), which is zero."""
-    centre, scale = image_center(size_px), 2.0 / np.hypot(*size_px)
-    x, y = (u - centre[0]) * scale, (v - centre[1]) * scale
-    xx, xy, yy = x * x, x * y, y * y
-    square = xx + yy
-    np.multiply(square, x, out=out[0, 0])
-    np.multiply(square, y, out=out[1, 0])
-    for j in range(1, len(RADIAL_POWERS)):
-        np.multiply(square, out[:, j - 1], out=out[:, j])
-    # Decentring (tangential distortion), thin prisms, these again with the square of the radius, aspect ratio, shear.
-    k = len(RADIAL_POWERS)
-    out[0, k], out[1, k] = square + 2.0 * xx, 2.0 * xy
-    out[0, k + 1], out[1, k + 1] = out[1, k], square + 2.0 * yy
-    out[0, k + 2] = out[1, k + 3] = square
-    out[0, k + 4] = out[1, k + 5] = square * square
-    out[0, k + 6], out[1, k + 6] = x, -y
-    out[0, k + 7], out[1, k + 7] = y, x
-
-
 def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     """Return E[a a^T] (J, J) of amounts a of which the images give the information (J, J) and the score (J,), averaged
     over the sizes that those along the radius, and the others, may have beforehand."""
@@ -115,7 +82,7 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     # The middles of so many equal parts.
     sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, 2 * SIZES_TRIED + 1)[1::2]
     along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
-    prior = np.where(np.arange(DISPLACEMENTS) < len(RADIAL_POWERS), along[:, None], others[:, None])
+    prior = np.where(np.arange(DISPLACEMENTS) < RADIAL_POWERS, along[:, None], others[:, None])
     scaled = np.eye(DISPLACEMENTS) + prior[:, :, None] * information * prior[:, None, :]
     root = np.linalg.cholesky(scaled)
     variance = np.linalg.inv(scaled) * prior[:, :, None] * prior[:, None, :]
@@ -131,55 +98,32 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
 def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, int]:
     """Return the sums of products (K, K) of derivatives by the parameters in units of `sigmas` (P,), the displacements
     and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the parameters."""
-    views = [view for view in calibration.views if view.kept.any()]
-    each = len(sigmas) + DISPLACEMENTS + 1
-    if not views:
-        return np.zeros((each, each)), 0
-    kept = [np.flatnonzero(view.kept) for view in views]
-    # Of very many corners some tell enough.
-    fewest, total = min(len(own) for own in kept), sum(len(own) for own in kept)
-    every = max(1, min(total // ENOUGH_CORNERS, fewest // CORNERS_OF_VIEW))
-    used = [own[::every] for own in kept]
-    count = np.array([len(own) for own in used])
-    out, with_pose = np.zeros((each, each)), np.empty((len(views), each + 6, 6))
-    block = np.cumsum(count) // CORNERS_AT_A_TIME
-    for number in np.unique(block):
-        chosen = np.flatnonzero(block == number)
-        rows = _rows(calibration, [(views[k], used[k]) for k in chosen], sigmas)
-        for part in rows:
-            out += part[6:] @ part[6:].T
-        stop = 0
-        for k in chosen:
-            own = slice(stop, stop + count[k])
-            stop = own.stop
-            with_pose[k] = rows[0, :, own] @ rows[0, :6, own].T + rows[1, :, own] @ rows[1, :6, own].T
-    coupling = with_pose[:, 6:]
-    back = pose_inverses(with_pose[:, :6]) @ np.swapaxes(coupling, 1, 2)
-    out -= coupling.transpose(1, 0, 2).reshape(each, -1) @ back.reshape(-1, each)
-    return out, int(2 * count.sum()) - 6 * len(count)
+    corners, camera = calibration.corners, calibration.camera
+    used, count = _enough(np.flatnonzero(corners.kept), corners.view)
+    view = corners.view[used]
+    rotation = np.ascontiguousarray(corners.rotation.transpose(1, 2, 0))
+    lever = (rotation[..., view] * corners.points_mm[used].T).sum(axis=1)
+    x, y, z = lever + corners.translation_mm.T[:, view]
+    by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
+    u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
+    residuals = corners.residuals_px[used]
+    # Corners that do not project tell nothing.
+    told = valid & np.isfinite(residuals).all(axis=1)
+    rows = LensCorners.make(by_point, by_parameters, sigmas, lever, (u, v), residuals, told, count, camera.size_px)
+    with_pose, out = rows.products()
+    coupling = with_pose[:, POSE:]
+    back = pose_inverses(with_pose[:, :POSE]) @ np.swapaxes(coupling, 1, 2)
+    out -= coupling.transpose(1, 0, 2).reshape(len(out), -1) @ back.reshape(-1, len(out))
+    return out, 2 * len(used) - POSE * len(count)
 
 
-def _rows(calibration: Calibration, used: Sequence[tuple[ViewResult, IntArray]], sigmas: FloatArray) -> FloatArray:
-    """Return for the corners used of some views (2, K, N): derivatives by the view's pose (6), by the parameters, the
-    displacements, the residual. Corners that do not project are zero."""
-    shapes = {board.board_id: board for board in calibration.boards}
-    points = np.concatenate([shapes[v.board_id].at(v.grid[own]) for v, own in used])
-    view = np.repeat(np.arange(len(used)), [len(own) for _, own in used])
-    rotation = np.array([one.cam_from_board.rotation for one, _ in used]).transpose(1, 2, 0)[..., view]
-    lever = (rotation * points.T).sum(axis=1)
-    in_cam = lever + np.array([one.cam_from_board.translation_mm for one, _ in used]).T[:, view]
-    p = len(sigmas)
-    rows = np.zeros((2, 6 + p + DISPLACEMENTS + 1, len(points)))
-    by_point = rows[:, 3:6]
-    u, v, valid = calibration.camera.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        np.multiply(lever[i], by_point[:, j], out=rows[:, k])
-        rows[:, k] -= lever[j] * by_point[:, i]
-    rows[:, 6 : 6 + p] *= sigmas[:, None]
-    _displace(rows[:, 6 + p : -1], u, v, calibration.camera.size_px)
-    rows[:, -1] = np.concatenate([one.residuals_px[own] for one, own in used]).T
-    told = valid & np.isfinite(rows[:, -1]).all(axis=0)
-    if not told.all():
-        rows[..., ~told] = 0.0
-    return rows
+def _enough(kept: IntArray, view: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the corners to take of those `kept` (N,), by their numbers, and how many they are of every view that has
+    any: of very many corners some tell enough. `view` is that of each corner."""
+    count = np.bincount(view[kept])
+    count = count[count > 0]
+    every = max(1, min(len(kept) // ENOUGH_CORNERS, int(count.min(initial=len(kept))) // CORNERS_OF_VIEW))
+    if every == 1:
+        return kept, count
+    place = np.arange(len(kept)) - np.repeat(np.cumsum(count) - count, count)
+    return kept[place % every == 0], -(-count // every)

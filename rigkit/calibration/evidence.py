@@ -119,6 +119,6 @@ def _variance(state: State, normal: NormalEquations) -> FloatArray:
     matrix of thousands."""
     count, first = state.shape.count, state.shape.basis.shape[-1]
     if state.shape.kind == "warp":
-        return np.diag(normal.covariance()[0])[-count:]
+        return np.diag(normal.covariance[0])[-count:]
     own = np.diagonal(np.linalg.inv(_own_blocks(normal, (count - first) // 3)), axis1=-2, axis2=-1)
     return np.concatenate([np.zeros(first), own.ravel()])

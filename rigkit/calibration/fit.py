@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import solve
+from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of
@@ -43,7 +44,7 @@ MAX_SCATTER_OF_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """A solved model: its state, the normal equations of the corners there, without priors, the corners kept (V, C),
     sigma per coordinate of a corner, how the solver ended."""
@@ -61,6 +62,11 @@ class Fit:
     def norm(self, observations: Observations) -> FloatArray:
         """Return the weighted 2-D residuals (V, C) in px."""
         return self.residuals.weighted(observations)
+
+    @cached_property
+    def normal(self) -> NormalEquations:
+        """The normal equations in px^-2, priors included."""
+        return with_priors(self.data, self.state, self.sigma_px)
 
     @property
     def residuals(self) -> Residuals:

@@ -36,8 +36,7 @@ def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
     _, first = np.unique(number, return_index=True)
     if len(first) < 2 * MIN_PARTNERS:
         return []
-    rotation = np.array([view.cam_from_board.rotation for view in views])
-    centre = np.array([view.cam_from_board.translation_mm for view in views])
+    rotation, centre = calibration.corners.rotation, calibration.corners.translation_mm
     boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
     start, end = _partners(rotation, centre, boards, number)
     alike = len(np.unique(number[start]))
@@ -85,11 +84,10 @@ def _partners(
     middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
     turn = rotation[j[middle]] @ rotation[i[middle]].T
     landed = (points - centre[i[middle]]) @ turn.T + centre[j[middle]]
-    squared = np.zeros((len(points), len(points)))
-    for one, other in zip(landed.reshape(-1, 12).T, points.reshape(-1, 12).T, strict=True):
-        squared += (one[:, None] - other) ** 2
-    end = squared.argmin(axis=1)
-    found = np.flatnonzero(squared.min(axis=1) < reach**2)
+    one, other = landed.reshape(-1, 12), points.reshape(-1, 12)
+    # |a - b|^2 - |a|^2, all of them as one product.
+    end = ((other**2).sum(axis=1) - 2.0 * one @ other.T).argmin(axis=1)
+    found = np.flatnonzero(((one - other[end]) ** 2).sum(axis=1) < reach**2)
     found = found[(boards[found] == boards[end[found]]) & (number[found] != number[end[found]])]
     return found, end[found]
 

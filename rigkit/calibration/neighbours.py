@@ -9,13 +9,12 @@ from rigkit.calibration.result import Calibration
 
 def neighbour_correlation(c: Calibration) -> float:
     """Return the correlation of the residuals of corners next to each other on their board, kept ones; 0 if none is."""
-    grid = np.concatenate([v.grid for v in c.views])
-    kept = np.concatenate([v.kept for v in c.views])
-    view = np.repeat(np.arange(len(c.views)), [len(v.grid) for v in c.views])
+    corners = c.corners
+    kept, grid = corners.kept, corners.grid
     columns, rows = (grid.max(axis=0) + 1).tolist()
     lattice, there = np.zeros((len(c.views) * rows * columns, 2)), np.zeros(len(c.views) * rows * columns)
-    place = ((view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
-    lattice[place], there[place] = np.concatenate([v.residuals_px for v in c.views])[kept], 1.0
+    place = ((corners.view * rows + grid[:, 1]) * columns + grid[:, 0])[kept]
+    lattice[place], there[place] = corners.residuals_px[kept], 1.0
     lattice, there = lattice.reshape(-1, rows, columns, 2), there.reshape(-1, rows, columns)
     squared = lattice[..., 0] ** 2 + lattice[..., 1] ** 2
     products, power = 0.0, 0.0

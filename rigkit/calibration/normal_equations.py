@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Residuals:
         return length if self.valid.all() else np.where(self.valid | ~observations.present, length, np.inf)
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class NormalEquations:
     """Blocks of J^T W J and J^T W r: g for the G globals, p for the 6 numbers of each of V poses.
 
@@ -161,16 +162,17 @@ class NormalEquations:
     def identifiable(self) -> bool:
         """Whether the equations tell every global from the others at all: combinations of which they say less than the
         arithmetic can resolve have no inverse, and no covariance."""
-        variance = np.diag(self.covariance()[0])
-        back = pose_inverses(self.pp) @ np.swapaxes(self.gp, -1, -2)
+        inverse, back, _ = self.covariance
+        variance = np.diag(inverse)
         # Against what it would be if all other globals were known.
         alone = np.diag(self.gg) - np.einsum("vgi,vig->g", self.gp, back)
         inflated = variance * alone
         limit = 1.0 / (len(inflated) * np.finfo(float).eps)
         return bool((np.isfinite(inflated) & (inflated > 0.0) & (inflated < limit)).all())
 
+    @cached_property
     def covariance(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
+        """S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
         for unit residuals is cov(g) = S^-1, cov(p_v, g) = -W_v S^-1, cov(p_v, p_u) = W_v S^-1 W_u^T + [v = u] pp_v^-1.
 
         Directions that the data leave open get the pseudo-inverse's zero only after scaling to unit diagonal.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -198,8 +200,12 @@ class BoardShape:
 
     def at(self, grid: IntArray) -> Points:
         """Return the corners (N, 3) at places of the grid (N, 2), column and row."""
-        columns = self.board.columns if self.declared is None else self.declared.columns
-        return np.asarray(self.points_mm[grid @ np.array([1, columns])])
+        return np.asarray(self.points_mm[grid @ np.array([1, self.column_count])])
+
+    @property
+    def column_count(self) -> int:
+        """Number of corners in a row."""
+        return self.board.columns if self.declared is None else self.declared.columns
 
     @property
     def board(self) -> Board:
@@ -241,6 +247,51 @@ def _chessboard_of(board_id: str, points_mm: Points) -> Board:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class CalibrationCorners:
+    """All corners of the views of a calibration, outliers too, one view after the other.
+
+    Attributes
+    ----------
+    count : (V,) corners of each view.
+    view : (N,) the view of each corner.
+    grid, pixels, residuals_px, kept : (N, 2), (N, 2), (N, 2) and (N,), as of the views.
+    points_mm : (N, 3) the corners on their boards, as the solution has those.
+    rotation, translation_mm : (V, 3, 3) and (V, 3), cam_from_board of each view.
+    """
+
+    count: IntArray
+    view: IntArray
+    grid: IntArray
+    pixels: Pixels
+    residuals_px: FloatArray
+    kept: BoolArray
+    points_mm: Points
+    rotation: FloatArray
+    translation_mm: Points
+
+    @classmethod
+    def of(cls, views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> Self:
+        count = np.array([len(view.grid) for view in views])
+        number = {board.board_id: k for k, board in enumerate(boards)}
+        shown = np.array([number[view.board_id] for view in views])
+        first = np.cumsum([0, *(len(board.points_mm) for board in boards)])[:-1]
+        view, grid = np.repeat(np.arange(len(views)), count), np.concatenate([view.grid for view in views])
+        columns = np.array([board.column_count for board in boards])
+        row = first[shown][view] + grid[:, 1] * columns[shown][view] + grid[:, 0]
+        return cls(
+            count=count,
+            view=view,
+            grid=grid,
+            pixels=np.concatenate([view.pixels for view in views]),
+            residuals_px=np.concatenate([view.residuals_px for view in views]),
+            kept=np.concatenate([view.kept for view in views]),
+            points_mm=np.concatenate([board.points_mm for board in boards])[row],
+            rotation=np.array([view.cam_from_board.rotation for view in views]),
+            translation_mm=np.array([view.cam_from_board.translation_mm for view in views]),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Calibration:
     """A calibrated camera with everything a person needs to judge it.
 
@@ -311,6 +362,11 @@ class Calibration:
             *(f"  {finding}" for finding in self.verdicts[:1]),
         ]
         return "\n".join(lines)
+
+    @cached_property
+    def corners(self) -> CalibrationCorners:
+        """All corners of all views."""
+        return CalibrationCorners.of(self.views, self.boards)
 
     @property
     def parameter_sigmas(self) -> FloatArray:

@@ -25,12 +25,13 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.departures import DISPLACEMENTS, Departures
+from rigkit.calibration.departures import Departures
 from rigkit.calibration.result import Calibration, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays
 from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.kernels.departures import DISPLACEMENTS
 
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
@@ -115,8 +116,7 @@ class FarProjection:
         corners used, where they are known: it saves the way back from the pixels."""
         camera = calibration.camera
         if points_in_cam is None:
-            kept = np.concatenate([view.kept for view in calibration.views])
-            pixels = np.concatenate([view.pixels for view in calibration.views])[kept]
+            pixels = calibration.corners.pixels[calibration.corners.kept]
             rays, valid = camera.unproject(pixels[_spread(len(pixels))])
             rays = rays[valid]
         else:
@@ -130,7 +130,8 @@ class FarProjection:
         departures, pixels = Departures.of(calibration), camera.project(rays)[0]
         beyond = departures.left_over(pixels, design).transpose(1, 0, 2).reshape(DISPLACEMENTS, -1)
         hidden = np.concatenate([sigmas[:, None] * there[:p], beyond]).T
-        hides = np.asarray(np.linalg.lstsq(there[p:].T, hidden, rcond=None)[0], dtype=np.float64)
+        turned = there[p:]
+        hides = np.linalg.pinv(turned @ turned.T, hermitian=True) @ (turned @ hidden)
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         return cls(
             camera=camera,

@@ -179,8 +179,7 @@ def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
 def _coverage(c: Calibration) -> list[Finding]:
     """Name the cells of the image that no board reached, where the lens has an image at all."""
     width, height = c.camera.size_px
-    kept = np.concatenate([v.kept for v in c.views])
-    pixels = np.concatenate([v.pixels for v in c.views])[kept]
+    pixels = c.corners.pixels[c.corners.kept]
     size = np.array([width / CELLS[0], height / CELLS[1]])
     cell = np.clip((pixels / size).astype(np.int64), 0, np.array(CELLS) - 1)
     count = np.bincount(cell[:, 0] * CELLS[1] + cell[:, 1], minlength=CELLS[0] * CELLS[1]).reshape(CELLS)
@@ -213,15 +212,15 @@ def _cell(c: Calibration, pixel: FloatArray) -> str:
 def _views(c: Calibration) -> list[Finding]:
     if len(c.views) < 3:
         return []
-    lengths = np.array([len(v.grid) for v in c.views])
-    out = lengths - [np.count_nonzero(v.kept) for v in c.views]
+    lengths = c.corners.count
+    out = np.bincount(c.corners.view[~c.corners.kept], minlength=len(lengths))
     # Of all corners: a view that is bad throughout has its worst corners among the outliers.
-    residual = np.hypot(*np.nan_to_num(np.concatenate([v.residuals_px for v in c.views])).T)
+    residual = np.hypot(*np.nan_to_num(c.corners.residuals_px).T)
     middle = _medians(residual, lengths)
     usual = max(float(np.median(middle)), np.finfo(float).tiny)
     times = middle / usual
     if times.max() > MAX_RATIO_OF_MEDIANS:
-        away = np.concatenate([v.pixels for v in c.views]) - image_center(c.camera.size_px)
+        away = c.corners.pixels - image_center(c.camera.size_px)
         there = np.full(len(away), usual)
         for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
             there[ring] = max(float(np.median(residual[ring])), usual)
@@ -292,7 +291,7 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
         return [_bad(what, "take more views, with the board tilted")]
-    pixels = np.concatenate([view.pixels[view.kept] for view in c.views])
+    pixels = c.corners.pixels[c.corners.kept]
     place = pixels[np.linspace(0, len(pixels) - 1, len(inside)).astype(np.int64)[np.nanargmax(inside)]]
     what += f", most in the {_cell(c, place)} of the image"
     return [_bad(what, "take more views there, with the board tilted")]

@@ -181,6 +181,37 @@ EXPORT void edge_shifts(
     double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,
     ARRAY(double, sums, parts, steps + 1), ARRAY(double, out, parts));
 
+/* departures.c */
+
+/* Displacements of an image that models leave out: so many powers of the radius, and of those that are not radial eight
+ * (calibration.departures). A pose has six numbers. */
+enum { RADIAL_POWERS = 5, DISPLACEMENTS = RADIAL_POWERS + 8, POSE = 6 };
+
+/* Corners of boards, view after view so many: their derivatives, what turns with the pose (board corner less the board's
+ * origin, in the camera frame), where they project, the residuals, and which of them tell anything. The derivatives by the
+ * parameters count in units of `sigmas`. */
+typedef struct {
+    ARRAY(const double, d_pixels_d_point, 2, 3, count);
+    ARRAY(const double, d_pixels_d_parameters, 2, parameters, count);
+    ARRAY(const double, sigmas, parameters);
+    ARRAY(const double, lever, 3, count);
+    ARRAY(const double, u, count);
+    ARRAY(const double, v, count);
+    ARRAY(const double, residuals, count, 2);
+    ARRAY(const uint8_t, told, count);
+    ARRAY(const int64_t, counts, views);
+    int64_t count, parameters, views, width, height;
+} lens_corners_t;
+
+EXPORT void displace_pixels(
+    ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
+    ARRAY(double, out, 2, DISPLACEMENTS, count));
+EXPORT int64_t lens_memory(int64_t parameters);
+EXPORT void lens_products(
+    const lens_corners_t *corners, ARRAY(double, memory, lens_memory(corners.parameters)),
+    ARRAY(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
+    ARRAY(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
+
 /* edges.c */
 
 /* How far two pixels lie apart, both ways, whose noise is compared: LAGS pairs, of which the opposite ones are the same.

@@ -11,13 +11,14 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.departures import DISPLACEMENTS, Departures, displacements
+from rigkit.calibration.departures import Departures
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_design, projection_uncertainty
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.io.calibration_file import load_calibration, save_calibration
+from rigkit.kernels.departures import DISPLACEMENTS, displacements
 
 NOISE_PX = 0.02
 

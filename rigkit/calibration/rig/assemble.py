@@ -39,7 +39,7 @@ def assemble_rig(
     observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
-    unit, back, own = normal.covariance()
+    unit, back, own = normal.covariance
     clustered = clustered_by_frame(observations, state, normal, unit, joint.frames, sigma)
     overdispersion = clustered.overdispersion
     covariance = with_block(unit * sigma**2, clustered.covariance, overdispersion**2)

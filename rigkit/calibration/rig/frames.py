@@ -77,13 +77,15 @@ def _targets(own: FrameObservations, places: Places) -> dict[Key, _Target]:
     if not best:
         return {}
     out = {}
+    boards = {entry.board_id: entry.view.board for entry in best.values()}
+    looks = {name: (outer_corners(board), turns_of(board)) for name, board in boards.items()}
     for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
-        corners = outer_corners(entry.view.board)
+        corners, orientations = looks[entry.board_id]
         if entry.board_id in places:
             # Two cameras may know the target by different boards: its own frame has the same points for both.
             out[key] = _Target(rotation, shift, corners.max() * _FRAME, ALONE)
         else:
-            out[key] = _Target(rotation, shift, corners, turns_of(entry.view.board))
+            out[key] = _Target(rotation, shift, corners, orientations)
     return out
 
 

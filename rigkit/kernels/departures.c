@@ -1,0 +1,119 @@
+/* What a lens may do beyond its model: displacements of its image, and the sums of products with what poses and parameters
+ * do. tests/kernels/reference/departures.py says in numpy what is computed. */
+#include "kernels.h"
+
+/* Corners whose rows are made at a time stay in the first cache; of the products four rows by eight stay in registers. */
+enum { CORNERS = 32, ACROSS = 8, DOWN = 4 };
+
+/* Write the displacements of the corner at (x, y), from the middle of the image in units of half its diagonal. */
+INLINE void displace(double x, double y, double u[DISPLACEMENTS], double v[DISPLACEMENTS])
+{
+    const double xx = x * x, xy = x * y, yy = y * y, square = xx + yy;
+    u[0] = square * x;
+    v[0] = square * y;
+    for (int64_t j = 1; j < RADIAL_POWERS; j++) {
+        u[j] = square * u[j - 1];
+        v[j] = square * v[j - 1];
+    }
+    /* Decentring (tangential distortion), thin prisms, these again with the square of the radius, aspect ratio, shear. */
+    const double others_u[] = {square + 2.0 * xx, 2.0 * xy, square, 0.0, square * square, 0.0, x, y};
+    const double others_v[] = {2.0 * xy, square + 2.0 * yy, 0.0, square, 0.0, square * square, -y, x};
+    for (int64_t j = RADIAL_POWERS; j < DISPLACEMENTS; j++) {
+        u[j] = others_u[j - RADIAL_POWERS];
+        v[j] = others_v[j - RADIAL_POWERS];
+    }
+}
+
+EXPORT FOR_EACH_PROCESSOR void displace_pixels(
+    const double *u, const double *v, int64_t count, int64_t width, int64_t height, double *out)
+{
+    const double scale = 2.0 / sqrt((double)(width * width + height * height));
+    for (int64_t n = 0; n < count; n++) {
+        double row_u[DISPLACEMENTS], row_v[DISPLACEMENTS];
+        displace(scale * (u[n] - 0.5 * (double)(width - 1)), scale * (v[n] - 0.5 * (double)(height - 1)), row_u, row_v);
+        for (int64_t j = 0; j < DISPLACEMENTS; j++) {
+            out[j * count + n] = row_u[j];
+            out[(DISPLACEMENTS + j) * count + n] = row_v[j];
+        }
+    }
+}
+
+/* Write both rows of a corner: derivatives by the pose (turn, shift) and the parameters, displacements, residual. */
+INLINE void write_rows(const lens_corners_t *c, double scale, int64_t n, int64_t across, double *row)
+{
+    const int64_t N = c->count, P = c->parameters;
+    double *rows[2] = {row, row + across};
+    const double q[3] = {c->lever[n], c->lever[N + n], c->lever[2 * N + n]};
+    for (int64_t i = 0; i < 2; i++) {
+        const double *J = c->d_pixels_d_point + 3 * N * i + n, *by = c->d_pixels_d_parameters + P * N * i + n;
+        const double j0 = J[0], j1 = J[N], j2 = J[2 * N];
+        double *to = rows[i];
+        to[0] = q[1] * j2 - q[2] * j1;
+        to[1] = q[2] * j0 - q[0] * j2;
+        to[2] = q[0] * j1 - q[1] * j0;
+        to[3] = j0;
+        to[4] = j1;
+        to[5] = j2;
+        for (int64_t k = 0; k < P; k++)
+            to[POSE + k] = c->sigmas[k] * by[k * N];
+        to[POSE + P + DISPLACEMENTS] = c->residuals[2 * n + i];
+    }
+    const double x = scale * (c->u[n] - 0.5 * (double)(c->width - 1)), y = scale * (c->v[n] - 0.5 * (double)(c->height - 1));
+    displace(x, y, rows[0] + POSE + P, rows[1] + POSE + P);
+}
+
+/* Add to the upper triangle of `sums` (across, across), by blocks, the products of `count` rows. */
+INLINE void add_products(const double *rows, int64_t count, int64_t across, double *sums)
+{
+    for (int64_t i = 0; i < across; i += DOWN)
+        for (int64_t j = i - i % ACROSS; j < across; j += ACROSS) {
+            double block[DOWN][ACROSS] = {{0.0}};
+            for (int64_t r = 0; r < count; r++) {
+                const double *left = rows + r * across + i, *right = rows + r * across + j;
+                for (int64_t a = 0; a < DOWN; a++)
+#pragma omp simd
+                    for (int64_t b = 0; b < ACROSS; b++)
+                        block[a][b] += left[a] * right[b];
+            }
+            for (int64_t a = 0; a < DOWN; a++)
+                for (int64_t b = 0; b < ACROSS; b++)
+                    sums[(i + a) * across + j + b] += block[a][b];
+        }
+}
+
+int64_t lens_memory(int64_t parameters)
+{
+    const int64_t across = (POSE + parameters + DISPLACEMENTS + ACROSS) / ACROSS * ACROSS;
+    return across * (across + 2 * CORNERS);
+}
+
+EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *memory, double *with_pose, double *products)
+{
+    const int64_t all = POSE + c->parameters + DISPLACEMENTS + 1, across = (all + ACROSS - 1) / ACROSS * ACROSS;
+    const int64_t kept = all - POSE;
+    const double scale = 2.0 / sqrt((double)(c->width * c->width + c->height * c->height));
+    double *sums = memory, *rows = memory + across * across;
+    memset(products, 0, (size_t)(kept * kept) * sizeof(double));
+    memset(rows, 0, (size_t)(2 * CORNERS * across) * sizeof(double));
+    for (int64_t view = 0, n = 0; view < c->views; view++) {
+        const int64_t stop = n + c->counts[view];
+        memset(sums, 0, (size_t)(across * across) * sizeof(double));
+        while (n < stop) {
+            int64_t used = 0;
+            for (; n < stop && used < CORNERS; n++)
+                if (c->told[n])
+                    write_rows(c, scale, n, across, rows + 2 * across * used++);
+            add_products(rows, 2 * used, across, sums);
+        }
+        double *own = with_pose + all * POSE * view;
+        for (int64_t k = 0; k < all; k++)
+            for (int64_t a = 0; a < POSE; a++)
+                own[k * POSE + a] = k < a ? sums[k * across + a] : sums[a * across + k];
+        for (int64_t i = 0; i < kept; i++)
+            for (int64_t j = i; j < kept; j++)
+                products[i * kept + j] += sums[(POSE + i) * across + POSE + j];
+    }
+    for (int64_t i = 0; i < kept; i++)
+        for (int64_t j = 0; j < i; j++)
+            products[i * kept + j] = products[j * kept + i];
+}

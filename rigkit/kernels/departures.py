@@ -1,0 +1,87 @@
+"""Calls of the kernels in departures.c: what a lens may do beyond its model, and what its images say of that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
+
+RADIAL_POWERS = header().constants["RADIAL_POWERS"]
+"""Powers of the radius (2, 4, ...) by which the image is stretched: no model has more terms that tell."""
+DISPLACEMENTS = header().constants["DISPLACEMENTS"]
+POSE = header().constants["POSE"]
+
+
+@structure("lens_corners_t")
+class LensCorners(Struct):
+    """Corners of boards, view after view, with their derivatives."""
+
+    @classmethod
+    def make(
+        cls,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray,
+        sigmas: FloatArray,
+        lever: FloatArray,
+        pixels: tuple[FloatArray, FloatArray],
+        residuals: FloatArray,
+        told: BoolArray,
+        counts: IntArray,
+        size_px: tuple[int, int],
+    ) -> LensCorners:
+        """Return them: N corners, so many of each view (V,) as `counts` say.
+
+        Parameters
+        ----------
+        d_pixels_d_point, d_pixels_d_parameters : (2, 3, N) px/mm and (2, P, N), as of `Camera.derivatives`.
+        sigmas : (P,) units in which parameters count.
+        lever : (3, N) from the board's origin to the corner, in the camera frame, mm.
+        pixels : u and v, (N,) each, where the corners project.
+        residuals, told : (N, 2) px, and (N,) which corners tell anything.
+        """
+        arrays = (d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, *pixels, residuals)
+        by_point, by_parameters, sigmas, lever, u, v, residuals = (np.ascontiguousarray(a, np.float64) for a in arrays)
+        return cls.of(
+            d_pixels_d_point=by_point,
+            d_pixels_d_parameters=by_parameters,
+            sigmas=sigmas,
+            lever=lever,
+            u=u,
+            v=v,
+            residuals=residuals,
+            told=np.ascontiguousarray(told),
+            counts=np.ascontiguousarray(counts, np.int64),
+            count=len(told),
+            parameters=len(sigmas),
+            views=len(counts),
+            width=size_px[0],
+            height=size_px[1],
+        )
+
+    def products(self) -> tuple[FloatArray, FloatArray]:
+        """Return the sums of products of the corners' rows that tell: of every view those of all K + 6 with its pose
+        (V, K + 6, 6), and over all views those of the others (K, K).
+
+        With rows in this order: the pose (w, t), the P parameters in units of `sigmas`, the displacements, the
+        residual.
+        """
+        out = np.empty((self.parameters + DISPLACEMENTS + 1,) * 2)
+        with_pose = np.empty((self.views, len(out) + POSE, POSE))
+        memory = np.empty(kernels().lens_memory(self.parameters))
+        kernels().lens_products(self, memory, with_pose, out)
+        return with_pose, out
+
+
+def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
+    """Return the displacements (2, J, M) at pixels (M, 2), px: of about one px in the corners of the image.
+
+    Powers of the radius, decentring (tangential distortion), thin prisms, these again with the square of the radius,
+    aspect ratio and shear.
+    """
+    out = np.empty((2, DISPLACEMENTS, len(pixels)))
+    u, v = (np.ascontiguousarray(pixels[:, k], np.float64) for k in range(2))
+    kernels().displace_pixels(u, v, len(pixels), *size_px, out)
+    return out

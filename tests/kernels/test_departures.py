@@ -1,0 +1,38 @@
+"""The kernels of what a lens may do beyond its model agree with their definition in numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.reference import departures as reference
+
+from rigkit.kernels.departures import DISPLACEMENTS, LensCorners, displacements
+
+SIZE = (641, 480)
+ROUNDING = 1e-12
+"""Of the largest term: both add the same thousand products, in another order."""
+
+
+def test_displacements_are_as_defined(rng: np.random.Generator) -> None:
+    pixels = rng.uniform(-10.0, 700.0, (101, 2))
+    ours, theirs = displacements(pixels, SIZE), reference.displacements(pixels, SIZE)
+    assert ours.shape == (2, DISPLACEMENTS, 101)
+    np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("parameters", [1, 8, 10, 13])
+def test_products_are_as_defined(parameters: int, rng: np.random.Generator) -> None:
+    """Views of fewer and of more corners than are worked on at a time, with some that tell nothing, NaN among them."""
+    counts = np.array([1, 31, 32, 33, 140])
+    count = int(counts.sum())
+    by_point, by_parameters = rng.normal(size=(2, 3, count)), rng.normal(size=(2, parameters, count))
+    lever, pixels = rng.normal(size=(3, count)), rng.uniform(0.0, 640.0, (count, 2))
+    residuals, sigmas, told = rng.normal(size=(count, 2)), rng.uniform(0.1, 2.0, parameters), rng.random(count) < 0.8
+    residuals[~told] = by_point[..., ~told] = np.nan
+    uv = (pixels[:, 0], pixels[:, 1])
+    corners = LensCorners.make(by_point, by_parameters, sigmas, lever, uv, residuals, told, counts, SIZE)
+    ours = corners.products()
+    view = np.repeat(np.arange(len(counts)), counts)
+    theirs = reference.products(by_point, by_parameters, sigmas, lever, pixels, residuals, told, view, SIZE)
+    for one, other in zip(ours, theirs, strict=True):
+        assert np.abs(one - other).max() < ROUNDING * np.abs(other).max()
