@@ -42,9 +42,6 @@ MAX_VERB_LINES = 120
 MAX_POSITIONAL_FIELDS = 6
 """Nobody remembers the order of more: classes of more fields take keywords."""
 
-PER_MODULE = {"HELP"}
-"""Constants that every module of a kind has: the one-line help of a verb."""
-
 HEAVY_HOMES = {
     "open3d": {"interop/open3d.py"},
     "pycolmap": {"interop/colmap.py"},
@@ -165,10 +162,7 @@ def test_a_verb_is_a_page() -> None:
     """What it takes, one call of a workflow, what it prints; longer ones do work that belongs below."""
     from rigkit.cli.main import VERBS
 
-    lines = {
-        verb: len((PACKAGE / f"cli/{home.split('.')[-1]}.py").read_text().splitlines())
-        for verb, (home, _) in VERBS.items()
-    }
+    lines = {verb: len((PACKAGE / f"cli/{verb}.py").read_text().splitlines()) for verb in VERBS}
     assert not {verb: n for verb, n in lines.items() if n > MAX_VERB_LINES}
 
 
@@ -264,7 +258,7 @@ def test_a_constant_has_one_value() -> None:
                 for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
                     if isinstance(target, ast.Name) and target.id.isupper() and not target.id.startswith("_"):
                         values.setdefault(target.id, {})[place_of(path, target.id)] = ast.unparse(node.value)
-    several = {n: known for n, known in values.items() if n not in PER_MODULE and len(set(known.values())) > 1}
+    several = {n: known for n, known in values.items() if len(set(known.values())) > 1}
     assert not several, several
 
 

@@ -1,4 +1,4 @@
-"""`rigkit board`: a board to print, true to scale, and the measured print back into its file."""
+"""`rigkit board`: a board to print, true to scale (PDF and SVG), and its measured size back into its file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.core.patterns.base import Pattern
-
-HELP = "a board to print, true to scale (PDF and SVG), and its measured size back into the board file"
 
 MARKER_SHARE = 0.75
 """Side of a marker in squares: large enough to be read, with white left around it for the corners."""

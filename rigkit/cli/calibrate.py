@@ -1,4 +1,4 @@
-"""`rigkit calibrate`: from a session, or folders of images, to calibration.json, or of several cameras to rig.json."""
+"""`rigkit calibrate`: one camera, or several on one mount, from a session or folders of images of boards."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from rigkit.core.errors import ExitCode, InputError, RigkitError
 if TYPE_CHECKING:
     from rigkit.workflows.calibrate import SessionCalibration
     from rigkit.workflows.calibrate_rig import RigSessionCalibration
-
-HELP = "calibrate a camera, or several on one mount, from images of boards"
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,11 +1,9 @@
-"""`rigkit certify RIG_OR_CALIBRATION --length 800 --distance 1500`: how wrong a measurement may be."""
+"""`rigkit certify`: how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-HELP = "how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,5 +1,7 @@
-"""`rigkit check CALIBRATION IMAGES`: does it still hold, or what moved? Exit code 1 where it does not, 2
-where it does, but an image could not be read."""
+"""`rigkit check`: fresh pictures against a calibration or a rig: still holds, or what moved and by how much.
+
+Exit code 1 where it does not hold, 2 where it does, but an image could not be read.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,6 @@ import argparse
 from pathlib import Path
 
 from rigkit.core.errors import ExitCode, InputError
-
-HELP = "fresh pictures against a calibration or a rig: still holds, or what moved and by how much"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""`rigkit coach FOLDER --board 9x6x25`: a local page that says what to shoot next, takes it, and says when to stop."""
+"""`rigkit coach`: a guided capture on a local page that says what to shoot next, takes it, and says when to stop."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from rigkit.core.errors import ExitCode, InputError
 
 MAX_CAMERAS = 8
 """Of a browser: more streams than this no machine carries."""
-
-HELP = "a guided capture on a local page: says what to shoot next, takes it, stops when it is enough"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

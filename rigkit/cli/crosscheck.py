@@ -1,4 +1,7 @@
-"""`rigkit crosscheck`: the same pairs through pycolmap, planar PnP and the other chain."""
+"""`rigkit crosscheck`: the same pairs through pycolmap, planar PnP and the other chain.
+
+Exit code 1 where they disagree.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,6 @@ import argparse
 from rigkit.cli.console import note, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import add_dataset_arguments, dataset_options, exit_code_of, failed_pairs
 from rigkit.core.errors import ExitCode
-
-HELP = "the same pairs through pycolmap, planar PnP and the other chain; exit 1 if they disagree"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

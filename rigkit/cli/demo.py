@@ -1,11 +1,9 @@
-"""`rigkit demo`: renders a capture with known truth and runs everything on it."""
+"""`rigkit demo`: renders a small fisheye capture with known truth and runs the whole job on it; needs no data."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-HELP = "render a small fisheye capture and run the whole job on it; needs no data"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -11,8 +11,6 @@ from rigkit.core.errors import ExitCode, printable
 if TYPE_CHECKING:
     from rigkit.core.detections import BoardDetection
 
-HELP = "corners of every board in the images, to a corners file and overlay pictures"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", metavar="IMAGE|FOLDER|VIDEO", help="images, folders, videos, camera:0")

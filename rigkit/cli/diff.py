@@ -1,4 +1,4 @@
-"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, against their uncertainties."""
+"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, held against their uncertainties."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 
 from rigkit.core.errors import ExitCode
-
-HELP = "difference of two calibrations over the image: px map and numbers; same camera or not; of rigs; of mounts"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,8 +9,6 @@ from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
 from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
 
-HELP = "cameras in other tools' formats; clouds as PLY, LAS, npz or a COLMAP model"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)")

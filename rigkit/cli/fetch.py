@@ -1,11 +1,9 @@
-"""`rigkit fetch NAME`: a public capture with measured truth."""
+"""`rigkit fetch`: public captures with measured truth: list them, or fetch some."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-
-HELP = "public captures with measured truth: list them, or fetch one"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""`rigkit handeye`: where a camera sits on a robot, from the robot's poses and images of a board."""
+"""`rigkit handeye`: where a camera sits on a robot's hand, or before it, from its poses and images of a board."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 
 from rigkit.core.errors import ExitCode
-
-HELP = "where a camera sits on a robot's hand, or before it, from the robot's poses and images of a board"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

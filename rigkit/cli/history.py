@@ -7,8 +7,6 @@ from pathlib import Path
 
 from rigkit.core.errors import ExitCode, printable
 
-HELP = "a register of checks over months: drift plots with control limits, one page"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("register", type=Path, metavar="FILE.jsonl", help="as `rigkit check --register` wrote it")

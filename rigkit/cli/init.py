@@ -9,8 +9,6 @@ from typing import Any
 from rigkit.cli.manifest_words import POSE_TYPES
 from rigkit.core.errors import ExitCode, InputError
 
-HELP = "write a manifest of pairs to validate, or a session to calibrate, from a folder of images"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     repeatable: dict[str, Any] = {"action": "append", "default": []}

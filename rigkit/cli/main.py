@@ -1,6 +1,6 @@
 """The `rigkit` program: finds the verb, runs it, turns errors into one line and an exit code.
 
-A verb is a module in this package with `HELP: str`, `add_arguments(parser)` and `run(args) -> int`, one line in `VERBS`
+A verb is a module of its name in this package with `add_arguments(parser)` and `run(args) -> int`, one line in `VERBS`
 and its examples in `rigkit.cli.examples`. Verb modules import nothing heavy at module level: `rigkit --help` must
 answer at once.
 """
@@ -21,31 +21,31 @@ from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
 from rigkit.core.errors import ExitCode, RigkitError, printable
 
-VERBS: dict[str, tuple[str, str]] = {
-    "demo": ("rigkit.cli.demo", "render a small fisheye capture and run the whole job on it; needs no data"),
-    "board": ("rigkit.cli.board", "a board to print, true to scale"),
-    "calibrate": ("rigkit.cli.calibrate", "calibrate a camera, or several on one mount, from images of boards"),
-    "rectify": ("rigkit.cli.rectify", "perspective, cylindrical, equirectangular or stereo images from any camera's"),
-    "export": ("rigkit.cli.export", "cameras in other tools' formats; clouds as PLY, LAS, npz or a COLMAP model"),
-    "plan": ("rigkit.cli.plan", "which pictures to take next; what a lens, a board and so many pictures will reach"),
-    "coach": ("rigkit.cli.coach", "a guided capture on a local page: says what to shoot next and when it is enough"),
-    "diff": ("rigkit.cli.diff", "difference of two calibrations over the image; same camera or not"),
-    "check": ("rigkit.cli.check", "fresh pictures against a calibration or rig: still holds, or what moved; exit 1"),
-    "history": ("rigkit.cli.history", "a register of checks over months: drift plots with control limits"),
-    "certify": ("rigkit.cli.certify", "how wrong a length, depth, plane or angle may be that is measured with them"),
-    "init": ("rigkit.cli.init", "write a manifest, or a session, from a folder of images"),
-    "validate": ("rigkit.cli.validate", "captures beside what was measured of them: a page, clouds; exit 1"),
-    "reconstruct": ("rigkit.cli.reconstruct", "oriented clouds (PLY) and pictures of every pair"),
-    "mesh": ("rigkit.cli.mesh", "a surface through an oriented cloud (screened Poisson), as a mesh"),
-    "crosscheck": ("rigkit.cli.crosscheck", "the pairs of a data set through COLMAP and other ways"),
-    "pose": ("rigkit.cli.pose", "where a camera is in the frame of a board that is laid down"),
-    "handeye": ("rigkit.cli.handeye", "where a camera sits on a robot, from its poses and images of a board"),
-    "detect": ("rigkit.cli.detect", "corners of every board in the images"),
-    "simulate": ("rigkit.cli.simulate", "a synthetic study: sweeps over noise, box plots, tables"),
-    "fetch": ("rigkit.cli.fetch", "public captures with measured truth: list them, or fetch one"),
-    "schema": ("rigkit.cli.schema", "JSON Schema of a file that rigkit reads or writes: for editors and programs"),
+VERBS: dict[str, str] = {
+    "demo": "render a small capture and run everything on it",
+    "board": "a board to print, true to scale",
+    "calibrate": "a camera, or several on one mount, from images of boards",
+    "rectify": "perspective, panoramic or stereo images from any camera's",
+    "export": "cameras, rigs and clouds in other tools' formats, and back",
+    "plan": "which pictures to take next, and what they will bring",
+    "coach": "a guided capture on a local page",
+    "diff": "two calibrations, rigs or mounts: the same or not",
+    "check": "fresh pictures: does a calibration still hold, or what moved",
+    "history": "checks over months as drift plots with control limits",
+    "certify": "how wrong a length, depth, plane or angle measured may be",
+    "init": "start a manifest to validate, or a session, from a folder",
+    "validate": "captures beside what a person measured of them",
+    "reconstruct": "oriented clouds of pairs with boards, or of any scene",
+    "mesh": "a surface through an oriented cloud",
+    "crosscheck": "pairs through COLMAP and other independent methods",
+    "pose": "where a camera is against a board that is laid down",
+    "handeye": "where a camera sits on a robot",
+    "detect": "corners of every board in images",
+    "simulate": "a synthetic study: sweeps over noise, box plots, tables",
+    "fetch": "public captures with measured truth",
+    "schema": "every key of every file, as JSON Schema or a table",
 }
-"""Verb -> (module, one-line help)."""
+"""Verb -> what it does, in a line; `rigkit VERB --help` begins with the docstring of its module."""
 
 
 class _Version(argparse.Action):
@@ -84,13 +84,13 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
         epilog=FIRST_STEPS,
     )
     parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
-    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=_VerbParser)
-    for name, (module_name, summary) in VERBS.items():
+    verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True, parser_class=_VerbParser)
+    for name, summary in VERBS.items():
         sub = verbs.add_parser(name, help=summary, description=summary)
         if name == verb:
-            module = importlib.import_module(module_name)
+            module = importlib.import_module(f"rigkit.cli.{name}")
+            sub.description = (module.__doc__ or summary).partition(": ")[2]
             sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[name]}"
-            sub.description = module.HELP
             module.add_arguments(sub)
             add_log_arguments(sub)
             sub.set_defaults(run=module.run)

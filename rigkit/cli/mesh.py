@@ -8,8 +8,6 @@ from pathlib import Path
 from rigkit.cli.console import print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode
 
-HELP = "a surface through an oriented cloud (screened Poisson), as a mesh"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("cloud", type=Path, metavar="CLOUD.ply", help="as `rigkit reconstruct` writes it, or any other")

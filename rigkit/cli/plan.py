@@ -12,8 +12,6 @@ from rigkit.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from rigkit.workflows.plan import PlannedSession, PlanOptions
 
-HELP = "which pictures to take next, or what a lens, a board and so many pictures will reach"
-
 MAX_VIEWS = 100
 """Nobody takes more by a plan."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-HELP = "where a camera is in the frame of a board that is laid down"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("image", metavar="IMAGE", help="an image that shows the board")

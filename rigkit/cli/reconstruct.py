@@ -21,8 +21,6 @@ from rigkit.core.errors import ExitCode, InputError
 if TYPE_CHECKING:
     from rigkit.workflows.reconstruct import PairReconstruction
 
-HELP = "oriented clouds (PLY) and pictures of every pair"
-
 METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 

@@ -1,4 +1,4 @@
-"""`rigkit rectify`: an image as an ideal camera would have taken it, or two whose rows correspond."""
+"""`rigkit rectify`: a perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 from rigkit.cli.rectification_words import alike, image_to_dict
 from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import ExitCode, InputError
-
-HELP = "perspective, cylindrical or equirectangular image from any camera's image, or a stereo pair"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

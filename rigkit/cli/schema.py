@@ -7,8 +7,6 @@ from pathlib import Path
 
 from rigkit.core.errors import ExitCode
 
-HELP = "JSON Schema of a file that rigkit reads or writes: for editors and other programs"
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", nargs="?", metavar="NAME", help="of the file; without one all are listed")

@@ -1,4 +1,7 @@
-"""`rigkit validate`: every pair and every estimator against what a person measured."""
+"""`rigkit validate`: every pair and every estimator against what a person measured: a page, tables, clouds.
+
+Exit code 1 if a check fails.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,6 @@ from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
     from rigkit.workflows.validate import ValidateOptions
-
-HELP = "captures beside what a person measured of them: a page, tables, oriented clouds; exit 1 if a check fails"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
