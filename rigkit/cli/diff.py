@@ -1,4 +1,4 @@
-"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, held against their uncertainties."""
+"""`rigkit diff`: two calibrations over the image, two rigs, or boards on one mount, against their uncertainties."""
 
 from __future__ import annotations
 
