@@ -24,30 +24,19 @@ from rigkit.cameras.registry import MODELS
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
-from rigkit.interop.exchange import Written
-from rigkit.interop.kalibr import read_kalibr, write_kalibr
-from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
-from rigkit.interop.ocamcalib import read_ocamcalib, write_ocamcalib
-from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.camera_formats import FOREIGN_FORMATS
+from rigkit.interop.colmap_cameras import write_colmap_cameras
+from rigkit.interop.mrcal import write_cameramodel
+from rigkit.interop.opencv import write_opencv
 from rigkit.interop.rigs import RIG_FORMATS, write_rig
-from rigkit.interop.ros import read_camera_info, write_camera_info
+from rigkit.interop.ros import write_camera_info
 
 LENS = KannalaBrandt((1280, 960), np.array([720.0, 721.0, 643.2, 477.9, -0.03, 0.004, -0.0008, 0.0]))
 """A lens of 85 by 65 degrees that every model can follow nearly."""
 GRID = (41, 31)
 EXACT_PX = 1e-6
 """Below this a file brings the same camera back: text has every digit."""
-FORMATS: dict[str, tuple[Callable[[Camera], Written], Callable[[str], Camera]]] = {
-    "opencv": (write_opencv, read_opencv),
-    "ros": (write_camera_info, read_camera_info),
-    "kalibr": (lambda c: write_kalibr([c]).cameras[0], lambda t: read_kalibr(t)[0][0]),
-    "colmap": (lambda c: write_colmap_cameras({1: c})[1][1], lambda t: read_colmap_cameras(t)[1]),
-    "mrcal": (write_cameramodel, lambda t: read_cameramodel(t)[0]),
-    "ocamcalib": (write_ocamcalib, lambda t: read_ocamcalib(t)[0]),
-}
-
-
+FORMATS = ("opencv", "ros", "kalibr", "colmap", "mrcal", "ocamcalib")
 ORDERS = {"brown": (4, 5, 8), "scaramuzza": (6,)}
 """Terms, or degree, of the models that have several."""
 
@@ -66,10 +55,11 @@ def pixels_and_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def cell(camera: Camera, kind: str) -> str:
     """Return what a format makes of a camera: the largest error after writing and reading."""
-    write, read = FORMATS[kind]
+    known = FOREIGN_FORMATS[kind]
+    assert known.write is not None
     try:
-        written = write(camera)
-        back = read(written.text)
+        written = known.write(camera, None)
+        back = known.read(written.text, kind, None)
     except RigkitError:
         return "cannot"
     pixels, rays = pixels_and_rays(camera)

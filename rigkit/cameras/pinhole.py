@@ -12,6 +12,11 @@ from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 
 
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Mat3:
+    """Return K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Pinhole(FocalCamera):
     """u = fx x/z + cx, v = fy y/z + cy; points with z <= 0 are not seen.
@@ -31,8 +36,7 @@ class Pinhole(FocalCamera):
     @property
     def K(self) -> Mat3:
         """The camera matrix."""
-        fx, fy, cx, cy = self.parameters
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return camera_matrix(*self.parameters)
 
     @property
     def max_angle_rad(self) -> float:

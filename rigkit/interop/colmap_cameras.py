@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,16 +11,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
-from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size
+from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, camera_of, image_size
 
-COLMAP_ACCEPTS = (
-    Accepted("pinhole"),
-    Accepted("brown", 4),
-    Accepted("brown", 5),
-    Accepted("brown", 8),
-    Accepted("kannala_brandt"),
-    Accepted("eucm"),
-)
+COLMAP_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("eucm"))
 MAX_COLMAP_DIGITS = 9
 BEHIND = "COLMAP projects no point at or beyond 90 degrees"
 
@@ -64,7 +58,7 @@ def write_colmap_cameras(
         line = chosen.written(f"{camera_id} {name} {c.size_px[0]} {c.size_px[1]} {values}\n")
         if c.model in ("kannala_brandt", "eucm") and _sees_behind(c):
             note = f"{line.note}; {BEHIND}" if line.note else BEHIND
-            line = Written(line.text, c, line.max_error_px, line.rms_error_px, line.covered, note)
+            line = replace(line, note=note)
         written[camera_id] = line
     header = (
         "# Camera list with one line of data per camera:\n"

@@ -38,6 +38,10 @@ class Accepted:
         return all(camera.parameters[names.index(name)] == 0.0 for name in self.zero)
 
 
+PERSPECTIVE = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
+"""Models of OpenCV's calib3d, which most formats can hold."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Written:
     """A camera in another program's format.
@@ -155,6 +159,12 @@ def image_size(value: Any, name: str, key: str) -> tuple[int, int]:
         if side != np.floor(side) or not 1.0 <= side <= MAX_SIDE_PX:
             raise InputError(f"'{name}': '{key}' has {side:g}, which is no number of pixels; correct it")
     return int(width), int(height)
+
+
+def written_size(data: dict[str, Any], name: str) -> tuple[int, int]:
+    """Return (width, height) under the keys of OpenCV and ROS; raises InputError as `field` and `image_size` do."""
+    keys = ("image_width", "image_height")
+    return image_size([field(data, key, name) for key in keys], name, ", ".join(keys))
 
 
 def camera_of(model: str, size_px: tuple[int, int], parameters: FloatArray, name: str) -> Camera:

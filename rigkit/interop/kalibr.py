@@ -15,6 +15,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.exchange import (
     MM_PER_M,
+    PERSPECTIVE,
     Accepted,
     Written,
     best_accepted,
@@ -28,12 +29,8 @@ from rigkit.interop.exchange import (
 from rigkit.interop.yaml_text import flow, parse_yaml
 
 KALIBR_ACCEPTS = (
-    Accepted("pinhole"),
-    Accepted("brown", 4),
-    Accepted("kannala_brandt"),
-    Accepted("ucm"),
-    Accepted("eucm"),
-    Accepted("double_sphere"),
+    *PERSPECTIVE[:2],
+    *(Accepted(model) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")),
 )
 CAMERA = re.compile(r"cam[0-9]{1,3}")
 

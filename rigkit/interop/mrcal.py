@@ -20,9 +20,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.interop.exchange import MM_PER_M, Accepted, Written, best_accepted, camera_of, field, image_size, numbers
+from rigkit.interop.exchange import MM_PER_M, PERSPECTIVE, Written, best_accepted, camera_of, field, image_size, numbers
 
-MRCAL_ACCEPTS = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
 SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
 )
@@ -53,7 +52,7 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
     of what was seen is its valid-intrinsics region."""
     pose = Rigid3.identity() if cam_from_ref is None else cam_from_ref
     try:
-        chosen = best_accepted(camera, MRCAL_ACCEPTS, "mrcal")
+        chosen = best_accepted(camera, PERSPECTIVE, "mrcal")
     except InputError:
         chosen = None
     if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:

@@ -8,6 +8,7 @@ polynomial is negative on the axis: (x, y, z) of theirs = (y, x, -z) of ours. Th
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -58,8 +59,7 @@ def write_ocamcalib(camera: Camera, outline: Pixels | None = None) -> Written:
     )
     written = chosen.written(text)
     note = f"the inverse polynomial of {inverse.size} terms follows to {error_px:.2g} px"
-    note = f"{written.note}; {note}" if written.note else note
-    return Written(text, c, written.max_error_px, written.rms_error_px, written.covered, note)
+    return replace(written, note=f"{written.note}; {note}" if written.note else note)
 
 
 def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuzza, Mat3]:

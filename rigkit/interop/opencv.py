@@ -10,29 +10,24 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.exchange import (
+    PERSPECTIVE,
     Accepted,
     Written,
     best_accepted,
     camera_of,
     field,
-    image_size,
     numbers,
     unified_from_xi,
     unified_with_xi,
+    written_size,
 )
 from rigkit.interop.yaml_text import parse_yaml
 
-OPENCV_ACCEPTS = (
-    Accepted("pinhole"),
-    Accepted("brown", 4),
-    Accepted("brown", 5),
-    Accepted("brown", 8),
-    Accepted("kannala_brandt"),
-    Accepted("ucm"),
-)
+OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
 
 
 def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
@@ -42,11 +37,7 @@ def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
     extra = "fisheye_model: 1\n" if c.model == "kannala_brandt" else ""
     if c.model == "ucm":
         xi, (fx, fy, cx, cy) = unified_with_xi(c)
-        K, distortion, extra = (
-            np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-            np.zeros((1, 4)),
-            f"xi: {xi!r}\n",
-        )
+        K, distortion, extra = camera_matrix(fx, fy, cx, cy), np.zeros((1, 4)), f"xi: {xi!r}\n"
     else:
         K, distortion = opencv_arrays(c)
     text = (
@@ -64,8 +55,7 @@ def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
     on top of omnidir's sphere).
     """
     data = parse_yaml(text, name)
-    sides = [field(data, key, name) for key in ("image_width", "image_height")]
-    size = image_size(sides, name, "image_width, image_height")
+    size = written_size(data, name)
     K = read_opencv_matrix(data, "camera_matrix", name)
     key = next((k for k in ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D") if k in data), None)
     d = np.zeros(0) if key is None else read_opencv_matrix(data, key, name)
@@ -96,8 +86,7 @@ def camera_from_arrays(size: tuple[int, int], K: FloatArray, d: FloatArray, *, f
 def opencv_arrays(camera: Camera) -> tuple[Mat3, FloatArray]:
     """Return K and the distortion of a pinhole or Brown camera (1, N), or of a Kannala-Brandt one (4, 1)."""
     p = camera.parameters
-    fx, fy, cx, cy = p[:4]
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = camera_matrix(*p[:4])
     if camera.model == "kannala_brandt":
         return K, p[4:].reshape(4, 1)
     return K, (p[4:] if p.size > 4 else np.zeros(5)).reshape(1, -1)

@@ -18,14 +18,11 @@ from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
-from rigkit.interop.exchange import Accepted, Chosen, best_accepted, field, image_size
+from rigkit.interop.exchange import PERSPECTIVE, Accepted, Chosen, best_accepted, written_size
 from rigkit.interop.opencv import camera_from_arrays, opencv_arrays, opencv_matrix, read_opencv_matrix
 from rigkit.interop.yaml_text import parse_yaml
 
-FAMILIES = (
-    (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8)),
-    (Accepted("kannala_brandt"),),
-)
+FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
 """The models that one call of OpenCV takes together: of calib3d, and of fisheye."""
 KEYS = ("M1", "D1", "M2", "D2", "R", "T")
 
@@ -81,8 +78,7 @@ def opencv_stereo(
 def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Camera, Camera], Rigid3]:
     """Return both cameras and cam2_from_cam1 (mm) of a pair's file; raises InputError for one without the keys."""
     data = parse_yaml(text, name)
-    sides = [field(data, key, name) for key in ("image_width", "image_height")]
-    size = image_size(sides, name, "image_width, image_height")
+    size = written_size(data, name)
     found = {key: read_opencv_matrix(data, key, name) for key in KEYS}
     for key, count in (("R", 9), ("T", 3)):
         if found[key].size != count:

@@ -9,22 +9,26 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, field, image_size, numbers
+from rigkit.interop.exchange import (
+    PERSPECTIVE,
+    Accepted,
+    Written,
+    best_accepted,
+    camera_of,
+    field,
+    numbers,
+    written_size,
+)
 from rigkit.interop.yaml_text import flow, parse_yaml
 
 Rectification = tuple[Mat3, FloatArray]
 """Rotation from the camera into the rectified view (3, 3), and the rectified view's projection matrix (3, 4), whose
 last column is in pixels times metres."""
 
-ROS_ACCEPTS = (
-    Accepted("pinhole"),
-    Accepted("brown", 4),
-    Accepted("brown", 5),
-    Accepted("brown", 8),
-    Accepted("kannala_brandt"),
-)
+ROS_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"))
 
 
 def write_camera_info(
@@ -37,21 +41,19 @@ def write_camera_info(
     """Return the camera as a camera_info YAML file called `camera_name` inside.
 
     `rectification` is that of a camera of a stereo pair; by default the camera stands alone. `outline`: as for
-    `best_accepted`. Raises InputError for
-    a name that ROS does not take.
+    `best_accepted`. Raises InputError for a name that ROS does not take.
     """
     if not camera_name or not camera_name.replace("_", "").isalnum():
         raise InputError(f"camera_info: name '{camera_name}'; ROS takes letters, digits and underscores")
     chosen = best_accepted(camera, ROS_ACCEPTS, "ROS", outline)
     c = chosen.camera
     p = c.parameters
-    fx, fy, cx, cy = p[:4].tolist()
     distortion = p[4:] if p.size > 4 else np.zeros(5)
     if c.model == "brown" and distortion.size == 4:
         # plumb_bob has five numbers; without k3 the last one is 0.
         distortion = np.append(distortion, 0.0)
     model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[distortion.size]
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = camera_matrix(*p[:4])
     R, P = (np.eye(3), np.hstack([K, np.zeros((3, 1))])) if rectification is None else rectification
     text = (
         f"image_width: {c.size_px[0]}\nimage_height: {c.size_px[1]}\ncamera_name: {camera_name}\n"
@@ -67,8 +69,7 @@ def write_camera_info(
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:
     """Return the camera of a camera_info file; raises InputError for other distortion models and damaged files."""
     data = parse_yaml(text, name)
-    sides = [field(data, key, name) for key in ("image_width", "image_height")]
-    size = image_size(sides, name, "image_width, image_height")
+    size = written_size(data, name)
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
     if K[1] != 0.0:
         raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has; calibrate without skew")

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.interop.colmap_cameras import read_colmap_cameras
+from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.kalibr import read_kalibr
-from rigkit.interop.mrcal import read_cameramodel
-from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib
-from rigkit.interop.opencv import read_opencv
 from rigkit.interop.opencv_stereo import read_opencv_stereo
-from rigkit.interop.ros import read_camera_info
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import is_rig_file, load_rig
 from rigkit.workflows.formats import READ_FORMATS
 
-SIGNS = (
-    ("mrcal", re.compile(r"['\"]lens_?model['\"]\s*:")),
-    ("py-ocamcalib", re.compile(r'\A\s*\{.*"taylor_coefficient"\s*:', re.DOTALL)),
-    ("rigkit", re.compile(r'\A\s*\{\s*["}]')),
-    ("ocamcalib", re.compile(r"\A\s*#\s*polynomial coefficients", re.IGNORECASE)),
-    ("kalibr", re.compile(r"^cam\d+\s*:", re.MULTILINE)),
-    ("opencv", re.compile(r"!!opencv-matrix|<opencv_storage>|\A%YAML")),
-    ("ros", re.compile(r"^distortion_model\s*:", re.MULTILINE)),
-    ("colmap", re.compile(r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]", re.MULTILINE)),
-)
-"""Format -> what its files have and those of the formats after it in this list have not."""
-
+OURS = re.compile(r'\A\s*\{\s*["}]')
+"""How our files begin, and py-OCamCalib's."""
 STEREO = re.compile(r"^M1\s*:", re.MULTILINE)
 """What OpenCV's files of pairs have."""
-
-_log = logging.getLogger(__name__)
 
 
 def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
@@ -55,27 +38,13 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
     if kind == "rigkit":
         return load_camera(source)
-    if kind == "kalibr":
-        return _only(read_kalibr(text, name)[0], name)
-    if kind == "colmap":
-        return _only(tuple(read_colmap_cameras(text, name).values()), name)
-    if kind == "mrcal":
-        camera, _, worst = read_cameramodel(text, name)
-        if worst > 0.0:
-            _log.info(f"the spline was refitted as '{camera.model}', at most {worst:.4g} px away")
-        return camera
-    if kind == "ocamcalib":
-        return read_ocamcalib(text, name)[0]
-    if kind == "py-ocamcalib":
-        if size_px is None:
-            raise InputError(f"'{name}': py-OCamCalib writes no image size; use `rigkit export --size`")
-        return read_py_ocamcalib(text, size_px, name)[0]
-    return read_opencv(text, name) if kind == "opencv" else read_camera_info(text, name)
+    return FOREIGN_FORMATS[kind].read(text, name, size_px)
 
 
 def camera_format(text: str) -> str | None:
     """Return the format of a camera file's content, one of `READ_FORMATS`; None where none of them looks so."""
-    return next((kind for kind, sign in SIGNS if sign.search(text)), None)
+    found = next((kind for kind, known in FOREIGN_FORMATS.items() if known.sign.search(text)), None)
+    return "rigkit" if OURS.search(text) and found not in ("mrcal", "py-ocamcalib") else found
 
 
 def is_ours(path: str | Path) -> bool:
@@ -114,9 +83,3 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     if kind == "rigkit":
         return load_rig(path)
     raise InputError(f"'{name}': no rig of rigkit, Kalibr (camchain) or OpenCV (M1, D1, M2, D2, R, T); check the file")
-
-
-def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
-    if len(cameras) != 1:
-        raise InputError(f"'{name}' holds {len(cameras)} cameras; leave the one that you want in it")
-    return cameras[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,14 +13,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.interop.colmap_cameras import write_colmap_cameras
+from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.exchange import Written
-from rigkit.interop.kalibr import write_kalibr
-from rigkit.interop.mrcal import write_cameramodel
-from rigkit.interop.ocamcalib import write_ocamcalib
-from rigkit.interop.opencv import write_opencv
 from rigkit.interop.rigs import RIG_FORMATS, Outlines, Rig, write_rig
-from rigkit.interop.ros import write_camera_info
 from rigkit.io.calibration_file import is_calibration, load_calibration, save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
@@ -88,11 +83,11 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)
     with about(source):
         outline = outline_of_corners(load_calibration(source)) if _is_calibration(source) else None
-        text, worst_px, words = _foreign(camera, kind, outline)
-    write_atomic(options.output, text, force=options.force)
-    if words:
-        _log.info(words)
-    return ExportedCamera(camera=camera, kind=kind, max_error_px=worst_px)
+        done = _foreign(camera, kind, outline)
+    write_atomic(options.output, done.text, force=options.force)
+    if done.note:
+        _log.info(done.note)
+    return ExportedCamera(camera=camera, kind=kind, max_error_px=done.max_error_px)
 
 
 def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence[str] = ()) -> ExportedRig:
@@ -166,9 +161,10 @@ def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) 
     files = {}
     outline = outline_of_corners(calibration) if kinds else None
     for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
-        files[path], _, words = _foreign(calibration.camera, kind, outline)
-        if words:
-            _log.info(f"{path}: {words}")
+        done = _foreign(calibration.camera, kind, outline)
+        files[path] = done.text
+        if done.note:
+            _log.info(f"{path}: {done.note}")
     return files
 
 
@@ -184,20 +180,8 @@ def _is_calibration(source: str | Path) -> bool:
     return is_ours(source) and is_calibration(source)
 
 
-def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> tuple[str, float, str]:
-    """Return the file's text, its largest error in px (inside the `outline`), and what a user should know."""
-    if kind == "kalibr":
-        chain = write_kalibr([camera], outlines=[outline])
-        one = chain.cameras[0]
-        return chain.text, one.max_error_px, one.note
-    if kind == "colmap":
-        text, lines = write_colmap_cameras({1: camera}, {} if outline is None else {1: outline})
-        return text, lines[1].max_error_px, lines[1].note
-    write: dict[str, Callable[..., Written]] = {
-        "opencv": write_opencv,
-        "ros": write_camera_info,
-        "ocamcalib": write_ocamcalib,
-        "mrcal": write_cameramodel,
-    }
-    done = write[kind](camera, outline=outline)
-    return done.text, done.max_error_px, done.note
+def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> Written:
+    """Return the camera in a format that is written, held against it inside the `outline`."""
+    write = FOREIGN_FORMATS[kind].write
+    assert write is not None
+    return write(camera, outline)

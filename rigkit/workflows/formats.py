@@ -10,7 +10,8 @@ FOREIGN_ENDINGS = {
     "ocamcalib": ".txt",
     "mrcal": ".cameramodel",
 }
-"""Other tools' formats of cameras, and how the names of their files end."""
+"""Other tools' formats of cameras that are written, and how the names of their files end. Readers and writers are in
+`rigkit.interop.camera_formats`, which takes too long to load for a help text."""
 CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
 READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib")
 CLOUD_FORMATS = ("ply", "npz", "las", "colmap")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -14,11 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.images import IMAGE_ENDINGS, Image, quiet_opencv, read_image_of, require_pixels, require_size
+from rigkit.io.npz import npz_bytes
 from rigkit.io.reading import about
 from rigkit.io.rig_session import frames_of_images
 from rigkit.io.video import Video, is_video
@@ -350,7 +351,7 @@ def _write_maps(maps: list[RectifyMap], pair: StereoRectification | None, option
     target = maps[0].target
     arrays: dict[str, NDArray[Any]] = {"size_px": np.array(target.size_px), "projection": np.array(options.projection)}
     fx, fy, cx, cy = target.parameters[:4]
-    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    K = camera_matrix(fx, fy, cx, cy)
     for i, remap in enumerate(maps, start=1):
         end = "" if pair is None else str(i)
         arrays[f"map_x{end}"], arrays[f"map_y{end}"] = remap.maps()
@@ -362,9 +363,7 @@ def _write_maps(maps: list[RectifyMap], pair: StereoRectification | None, option
         arrays["Q"] = np.array(
             [[1.0, 0, 0, -cx], [0, fx / fy, 0, -cy * fx / fy], [0, 0, 0, fx], [0, 0, -1.0 / along, 0]]
         )
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-    write_atomic(options.maps, stream.getvalue(), force=options.force)
+    write_atomic(options.maps, npz_bytes(arrays), force=options.force)
 
 
 def _encoded(image: NDArray[Any], path: Path) -> bytes:

@@ -11,19 +11,17 @@ import pycolmap
 import pytest
 from helpers.cameras import image_pixels, rays_within, sample_cameras
 
-from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
-from rigkit.interop.exchange import Written
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
-from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
-from rigkit.interop.ocamcalib import read_ocamcalib, write_ocamcalib
 from rigkit.interop.opencv import read_opencv, write_opencv
-from rigkit.interop.ros import read_camera_info, write_camera_info
+from rigkit.interop.ros import read_camera_info
+from rigkit.workflows.formats import FOREIGN_ENDINGS, READ_FORMATS
 
 CAMERAS = sample_cameras()
 SAME_PX = 1e-9
@@ -32,19 +30,10 @@ STATED_REL = 1e-3
 """The error that the writer states is the one found on reading the file back, on nearly the same pixels."""
 
 
-def _colmap(camera: Camera) -> Written:
-    text, cameras = write_colmap_cameras({1: camera})
-    assert text.endswith(cameras[1].text)
-    return cameras[1]
-
-
 FORMATS = {
-    "opencv": (write_opencv, read_opencv),
-    "kalibr": (lambda c: write_kalibr([c]).cameras[0], lambda t: read_kalibr(t)[0][0]),
-    "ros": (write_camera_info, read_camera_info),
-    "colmap": (_colmap, lambda t: read_colmap_cameras(t)[1]),
-    "ocamcalib": (write_ocamcalib, lambda t: read_ocamcalib(t)[0]),
-    "mrcal": (write_cameramodel, lambda t: read_cameramodel(t)[0]),
+    name: (lambda c, known=known: known.write(c, None), lambda t, known=known: known.read(t, "file", None))
+    for name, known in FOREIGN_FORMATS.items()
+    if known.write is not None
 }
 NATIVE = {
     "opencv": {"pinhole", "brown", "brown_rational", "kannala_brandt", "kannala_brandt_folding", "ucm", "ucm_narrow"},
@@ -57,6 +46,11 @@ NATIVE = {
     "ocamcalib": {"scaramuzza", "scaramuzza_3"},
     "mrcal": {"pinhole", "brown", "brown_rational"},
 }  # fmt: skip
+
+
+def test_the_command_line_knows_every_format() -> None:
+    assert set(READ_FORMATS) == {"rigkit", *FOREIGN_FORMATS}
+    assert set(FOREIGN_ENDINGS) == set(FORMATS)
 
 
 @pytest.mark.parametrize(("name", "label"), [(f, label) for f in sorted(NATIVE) for label in sorted(NATIVE[f])])

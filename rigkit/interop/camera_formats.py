@@ -1,0 +1,101 @@
+"""The camera formats of other programs: what tells a file of each, its reader and its writer.
+
+Adding one is a module, a line here and, for what is written, its ending in `rigkit.workflows.formats`.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import Pixels
+from rigkit.core.errors import InputError
+from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.exchange import Written
+from rigkit.interop.kalibr import read_kalibr, write_kalibr
+from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
+from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib, write_ocamcalib
+from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.ros import read_camera_info, write_camera_info
+
+SizePx = tuple[int, int]
+
+_log = logging.getLogger(__name__)
+
+
+class CameraFormat(NamedTuple):
+    """A format of one camera a file.
+
+    Attributes
+    ----------
+    sign : what its files have, and those of the formats after it in `FOREIGN_FORMATS` have not.
+    read : the camera of a text, of the file of that name; the images' size is for formats that do not say it.
+    write : the file of a camera, held against it inside the outline of what was seen (None: everywhere); None where
+        the format is read only.
+    """
+
+    sign: re.Pattern[str]
+    read: Callable[[str, str, SizePx | None], Camera]
+    write: Callable[[Camera, Pixels | None], Written] | None = None
+
+
+def _read_mrcal(text: str, name: str, size_px: SizePx | None) -> Camera:
+    camera, _, worst = read_cameramodel(text, name)
+    if worst > 0.0:
+        _log.info(f"the spline was refitted as '{camera.model}', at most {worst:.4g} px away")
+    return camera
+
+
+def _read_py_ocamcalib(text: str, name: str, size_px: SizePx | None) -> Camera:
+    if size_px is None:
+        raise InputError(f"'{name}': py-OCamCalib writes no image size; use `rigkit export --size`")
+    return read_py_ocamcalib(text, size_px, name)[0]
+
+
+def _write_colmap(camera: Camera, outline: Pixels | None) -> Written:
+    text, lines = write_colmap_cameras({1: camera}, {} if outline is None else {1: outline})
+    return replace(lines[1], text=text)
+
+
+def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
+    if len(cameras) != 1:
+        raise InputError(f"'{name}' holds {len(cameras)} cameras; leave the one that you want in it")
+    return cameras[0]
+
+
+FOREIGN_FORMATS: dict[str, CameraFormat] = {
+    "mrcal": CameraFormat(
+        re.compile(r"['\"]lens_?model['\"]\s*:"), _read_mrcal, lambda c, outline: write_cameramodel(c, outline=outline)
+    ),
+    "py-ocamcalib": CameraFormat(re.compile(r'\A\s*\{.*"taylor_coefficient"\s*:', re.DOTALL), _read_py_ocamcalib),
+    "ocamcalib": CameraFormat(
+        re.compile(r"\A\s*#\s*polynomial coefficients", re.IGNORECASE),
+        lambda text, name, _: read_ocamcalib(text, name)[0],
+        write_ocamcalib,
+    ),
+    "kalibr": CameraFormat(
+        re.compile(r"^cam\d+\s*:", re.MULTILINE),
+        lambda text, name, _: _only(read_kalibr(text, name)[0], name),
+        lambda c, outline: write_kalibr([c], outlines=[outline]).cameras[0],
+    ),
+    "opencv": CameraFormat(
+        re.compile(r"!!opencv-matrix|<opencv_storage>|\A%YAML"),
+        lambda text, name, _: read_opencv(text, name),
+        write_opencv,
+    ),
+    "ros": CameraFormat(
+        re.compile(r"^distortion_model\s*:", re.MULTILINE),
+        lambda text, name, _: read_camera_info(text, name),
+        lambda c, outline: write_camera_info(c, outline=outline),
+    ),
+    "colmap": CameraFormat(
+        re.compile(r"^\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]", re.MULTILINE),
+        lambda text, name, _: _only(tuple(read_colmap_cameras(text, name).values()), name),
+        _write_colmap,
+    ),
+}
+"""By name, in the order in which a file is asked."""
