@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
@@ -144,11 +145,12 @@ def in_sigmas(scene: StereoScene, geometry: PairGeometry, found: Calibration) ->
     """Yield (what, error in stated sigmas) of a pair."""
     reconstruction = reconstruct_from(geometry)
     level = reconstruction.level_sigma_rad
-    shifts = calibration_shifts(reconstruction, found.covariance, level_sigma_rad=level)
+    known = uncertain_camera(found)
+    shifts = calibration_shifts(reconstruction, known, level_sigma_rad=level)
     measured = measure(reconstruction, shifts)
     fitted: dict[str, BoardPlanes] = {
-        "coplanar": coplanar_planes(geometry, found.covariance, one_camera=True),
-        "lattice": lattice_planes(geometry, found.covariance, one_camera=True),
+        "coplanar": coplanar_planes(geometry, known, one_camera=True),
+        "lattice": lattice_planes(geometry, known, one_camera=True),
     }
     truth = scene.normals_in_cam1()
     for a, b in FACES:

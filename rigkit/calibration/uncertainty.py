@@ -154,14 +154,24 @@ class FarProjection:
     def beyond_model(self, rays: FloatArray, design: FloatArray) -> FloatArray:
         """Return what of the covariance (M, 2, 2) along `rays` (M, 3) is what the lens may do beyond its model, from
         `projection_design` there."""
-        pixels, p = self.camera.project(rays)[0], len(self.sigmas)
-        left = self.departures.left_over(pixels, design)
-        left -= np.einsum("wj,iwm->ijm", self.hides_departures, design[:, p:])
-        out = _propagated(self.departures.covariance, left)
+        out = _propagated(self.departures.covariance, self.left_over(rays, design))
+        for rival, away in self.away(rays, design):
+            out += rival.likely * away[:, :, None] * away[:, None, :]
+        return out
+
+    def left_over(self, rays: FloatArray, design: FloatArray) -> FloatArray:
+        """Return what parameters and rotation leave of the displacements (2, J, M) along `rays` (M, 3)."""
+        left = self.departures.left_over(self.camera.project(rays)[0], design)
+        left -= np.einsum("wj,iwm->ijm", self.hides_departures, design[:, len(self.sigmas) :])
+        return left
+
+    def away(self, rays: FloatArray, design: FloatArray) -> list[tuple[Rival, FloatArray]]:
+        """Return how far each rival, followed where the boards were, projects `rays` (M, 3) elsewhere, (M, 2) px."""
+        out, pixels, p = [], self.camera.project(rays)[0], len(self.sigmas)
         for rival, step, turn in self.rivals:
             there, seen = rival.camera.project(rays @ turn.T)
-            away = np.where(seen[:, None], there - pixels, 0.0) - np.einsum("ipm,p->mi", design[:, :p], step)
-            out += rival.likely * away[:, :, None] * away[:, None, :]
+            moved = np.where(seen[:, None], there - pixels, 0.0) - np.einsum("ipm,p->mi", design[:, :p], step)
+            out.append((rival, moved))
         return out
 
     @cached_property

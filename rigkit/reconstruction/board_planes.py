@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
-from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
 
 if TYPE_CHECKING:
-    from rigkit.reconstruction.pairing import MatchedPair
+    pass
 
 MIN_CORNERS_OF_BOARD = 8
 """A board with fewer corners in a view has no pose there worth the name."""
@@ -102,22 +100,6 @@ class BoardPlanes(ABC):
         """Return where among the parameters a board's turn is."""
         start = 6 * (1 + self.board_ids.index(board_id))
         return slice(start, start + 3)
-
-
-def moved_cameras(
-    pair: MatchedPair, covariance1: FloatArray | None, covariance2: FloatArray | None, one_camera: bool
-) -> list[tuple[Camera, Camera]]:
-    """Return the cameras moved by one sigma along each principal axis of the calibrations; none where one is exact."""
-    one, two = pair.camera1, pair.camera2
-    if covariance1 is None or (covariance2 is None and not one_camera):
-        return []
-    out = []
-    for axis in principal_axes(covariance1):
-        moved = one.with_parameters(one.parameters + axis)
-        out.append((moved, moved if one_camera else two))
-    if covariance2 is not None and not one_camera:
-        out += [(one, two.with_parameters(two.parameters + axis)) for axis in principal_axes(covariance2)]
-    return out
 
 
 def near_the_rest(lengths: FloatArray) -> BoolArray:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -22,10 +23,10 @@ from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
     BoardPlanes,
     inverse_information,
-    moved_cameras,
     near_the_rest,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
+from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.noise_level import variance_factor
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
 
@@ -91,8 +92,8 @@ class CoplanarPlanes(BoardPlanes):
 
 def coplanar_planes(
     geometry: PairGeometry,
-    covariance1: FloatArray | None = None,
-    covariance2: FloatArray | None = None,
+    known1: UncertainCamera | None = None,
+    known2: UncertainCamera | None = None,
     *,
     one_camera: bool = False,
 ) -> CoplanarPlanes:
@@ -106,7 +107,7 @@ def coplanar_planes(
     The calibrations' share is found by fitting again with the cameras moved along each principal axis.
     """
     pair = geometry.pair
-    moved = moved_cameras(pair, covariance1, covariance2, one_camera)
+    moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
     cameras = [(pair.camera1, pair.camera2), *moved]
     both = [(c, pixels) for two in cameras for c, pixels in zip(two, _pixels(pair.captured), strict=True)]
     seen = np.logical_and.reduce([camera.unproject(pixels)[1] for camera, pixels in both])

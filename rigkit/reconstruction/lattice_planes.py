@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -24,7 +25,6 @@ from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
     BoardPlanes,
     inverse_information,
-    moved_cameras,
 )
 from rigkit.reconstruction.lattice_problem import (
     LatticeView,
@@ -34,6 +34,7 @@ from rigkit.reconstruction.lattice_problem import (
     free_parameters,
     residuals_of,
 )
+from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.noise_level import variance_factor
 
 if TYPE_CHECKING:
@@ -80,8 +81,8 @@ class LatticePlanes(BoardPlanes):
 
 def lattice_planes(
     geometry: PairGeometry,
-    covariance1: FloatArray | None = None,
-    covariance2: FloatArray | None = None,
+    known1: UncertainCamera | None = None,
+    known2: UncertainCamera | None = None,
     *,
     one_camera: bool = False,
 ) -> LatticePlanes:
@@ -90,8 +91,8 @@ def lattice_planes(
     Parameters
     ----------
     geometry : of the pair; boards need eight corners in each view.
-    covariance1, covariance2 : of the cameras' parameters, or None: the intrinsics are exact.
-    one_camera : both images are of one camera, whose errors they share; `covariance2` is not used then.
+    known1, known2 : the cameras as they are known, or None: the intrinsics are exact.
+    one_camera : both images are of one camera, whose errors they share; `known2` is not used then.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def lattice_planes(
     axis changes the residuals by dr and the parameters by -(J^T J)^-1 J^T dr.
     """
     pair = geometry.pair
-    moved = moved_cameras(pair, covariance1, covariance2, one_camera)
+    moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
     views, boards = _views(geometry, moved)
     if not boards:
         raise DegenerateError(

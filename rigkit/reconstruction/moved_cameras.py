@@ -6,21 +6,17 @@ The axes are independent: the squares of what they change in a quantity add up t
 from __future__ import annotations
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
-from rigkit.geometry.principal_axes import principal_axes
+from rigkit.cameras.uncertain import UncertainCamera
 
 
 def moved_cameras(
-    camera1: Camera, camera2: Camera, covariance1: FloatArray, covariance2: FloatArray | None = None
+    camera1: Camera, camera2: Camera, known1: UncertainCamera | None, known2: UncertainCamera | None, *, one: bool
 ) -> list[tuple[Camera, Camera]]:
-    """Return both cameras for each axis of the covariances of their parameters, (P, P) and (Q, Q).
+    """Return both cameras for each axis of what their calibrations leave open; none where one is exact.
 
-    Without `covariance2` both images are of one camera, and both move together.
+    With `one` both images are of one camera, and both move together; `known2` is not used then.
     """
-    cameras: list[tuple[Camera, Camera]] = []
-    for axis in principal_axes(covariance1):
-        shifted = camera1.with_parameters(camera1.parameters + axis)
-        cameras.append((shifted, shifted if covariance2 is None else camera2))
-    for axis in [] if covariance2 is None else principal_axes(covariance2):
-        cameras.append((camera1, camera2.with_parameters(camera2.parameters + axis)))
-    return cameras
+    if known1 is None or (known2 is None and not one):
+        return []
+    first = [(moved, moved if one else camera2) for moved in known1.moved()]
+    return first if one or known2 is None else first + [(camera1, moved) for moved in known2.moved()]

@@ -18,6 +18,7 @@ from rigkit.affine.geometry_noise import geometry_covariance
 from rigkit.affine.normal import estimate_normals
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, in_8_bits
 from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
@@ -202,8 +203,8 @@ def _cloud(
 def fit_planes(
     geometry: PairGeometry,
     planes: Planes,
-    covariance1: FloatArray | None = None,
-    covariance2: FloatArray | None = None,
+    known1: UncertainCamera | None = None,
+    known2: UncertainCamera | None = None,
     *,
     one_camera: bool = False,
 ) -> BoardPlanes:
@@ -211,7 +212,7 @@ def fit_planes(
     if planes not in ("coplanar", "lattice"):
         raise InputError(f"planes: '{planes}' are not fitted to both images; coplanar and lattice are")
     fit = lattice_planes if planes == "lattice" else coplanar_planes
-    return fit(geometry, covariance1, covariance2, one_camera=one_camera)
+    return fit(geometry, known1, known2, one_camera=one_camera)
 
 
 def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruction:

@@ -1,7 +1,7 @@
 """What the uncertainty of the calibrations does to a reconstruction.
 
 A calibration is one error for a whole pair: it tilts planes and stretches baselines without leaving any scatter behind.
-So each principal axis of the parameters' covariance is tried: the cameras moved by one standard deviation along it, the
+So each principal axis of what they leave open is tried: the cameras moved by one standard deviation along it, the
 pose, the scale and the points estimated again from the same corners. The axes are independent, so the squares of what
 they change in a quantity add up to its variance.
 """
@@ -17,6 +17,7 @@ from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, Normals
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
@@ -57,8 +58,8 @@ class CalibrationShifts:
 
 def calibration_shifts(
     reconstruction: Reconstruction,
-    covariance1: FloatArray,
-    covariance2: FloatArray | None = None,
+    known1: UncertainCamera,
+    known2: UncertainCamera | None = None,
     *,
     level_sigma_rad: float | None = None,
 ) -> CalibrationShifts:
@@ -67,12 +68,12 @@ def calibration_shifts(
     Parameters
     ----------
     reconstruction : of one pair.
-    covariance1 : (P, P) of camera 1's parameters.
-    covariance2 : (Q, Q) of camera 2's, or None where both images are of one camera: then both move together.
+    known1 : camera 1 as it is known.
+    known2 : camera 2, or None where both images are of one camera: then both move together.
     level_sigma_rad : as in the reconstruction.
     """
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    cameras = [(camera1, camera2), *moved_cameras(camera1, camera2, covariance1, covariance2)]
+    cameras = [(camera1, camera2), *moved_cameras(camera1, camera2, known1, known2, one=known2 is None)]
     # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
     seen = np.logical_and.reduce(
         [

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
@@ -89,11 +90,12 @@ def load_instrument(
         if cameras is not None:
             raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
         calibration = load_calibration(path)
+        known = uncertain_camera(calibration)
         return Instrument(
             names=(Path(path).stem,),
-            cameras=(calibration.camera,),
+            cameras=(known.camera,),
             cam_from_rig=(Rigid3.identity(),),
-            covariance=calibration.covariance,
+            covariance=known.covariance,
             sigma_px=sigma_px or calibration.sigma_px,
             freedom=calibration.freedom,
         )

@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from rigkit.affine.directions import Support
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
@@ -114,9 +115,9 @@ class LoadedCamera:
     calibration: Calibration | None
 
     @property
-    def covariance(self) -> FloatArray | None:
-        """The covariance of the camera's parameters, where it is known."""
-        return None if self.calibration is None else self.calibration.covariance
+    def known(self) -> UncertainCamera | None:
+        """The camera with what its calibration leaves open, where that is known."""
+        return None if self.calibration is None else uncertain_camera(self.calibration)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.hand_eye import HandEye, hand_eye
 from rigkit.calibration.uncertainty import pose_covariance_of_lens
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
@@ -157,10 +158,10 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         if not np.isfinite(found[0].covariance).all() or not np.isfinite(rms):
             raise DegenerateError("the lens does not see the board where it stands; check the numbers of its file")
     ambiguous = len(found) > 1 and found[1].rms_rad < PLANAR_AMBIGUITY * found[0].rms_rad
-    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _lens_covariance(camera)
+    pose, covariance, of_lens = found[0].cam_from_board, found[0].covariance.copy(), _known(camera)
     if of_lens is not None:
         covariance += pose_covariance_of_lens(
-            lens, of_lens, pose.apply(points), pose.translation_mm, view.sigma_px[valid]
+            of_lens.camera, of_lens.covariance, pose.apply(points), pose.translation_mm, view.sigma_px[valid]
         )
     if known.square_sigma_mm is not None:
         shift = pose.translation_mm * known.square_sigma_mm / np.sqrt(known.square_x_mm * known.square_y_mm)
@@ -169,10 +170,10 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None)
 
 
-def _lens_covariance(camera: str | Path) -> FloatArray | None:
-    """Return how sure the parameters of a camera's file are, (P, P); None of another tool's, which does not say."""
+def _known(camera: str | Path) -> UncertainCamera | None:
+    """Return a camera as its file knows it; None of another tool's, which does not say how sure it is."""
     try:
-        return load_calibration(camera).covariance
+        return uncertain_camera(load_calibration(camera))
     except InputError:
         return None
 

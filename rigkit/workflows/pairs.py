@@ -97,14 +97,11 @@ def reconstruct_with(
 
 def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: LoadedCamera) -> CalibrationShifts | None:
     """Return what the calibrations' uncertainty does to a reconstruction; None where a camera has no covariance."""
-    if camera1.covariance is None or camera2.covariance is None:
+    known1, known2 = camera1.known, camera2.known
+    if known1 is None or known2 is None:
         return None
-    return calibration_shifts(
-        reconstruction,
-        camera1.covariance,
-        None if camera1 is camera2 else camera2.covariance,
-        level_sigma_rad=reconstruction.level_sigma_rad,
-    )
+    second = None if camera1 is camera2 else known2
+    return calibration_shifts(reconstruction, known1, second, level_sigma_rad=reconstruction.level_sigma_rad)
 
 
 def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera) -> BoardPlanes:
@@ -112,8 +109,7 @@ def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, cam
 
     Raises DegenerateError where too few corners are seen.
     """
-    covariances = (camera1.covariance, camera2.covariance)
-    return fit_planes(geometry, planes, *covariances, one_camera=camera1 is camera2)
+    return fit_planes(geometry, planes, camera1.known, camera2.known, one_camera=camera1 is camera2)
 
 
 def reconstruct_on_planes(

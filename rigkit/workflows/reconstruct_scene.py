@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.affine.from_points import are_rough, with_affinities
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
@@ -201,16 +203,18 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
 
 
 def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Calibrations | None:
-    """Return the covariances of the cameras' parameters, zero for one whose file has none; None where none has."""
-    known = [
-        load_calibration(path).covariance if path is not None and is_ours(path) and is_calibration(path) else None
+    """Return the cameras as their files know them, exact where one does not say; None where none does."""
+    found = [
+        uncertain_camera(load_calibration(path))
+        if path is not None and is_ours(path) and is_calibration(path)
+        else None
         for path in (options.camera, options.camera2)
     ]
-    if all(covariance is None for covariance in known):
+    if all(known is None for known in found):
         return None
     first, second = (
-        np.zeros((camera.parameters.size,) * 2) if covariance is None else covariance
-        for camera, covariance in zip((camera1, camera2), known, strict=True)
+        known or UncertainCamera(camera, np.zeros((camera.parameters.size,) * 2))
+        for camera, known in zip((camera1, camera2), found, strict=True)
     )
     return first, None if options.camera2 is None else second
 

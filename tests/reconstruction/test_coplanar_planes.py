@@ -10,6 +10,7 @@ from helpers.board_scenes import detection, fisheye_camera, regular_camera
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
@@ -138,7 +139,7 @@ def test_calibration_moves_are_those_of_a_new_fit(rng: np.random.Generator) -> N
     geometry = geometry_of(scene, rng)
     step = np.zeros(len(scene.camera1.parameters))
     step[0] = 0.05
-    planes = coplanar_planes(geometry, np.outer(step, step), one_camera=True)
+    planes = coplanar_planes(geometry, UncertainCamera(scene.camera1, np.outer(step, step)), one_camera=True)
     exact = coplanar_planes(geometry)
     moved = scene.camera1.with_parameters(scene.camera1.parameters + step)
     pair = replace(geometry.pair, camera1=moved, camera2=moved, captured=_seen(geometry, moved))

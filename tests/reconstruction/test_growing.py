@@ -13,6 +13,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
@@ -139,7 +140,7 @@ def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
     camera = true.with_parameters(true.parameters + np.array([1.0, 1.0, -1.0, 1.0]) * sigmas)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM)
     in_sigmas = {}
-    for calibrations in (None, (np.diag(sigmas**2), None)):
+    for calibrations in (None, (UncertainCamera(camera, np.diag(sigmas**2)), None)):
         r = grow_scene(sparse, seeds, *images, calibrations=calibrations).scene.reconstruction
         told = calibrations is not None
         assert r.cloud.calibration_in_sigmas == told and r.pose_covariance is not None

@@ -12,6 +12,7 @@ from helpers.board_scenes import detection, fisheye_camera, regular_camera
 from helpers.reconstructions import BOARDS
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.posetype import PoseType
@@ -126,7 +127,7 @@ def test_calibration_moves_are_those_of_a_new_fit(rng: np.random.Generator) -> N
     camera = scene.camera1
     step = np.zeros(len(camera.parameters))
     step[0] = 0.05
-    planes = lattice_planes(geometry, np.outer(step, step), one_camera=True)
+    planes = lattice_planes(geometry, UncertainCamera(camera, np.outer(step, step)), one_camera=True)
     assert planes.calibration_moves.shape[0] == 1
     moved = camera.with_parameters(camera.parameters + step)
     again = lattice_planes(replace(geometry, pair=replace(geometry.pair, camera1=moved, camera2=moved)))
@@ -168,7 +169,8 @@ def test_a_cloud_on_the_lattices_says_what_its_sigmas_include(rng: np.random.Gen
     free = reconstruct_from(geometry_of(scene, rng))
     assert free.geometry is not None
     step = 1e-3 * np.abs(scene.camera1.parameters)
-    planes = [lattice_planes(free.geometry, c, one_camera=True) for c in (None, np.outer(step, step))]
+    known = UncertainCamera(scene.camera1, np.outer(step, step))
+    planes = [lattice_planes(free.geometry, c, one_camera=True) for c in (None, known)]
     exact, whole = (on_planes(free, one).cloud for one in planes)
     assert (whole.sigma_mm > exact.sigma_mm).all()
     assert (whole.normal_sigma_rad > exact.normal_sigma_rad).all()

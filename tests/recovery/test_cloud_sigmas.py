@@ -10,6 +10,7 @@ from helpers.reconstructions import BOARDS
 from recovery.test_honest_sigmas import SIGMA_PX, random_scene, recalibration
 from scipy.spatial import cKDTree
 
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
@@ -57,7 +58,8 @@ def test_sigmas_of_free_clouds_include_the_calibration(rng: np.random.Generator,
         )
         matched = match_pair("made", calibrated, calibrated, one, two, BOARDS)
         given = reconstruct_pair(matched, pose_type=scene.pose_type, affine_method=method)
-        whole = with_calibrations(given, calibration_shifts(given, covariance, level_sigma_rad=given.level_sigma_rad))
+        known = UncertainCamera(calibrated, covariance)
+        whole = with_calibrations(given, calibration_shifts(given, known, level_sigma_rad=given.level_sigma_rad))
         assert whole.cloud.calibration_in_sigmas and np.isfinite(whole.cloud.sigma_mm).all()
         off = errors(whole, scene)
         off_mm.append(off[0])

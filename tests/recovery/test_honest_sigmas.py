@@ -22,6 +22,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
@@ -66,7 +67,8 @@ def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate
     reconstruction = reconstruct_pair(matched, pose_type=scene.pose_type)
     shifts = None
     if covariance is not None:
-        shifts = calibration_shifts(reconstruction, covariance, level_sigma_rad=reconstruction.level_sigma_rad)
+        known = UncertainCamera(camera, covariance)
+        shifts = calibration_shifts(reconstruction, known, level_sigma_rad=reconstruction.level_sigma_rad)
     return validate(reconstruction, truth, shifts=shifts)
 
 

@@ -8,6 +8,7 @@ from helpers.board_scenes import fisheye_camera
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -45,14 +46,16 @@ def exact(camera: Camera) -> Reconstruction:
 def test_predicted_share_is_the_observed_one(rng: np.random.Generator, one_camera: bool) -> None:
     made = exact(fisheye_camera())
     covariance = covariance_of(made.camera1, rng)
-    shifts = calibration_shifts(made, covariance, None if one_camera else covariance)
+    known = UncertainCamera(made.camera1, covariance)
+    shifts = calibration_shifts(made, known, None if one_camera else known)
     axes = principal_axes(covariance)
     values = []
     for _ in range(DRAWS):
         # Drawn calibrations: a single "axis" that is a random sum of all of them, estimated again by the same code.
         first = rng.normal(size=len(axes)) @ axes
         second = np.zeros_like(first) if one_camera else rng.normal(size=len(axes)) @ axes
-        drawn = calibration_shifts(made, np.outer(first, first), None if one_camera else np.outer(second, second))
+        off = [UncertainCamera(made.camera1, np.outer(step, step)) for step in (first, second)]
+        drawn = calibration_shifts(made, off[0], None if one_camera else off[1])
         moved = [[measure(r).angle_deg(*two)[0] for two in PAIRS] + [r.baseline_mm] for r in (drawn.base, *drawn.moved)]
         signs = rng.choice([-1.0, 1.0], size=len(moved) - 1)
         values.append(signs @ (np.array(moved[1:]) - moved[0]))
@@ -67,7 +70,7 @@ def test_predicted_share_is_the_observed_one(rng: np.random.Generator, one_camer
 def test_the_share_is_in_every_sigma_of_the_report(rng: np.random.Generator) -> None:
     made = exact(fisheye_camera())
     truth = PairTruth(MeasuredLength(297.3, 2.0, "rule"), (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "square"),))
-    shifts = calibration_shifts(made, covariance_of(made.camera1, rng))
+    shifts = calibration_shifts(made, UncertainCamera(made.camera1, covariance_of(made.camera1, rng)))
     plain, honest = validate(made, truth), validate(made, truth, shifts=shifts)
     for a, b in zip(plain.checks, honest.checks, strict=True):
         # Weights differ, exact points do not.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import grey_of
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
@@ -50,8 +51,8 @@ SHARED_ERROR = 0.5
 OVERLAP = 3.5
 """Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
 
-Calibrations: TypeAlias = tuple[FloatArray, FloatArray | None]
-"""Covariances of the parameters of both cameras; None: the second is the first."""
+Calibrations: TypeAlias = tuple[UncertainCamera, UncertainCamera | None]
+"""Both cameras as they are known; None: the second is the first."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -107,8 +108,8 @@ def grow_scene(
 ) -> DenseScene:
     """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
 
-    With `pose_is_known` its pose is not estimated again. With `calibrations`, the covariances of the cameras'
-    parameters, what these leave open is in the covariance of the pose and in the cloud's sigmas.
+    With `pose_is_known` its pose is not estimated again. With `calibrations`, the cameras as they are known,
+    what these leave open is in the covariance of the pose and in the cloud's sigmas.
 
     Raises
     ------
@@ -279,7 +280,7 @@ def _moved_poses(
 ) -> list[_Moved]:
     """Return the moved cameras with their poses, found from the same pairs unless the pose is `fixed`."""
     pixels1, pixels2, sigma = even.matches.pixels1, even.matches.pixels2, even.matches.sigma1_px
-    each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations)]
+    each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None)]
     seen = np.logical_and.reduce([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in each])
     start, level = even.pose.cam2_from_cam1, r.level_sigma_rad
     poses = []

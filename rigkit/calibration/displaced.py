@@ -1,0 +1,166 @@
+"""A calibrated camera with what it may do beyond its model as further parameters.
+
+Whatever propagates the covariance of a camera's parameters (certificates, planes, clouds) takes the lens's departures
+from its model (`departures`) along with them: a camera whose image is moved by
+
+    q' = q + sum_m c_m sum_j E_jm b_j(q),      q = the model's pixel,
+
+with b_j the displacements and E (J, M) a few modes of one standard deviation each, has the amounts c, all zero, as
+parameters after those of its model. The model's parameters follow each mode as the images make them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.calibration.departures import DISPLACEMENTS, displacements
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import FarProjection, projection_design
+from rigkit.cameras.base import Camera, RadialCurve, image_center
+from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.errors import InputError
+
+MODES_GRID = (24, 18)
+"""Columns and rows of pixels at which modes are weighed against the whole uncertainty."""
+MAX_LEFT_OUT = 0.02
+"""Modes that together make up less than this part of the variance at every pixel are left out: 1 % of a sigma."""
+TOLD_APART = 1e-6
+"""Displacements that differ by less than this part have the same share in a rival."""
+SLOPE_STEP_PX = 1e-2
+"""For the slope of displacements, which are polynomials over hundreds of pixels: exact to eight digits."""
+MAX_ROUNDS, ROUNDING_PX = 20, 1e-10
+"""Each round of going back through displacements takes their slope, a hundredth, off the error."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class DisplacedCamera(Camera):
+    """A camera whose image is moved by amounts of the modes (J, M), px, of displacements; `parameters` are those of
+    its `lens` and the amounts. Beyond the corners of the image displacements stay as they are there."""
+
+    lens: Camera
+    modes: FloatArray
+    _own: Camera = field(init=False, repr=False)
+    _amounts: FloatArray = field(init=False, repr=False)
+
+    model: ClassVar[str] = "displaced"
+
+    def _prepare(self) -> None:
+        count = self.lens.parameters.size
+        object.__setattr__(self, "_own", self.lens.with_parameters(self.parameters[:count]))
+        object.__setattr__(self, "_amounts", self.modes @ self.parameters[count:])
+
+    @classmethod
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        raise InputError("a displaced camera is one that was calibrated; a radial curve starts its lens alone")
+
+    def with_parameters(self, parameters: ArrayLike) -> Self:
+        return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64), self.lens, self.modes)
+
+    def parameter_names(self) -> tuple[str, ...]:
+        return (*self.lens.parameter_names(), *(f"departure {m + 1}" for m in range(self.modes.shape[1])))
+
+    @property
+    def max_angle_rad(self) -> float:
+        return self.lens.max_angle_rad
+
+    def _basis(self, u: FloatArray, v: FloatArray) -> FloatArray:
+        """Return the displacements (2, J, N) at pixels, those beyond the corners as on the circle through them."""
+        pixels, centre = np.stack([u, v], axis=-1), image_center(self.size_px)
+        off = pixels - centre
+        reach = 0.5 * np.hypot(*self.size_px) / np.maximum(np.linalg.norm(off, axis=-1), 1.0)
+        return displacements(centre + np.minimum(reach, 1.0)[:, None] * off, self.size_px)
+
+    def _displacement(self, u: FloatArray, v: FloatArray) -> FloatArray:
+        if not self._amounts.any():
+            return np.zeros((2, len(u)))
+        return np.asarray(np.einsum("ijn,j->in", self._basis(u, v), self._amounts))
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        u, v, valid = self._own._project(x, y, z)
+        du, dv = self._displacement(u, v)
+        return u + du, v + dv, valid
+
+    def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        off = np.zeros((2, len(u)))
+        for _ in range(MAX_ROUNDS):
+            before, off = off, self._displacement(u - off[0], v - off[1])
+            if not np.nanmax(np.abs(off - before), initial=0.0) > ROUNDING_PX:
+                break
+        return self._own._unproject(u - off[0], v - off[1])
+
+    def _derivatives(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        count = self.lens.parameters.size
+        of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :count]
+        u, v, valid = self._own._derivatives(x, y, z, d_pixels_d_point, of_lens)
+        if d_pixels_d_parameters is not None:
+            d_pixels_d_parameters[:, count:] = np.swapaxes(np.swapaxes(self._basis(u, v), 1, 2) @ self.modes, 1, 2)
+        if not self._amounts.any():
+            return u, v, valid
+        along_u, along_v = (
+            (self._displacement(u + s, v + t) - self._displacement(u - s, v - t)) / (2.0 * SLOPE_STEP_PX)
+            for s, t in ((SLOPE_STEP_PX, 0.0), (0.0, SLOPE_STEP_PX))
+        )
+        for block in (d_pixels_d_point, of_lens):
+            if block is not None:
+                block += along_u[:, None] * block[0] + along_v[:, None] * block[1]
+        du, dv = self._displacement(u, v)
+        return u + du, v + dv, valid
+
+
+def uncertain_camera(calibration: Calibration) -> UncertainCamera:
+    """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
+    with boards all over the image and a model that fits none do, and the camera is the calibration's own."""
+    far = FarProjection.of(calibration)
+    modes = telling_modes(far)
+    if not modes.size:
+        return UncertainCamera(calibration.camera, calibration.covariance)
+    lens = calibration.camera
+    camera = DisplacedCamera(lens.size_px, np.append(lens.parameters, np.zeros(modes.shape[1])), lens, modes)
+    p = lens.parameters.size
+    # What is right differs from what was found by each mode, less what the parameters have followed of it.
+    moves = np.concatenate([-far.departures.followed @ modes, np.eye(modes.shape[1])])
+    covariance = moves @ moves.T
+    covariance[:p, :p] += calibration.covariance
+    return UncertainCamera(camera, covariance)
+
+
+def telling_modes(far: FarProjection) -> FloatArray:
+    """Return modes (J, M) of displacements, px, of one standard deviation each, independent of each other: those of
+    what a lens may do beyond its model, its rivals too, that matter beside its parameters."""
+    pixels = grid_pixels(far.camera.size_px, MODES_GRID).reshape(-1, 2)
+    rays, valid = far.camera.unproject(pixels)
+    rays = rays[valid]
+    design = projection_design(far.camera, rays)
+    whole = np.sqrt(np.trace(far.covariance(rays), axis1=1, axis2=2))
+    known = np.isfinite(whole) & (whole > 0.0)
+    if not known.any():
+        return np.zeros((DISPLACEMENTS, 0))
+    # In sigmas of the whole: what matters where boards were is not less than what matters far from them.
+    relative = far.left_over(rays, design)[..., known].transpose(1, 2, 0) / whole[known, None]
+    fields = relative.reshape(DISPLACEMENTS, -1)
+    covariance = far.departures.covariance.copy()
+    for rival, away in far.away(rays, design):
+        moved = (away[known] / whole[known, None]).ravel()
+        amounts = np.linalg.lstsq(fields.T, moved, rcond=TOLD_APART)[0]
+        covariance += rival.likely * np.outer(amounts, amounts)
+    values, axes = np.linalg.eigh(covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    flat = root.T @ fields
+    # Smallest first: the shares add up until they matter at some pixel.
+    turn = np.linalg.eigh(flat @ flat.T)[1]
+    share = ((turn.T @ flat) ** 2).reshape(DISPLACEMENTS, -1, 2).sum(axis=-1)
+    matters = np.cumsum(share, axis=0).max(axis=1) > MAX_LEFT_OUT
+    return np.asarray((root @ turn)[:, matters])

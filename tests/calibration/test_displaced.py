@@ -1,0 +1,98 @@
+"""What a lens may do beyond its model goes along with the covariance of its parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.departures import DISPLACEMENTS, displacements
+from rigkit.calibration.displaced import DisplacedCamera, uncertain_camera
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import FarProjection, projection_design
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
+
+DEPARTS = np.zeros(DISPLACEMENTS)
+DEPARTS[5:7] = 0.3, -0.2
+"""Decentring, px in the corners."""
+
+
+def displaced(name: str, *, amounts: tuple[float, float]) -> DisplacedCamera:
+    known = lens(name)
+    modes = np.random.default_rng(3).normal(size=(DISPLACEMENTS, 2))
+    return DisplacedCamera(SIZE, np.concatenate([known.parameters, amounts]), known, modes)
+
+
+def departing(seed: int) -> Calibration:
+    """Return a calibration without decentring of a lens that has some."""
+    views, _, _ = random_views(lens("fish"), 20, np.random.default_rng(seed), reach_deg=80.0, noise_px=0.02)
+    moved = [np.einsum("ijn,j->ni", displacements(np.asarray(view.pixels), SIZE), DEPARTS) for view in views]
+    views = [replace(view, pixels=view.pixels + by) for view, by in zip(views, moved, strict=True)]
+    return calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)
+
+
+@pytest.mark.parametrize("name", ["reg", "fish"])
+def test_a_displaced_camera_is_a_camera(name: str, rng: np.random.Generator) -> None:
+    """There and back; derivatives are those of the projection; without amounts it is its lens."""
+    camera = displaced(name, amounts=(0.7, -1.3))
+    pixels = grid_pixels(SIZE, (12, 9)).reshape(-1, 2)
+    rays, valid = camera.unproject(pixels)
+    pixels, rays = pixels[valid], rays[valid]
+    assert camera.project(rays)[0] == pytest.approx(pixels, abs=1e-8)
+    assert np.abs(camera.project(rays)[0] - lens(name).project(rays)[0]).max() > 1.0
+    points = rays * rng.uniform(300.0, 900.0, (len(rays), 1))
+    _, _, by_point, by_parameters = camera.project_with_jacobians(points)
+    for k in range(3):
+        step = 1e-3 * np.eye(3)[k]
+        moved = (camera.project(points + step)[0] - camera.project(points - step)[0]) / 2e-3
+        assert by_point[..., k] == pytest.approx(moved, abs=1e-6)
+    for k, value in enumerate(camera.parameters):
+        change = 1e-6 * max(abs(float(value)), 1.0) * np.eye(camera.parameters.size)[k]
+        one, two = (camera.with_parameters(camera.parameters + s * change).project(points)[0] for s in (1.0, -1.0))
+        assert by_parameters[..., k] == pytest.approx((one - two) / (2.0 * change[k]), rel=1e-5, abs=1e-5)
+    as_lens = displaced(name, amounts=(0.0, 0.0))
+    assert (as_lens.project(points)[0] == lens(name).project(points)[0]).all()
+    assert (as_lens.unproject(pixels)[0] == lens(name).unproject(pixels)[0]).all()
+    with pytest.raises(InputError, match="parameters expected"):
+        camera.with_parameters(camera.parameters[:-1])
+
+
+def far_variance(known: UncertainCamera, calibration: Calibration, pixels: FloatArray) -> FloatArray:
+    """Return the variance (N,) of the projection by the covariance, after the rotation hidden at the corners."""
+    camera, p = known.camera, known.camera.parameters.size
+    sigmas = np.sqrt(np.diag(known.covariance))
+    corners = projection_design(camera, FarProjection.of(calibration).rays)
+    there = corners.transpose(1, 0, 2).reshape(p + 3, -1)
+    hides = np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0]
+    design = projection_design(camera, calibration.camera.unproject(pixels)[0])
+    left = sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", hides, design[:, p:])
+    return np.asarray(np.einsum("ikm,kl,ilm->m", left, known.covariance / np.outer(sigmas, sigmas), left))
+
+
+def test_the_covariance_with_departures_is_that_of_the_projection() -> None:
+    found = departing(0)
+    known, pixels = uncertain_camera(found), grid_pixels(SIZE, (20, 15)).reshape(-1, 2)
+    pixels = pixels[found.camera.unproject(pixels)[1]]
+    stated = FarProjection.of(found).covariance(found.camera.unproject(pixels)[0]).trace(axis1=1, axis2=2)
+    assert far_variance(known, found, pixels) == pytest.approx(stated, rel=0.05)
+    # The parameters alone say much less.
+    alone = far_variance(UncertainCamera(found.camera, found.covariance), found, pixels)
+    assert np.median(alone / stated) < 0.5
+    assert len(known.moved()) == known.camera.parameters.size
+
+
+def test_a_lens_that_is_its_model_stays_as_it_is(rng: np.random.Generator) -> None:
+    """Boards all over the image: what else it may do is little, and of few kinds."""
+    views, _, _ = random_views(lens("fish"), 30, rng, reach_deg=REACH_DEG["fish"], noise_px=0.1)
+    found = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0)
+    known: Camera = uncertain_camera(found).camera
+    assert known.parameters.size - found.camera.parameters.size <= 5
+    rays = known.unproject(views[0].pixels)[0]
+    assert rays == pytest.approx(found.camera.unproject(views[0].pixels)[0], abs=1e-12)
