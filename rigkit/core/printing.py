@@ -52,3 +52,8 @@ def _value(value: Any) -> str:
         if len(value) <= MAX_LISTED and all(isinstance(v, str | int | float) for v in value):
             words = repr(value)
     return words.splitlines()[0] if len(words) <= MAX_LENGTH else f"{words.splitlines()[0][:MAX_LENGTH]}..."
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: 1 image, 2 images."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -16,6 +16,7 @@ from rigkit.calibration.usable import BESIDE, other_size, views_of_image, withou
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
@@ -90,7 +91,7 @@ def session_views(
         # A first calibration that fails is asked for no reason.
         shown = explained(session.images, session.boards) if corners.source else None
         raise InputError(
-            f"{session.path}: no board can be used in {len(found)} images{camera}; "
+            f"{session.path}: no board can be used in {counted(len(found), 'image')}{camera}; "
             + (shown or f"{reasons[1]} times: {reasons[0]}; check columns and rows in the board file")
         )
     return views, size_px, dropped

@@ -17,7 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, counted
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
@@ -31,6 +31,7 @@ from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
+from rigkit.workflows.identify_board import explained, suggested_words
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,13 +127,22 @@ def detect_in_images(
         more = f"; so it is with {len(failures) - 1} more" if len(failures) > 1 else ""
         raise InputError(f"{next(iter(failures.values()))}{more}")
     if not any(found.values()) and not failures:
-        seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")
-        raise CheckFailed(
-            f"no chessboard found in {len(images)} images; check focus and exposure, or --min-corners{seen}"
-        )
+        raise CheckFailed(_nothing_found(images, boards, doubtful))
     if options.output is not None and any(found.values()):
         write_corners(options.output, found, force=options.force)
     return DetectionResult(found, failures, doubtful)
+
+
+def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Mapping[str, str]) -> str:
+    """Say what images show instead of what was looked for, where that is known, and otherwise what may be wrong."""
+    looked_for = " or ".join(f"'{board.board_id}'" for board in boards) if boards else "chessboard"
+    lead = f"no {'board ' if boards else ''}{looked_for} found in {counted(len(images), 'image')}"
+    shown = None if boards else suggested_words(images)
+    why = explained(images, boards) if boards else shown and f"they show --board {shown}"
+    if why:
+        return f"{lead}; {why}"
+    seen = next((f"; in '{name}' {words}" for name, words in doubtful.items()), "")
+    return f"{lead}; check focus and exposure, or --min-corners{seen}"
 
 
 def _frames_of(

@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
+from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
@@ -76,10 +77,9 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     names = tuple(Path(name).name for name in images)
     if guess is None:
         if unreadable:
-            raise InputError(f"no board is seen in {len(names)} images, and {unreadable[0]}")
-        raise CheckFailed(
-            f"no board is seen in {len(names)} images: no chessboard, ChArUco board, AprilGrid or grid of circles"
-        )
+            raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
+        nothing = "no chessboard, ChArUco board, AprilGrid or grid of circles"
+        raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {nothing}")
     return IdentifiedBoard(
         board=guess.board,
         seen=tuple(names[k] for k in guess.images),
@@ -104,8 +104,8 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
         return None
     what, count = guess.board.describe().split(", ")[0], len(guess.images)
     if what in words[0]:
-        return f"in {count} images {words[0]}"
-    return f"{what} seen in {count} images; {words[0]}"
+        return f"in {counted(count, 'image')} {words[0]}"
+    return f"{what} seen in {counted(count, 'image')}; {words[0]}"
 
 
 def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import MAX_IDENTIFIER
+from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.files import write_atomic
@@ -71,7 +72,7 @@ def find_pairs(
         what = "of the boards told is" if boards else "chessboard is"
         seen = suggested_words(images)
         such = f"they show --board {seen}, with MM measured" if seen else "other boards must be told: --board"
-        raise InputError(f"init: no {what} found in {len(shown)} images; {such}")
+        raise InputError(f"init: no {what} found in {counted(len(shown), 'image')}; {such}")
     return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))
 
 

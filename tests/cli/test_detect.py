@@ -120,3 +120,16 @@ def test_no_board_anywhere_fails_the_check(tmp_path: Path, capsys: pytest.Captur
     assert main(["detect", str(tmp_path / "flat.png"), "-o", str(tmp_path / "c.csv"), "--jobs", "1"]) == 1
     assert "no chessboard" in capsys.readouterr().err
     assert not (tmp_path / "c.csv").exists()
+
+
+def test_images_of_another_board_are_told_what_they_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = np.full((420, 480), 255, np.uint8)
+    for row in range(5):
+        for column in range(6):
+            cv2.circle(picture, (70 + 68 * column, 70 + 68 * row), 20, 0, cv2.FILLED, cv2.LINE_AA)
+    cv2.imwrite(str(tmp_path / "grid.png"), picture)
+    image = str(tmp_path / "grid.png")
+    assert main(["detect", image, "--jobs", "1"]) == 1
+    assert "they show --board circles:6x5" in capsys.readouterr().err
+    assert main(["detect", image, "--board", "aprilgrid:6x6x88,spacing=0.3", "--jobs", "1"]) == 1
+    assert "no board 'aprilgrid-6x6x88' found in 1 image; in 1 image a circles board" in capsys.readouterr().err
