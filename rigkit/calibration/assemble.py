@@ -9,7 +9,6 @@ import numpy as np
 from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
@@ -76,8 +75,7 @@ def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tup
     variance = np.diag(unit)
     if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
         raise not_identifiable(fit.state.camera.model)
-    products = view_products(observations, fit.state, fit.weight(observations))
-    information, score = reduced_by_cluster(products, n, clusters)
+    information, score = reduced_by_cluster(fit.data.products[0], n, clusters)
     prior = (normal.gg - fit.data.gg)[:n, :n]
     clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
     covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)

@@ -34,15 +34,15 @@ def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
     half = 0.5 * (flat**2).sum(axis=1)
     # Each part has corners of all views: most of what is covered at all is covered by the first.
     count = -(-len(corners) // CORNERS_OF_PART)
-    parts = [(np.ascontiguousarray(corners[k::count].T), limit[k::count]) for k in range(count)]
+    order = np.concatenate([np.arange(k, len(corners), count) for k in range(count)])
+    corners, limit = np.ascontiguousarray(corners[order].T), limit[order]
     for first in range(0, len(flat), PIXELS_AT_A_TIME):
-        left = np.arange(first, min(first + PIXELS_AT_A_TIME, len(flat)))
-        for some, beyond in parts:
-            there = (flat[left] @ some - beyond).max(axis=1) >= half[left]
+        left, begin = np.arange(first, min(first + PIXELS_AT_A_TIME, len(flat))), 0
+        while left.size and begin < len(order):
+            part = slice(begin, begin + CORNERS_OF_PART * PIXELS_AT_A_TIME // len(left))
+            there = (flat[left] @ corners[:, part] - limit[part]).max(axis=1) >= half[left]
             found[left[there]] = True
-            left = left[~there]
-            if not left.size:
-                break
+            left, begin = left[~there], part.stop
     return found.reshape(np.shape(pixels)[:-1])
 
 
@@ -78,10 +78,13 @@ def _reach_px(view: IntArray, grid: IntArray, corners: Pixels) -> FloatArray:
 
 def corner_ranges(calibration: Calibration) -> FloatArray:
     """Return the distances of all corners of the boards from the camera, in every view, (N,) mm."""
+    corners, shown = calibration.corners, np.array([view.board_id for view in calibration.views])
     found = []
     for board in calibration.boards:
-        poses = [view.cam_from_board for view in calibration.views if view.board_id == board.board_id]
-        back = np.array([pose.rotation.T for pose in poses])
-        there = board.points_mm @ back + np.array([[pose.translation_mm] for pose in poses])
-        found.append(np.sqrt((there**2).sum(axis=-1)).ravel())
+        views = np.flatnonzero(shown == board.board_id)
+        rotation, shift = corners.rotation[views], corners.translation_mm[views]
+        # |R X + t|^2 = |X|^2 + 2 X . R^T t + |t|^2.
+        squared = board.points_mm @ (2.0 * (shift[:, None] @ rotation)[:, 0]).T
+        squared += (board.points_mm**2).sum(axis=1)[:, None] + (shift**2).sum(axis=1)
+        found.append(np.sqrt(np.maximum(squared, 0.0)).ravel())
     return np.concatenate(found)

@@ -101,8 +101,7 @@ def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray,
     corners, camera = calibration.corners, calibration.camera
     used, count = _enough(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
-    rotation = np.ascontiguousarray(corners.rotation.transpose(1, 2, 0))
-    lever = (rotation[..., view] * corners.points_mm[used].T).sum(axis=1)
+    lever = np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
     x, y, z = lever + corners.translation_mm.T[:, view]
     by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
     u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)

@@ -35,40 +35,35 @@ def normal_equations(
     views, corners = weight.shape
     shape = state.shape
     count = state.camera.parameters.size + shape.basis.shape[-1]
-    gg, g = np.zeros((count, count)), np.zeros(count)
-    gp, pp = np.empty((views, count, 6)), np.empty((views, 6, 6))
-    p, costs = np.empty((views, 6)), np.empty(views)
+    products, costs = np.empty((views, count + 7, count + 7)), np.empty(views)
     # Coordinates first in memory: every later step takes u and v apart.
     px = np.moveaxis(np.empty((2, views, corners)), 0, -1)
     residuals = Residuals(px, np.empty((views, corners), dtype=bool))
     released = _Released(shape, views, count) if shape.kind == "released" else None
     for block, rows in _blocks(observations, state, weight, loss_px, residuals, costs):
-        # Per view only what involves its pose; the globals among themselves in one product over all corners.
-        each = np.moveaxis(rows, (1, 2), (0, 1))
-        product = (each @ np.swapaxes(each[:, :, count:], -1, -2)).sum(axis=0)
-        flat = rows[:count].reshape(count, rows[0].size)
-        gg += flat @ flat.T
-        g += product[:, :count, 6].sum(axis=0)
-        gp[block], pp[block], p[block] = product[:, :count, :6], product[:, count:-1, :6], product[:, count:-1, 6]
+        along_u, along_v = np.moveaxis(rows, (1, 2), (0, 1))
+        np.matmul(along_u, np.swapaxes(along_u, -1, -2), out=products[block])
+        products[block] += along_v @ np.swapaxes(along_v, -1, -2)
         if released is not None:
             by_board = _by_board(rows, state.rotation[block])
             released.add(rows, by_board, observations.corner[block], observations.present[block], block.start)
-    normal = NormalEquations(gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, residuals=(residuals,))
+    shared = products[:, :count].sum(axis=0)
+    normal = NormalEquations(
+        gg=shared[:, :count],
+        gp=products[:, :count, count:-1],
+        pp=products[:, count:-1, count:-1],
+        g=shared[:, -1],
+        p=products[:, count:-1, -1],
+        costs=costs,
+        residuals=(residuals,),
+        products=(products,),
+    )
     return normal if released is None else released.appended(normal)
 
 
 def view_products(observations: Observations, state: State, weight: FloatArray) -> FloatArray:
-    """Return of every view the sums of the products of its weighted rows, (V, K, K): derivatives by the parameters of
-    the camera, by the warps of the boards and by the pose (w, t), and last the residual. Released corners are held."""
-    views, corners = weight.shape
-    residuals, costs = Residuals(np.empty((views, corners, 2)), np.empty((views, corners), dtype=bool)), np.empty(views)
-    state = state.with_corners_held()
-    count = state.camera.parameters.size + state.shape.basis.shape[-1] + 7
-    out = np.empty((views, count, count))
-    for block, rows in _blocks(observations, state, weight, None, residuals, costs):
-        each = np.moveaxis(rows, (1, 2), (0, 1))
-        out[block] = (each @ np.swapaxes(each, -1, -2)).sum(axis=0)
-    return out
+    """Return the products of every view (V, K, K) that are in the normal equations, released corners held."""
+    return normal_equations(observations, state.with_corners_held(), weight).products[0]
 
 
 def _blocks(

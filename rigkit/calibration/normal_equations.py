@@ -57,6 +57,9 @@ class NormalEquations:
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
     costs : (V,) cost of each view's residuals, px^2.
     residuals : of the corners, not weighted; those of all cameras of a rig one after the other.
+    products : of every view the sums of the products of its weighted rows (V, K, K): derivatives by the parameters of
+        the camera, by the warps of the boards and by the pose (w, t), and last the residual; without released corners
+        and priors. Those of all cameras of a rig one after the other.
     prior_cost : what the priors add to the cost, px^2.
     points_from : the globals from here on are released board points: three each, coupled within a point only. None
         where there are none.
@@ -69,6 +72,7 @@ class NormalEquations:
     p: FloatArray
     costs: FloatArray
     residuals: tuple[Residuals, ...]
+    products: tuple[FloatArray, ...]
     prior_cost: float = 0.0
     points_from: int | None = None
 

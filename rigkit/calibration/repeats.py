@@ -12,6 +12,12 @@ REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
 PAIRS_AT_A_TIME = 2**18
 """Keeps the memory small."""
+MAX_ALONG_ONE_AXIS = 1024
+"""So many points at most are sorted along one axis; more of them along two."""
+MIN_STRIP = 1e-6
+"""No strip is narrower than this part of the whole: places along strips are then exact to 1e-10 of it."""
+SOUGHT_FURTHER = 1.001
+"""Pairs are sought this far, for rounding, and kept by their own distances."""
 
 
 def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequence[Pixels]) -> IntArray:
@@ -43,22 +49,35 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
 
 
 def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
-    """Return which of the points (N, D) are within `reach` of each other along every axis: i and j (P,), i < j."""
-    axes = np.argsort(-np.ptp(points, axis=0), kind="stable")
-    order = np.argsort(points[:, axes[0]], kind="stable")
-    along, *others = points[order][:, axes].T.copy()
-    # Every point with those that follow it along the axis in which they are the furthest apart.
-    ahead = np.searchsorted(along, along + reach, side="right") - np.arange(len(order)) - 1
+    """Return which of the points (N, D), D > 1, are within `reach` of each other along every axis: i < j, (P,) each."""
+    extent = np.ptp(points, axis=0)
+    axes = np.argsort(extent, kind="stable")
+    there, many = np.arange(len(points)), len(points) > MAX_ALONG_ONE_AXIS
+    side = max(reach, MIN_STRIP * float(extent.max()), np.finfo(float).tiny)
+    place, length = points[:, axes[-1]], 0.0
+    if many:
+        # In strips across the axis in which they are the furthest apart, one after the other along the next one: close
+        # ones are in the same strip or in the next.
+        strip, along = (place - place.min()) // side, points[:, axes[-2]]
+        length = float(extent[axes[-2]]) + 4.0 * side
+        place = along - along.min() + strip * length
+    order = np.argsort(place, kind="stable")
+    place, ordered = place[order], points[order][:, axes].T.copy()
+    runs = [(there + 1, np.searchsorted(place, place + SOUGHT_FURTHER * side, side="right"))]
+    if many:
+        ends = place + length - SOUGHT_FURTHER * side, place + length + SOUGHT_FURTHER * side
+        runs.append((np.searchsorted(place, ends[0]), np.searchsorted(place, ends[1])))
     found = [np.zeros((2, 0), np.int64)]
-    for block in np.array_split(np.arange(len(order)), 1 + int(ahead.sum()) // PAIRS_AT_A_TIME):
-        count = ahead[block]
-        first = np.repeat(block, count)
-        second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(count) - count, count)
-        for values in others:
-            # Most pairs are told apart by the first of the other axes.
-            close = np.abs(values[first] - values[second]) <= reach
-            first, second = first[close], second[close]
-        found.append(order[np.stack([first, second])])
+    for begin, end in runs:
+        ahead = end - begin
+        for block in np.array_split(there, 1 + int(ahead.sum()) // PAIRS_AT_A_TIME):
+            count = ahead[block]
+            first = np.repeat(block, count)
+            second = np.arange(len(first)) + np.repeat(begin[block] - np.cumsum(count) + count, count)
+            for values in ordered:
+                close = np.abs(values[first] - values[second]) <= reach
+                first, second = first[close], second[close]
+            found.append(order[np.stack([first, second])])
     pairs = np.sort(np.concatenate(found, axis=1), axis=0)
     return pairs[0], pairs[1]
 

@@ -171,7 +171,8 @@ class Brown(Camera):
             here *= np.minimum(1.0, self._max_r / length)
             # The next step is (size / before)^2 of this one, for as long as the convergence is quadratic.
             size = np.abs(step[0]) + np.abs(step[1])
-            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= NEWTON_SETTLED * (1.0 + length))
+            reached = np.minimum(length, self._max_r)
+            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= NEWTON_SETTLED * (1.0 + reached))
             before = np.maximum(size, 1e-300)
             plane[:, moving] = here
             if not unsettled.all():
@@ -187,7 +188,9 @@ class Brown(Camera):
         # Even steps of the angle, because r runs away towards 90 degrees.
         knots = np.tan(np.linspace(0.0, np.arctan(self._max_r), KNOTS))
         radius = np.sqrt(m[0] ** 2 + m[1] ** 2)
-        found = np.interp(radius, knots * self._radial(knots * knots)[0], knots)
+        # Where the denominator vanishes at the edge, rounding may have it infinite or negative there.
+        values = np.fmax.accumulate(knots * self._radial(knots * knots)[0])
+        found = np.interp(radius, values, knots)
         return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
 
     def _derivatives(

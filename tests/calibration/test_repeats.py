@@ -10,7 +10,7 @@ from rigkit.calibration.repeats import close_pairs
 from rigkit.core.arrays import FloatArray
 
 
-@pytest.mark.parametrize("count", [1, 2, 300])
+@pytest.mark.parametrize("count", [1, 2, 300, 1100])
 @pytest.mark.parametrize("at_a_time", [7, 2**18])
 def test_close_pairs_are_those_of_all_with_all(
     count: int, at_a_time: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch

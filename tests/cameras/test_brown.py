@@ -53,3 +53,17 @@ def test_pixels_beyond_the_fold_have_no_ray() -> None:
 def test_field_of_view_ends_where_the_denominator_vanishes() -> None:
     camera = _brown(0.0, 0.0, 0.0, 0.0, 0.0, -0.5, 0.0, 0.0)
     assert np.tan(camera.max_angle_rad) <= np.sqrt(2.0)
+
+
+def test_a_pole_at_the_edge_leaves_the_middle_alone() -> None:
+    """Found by a calibration: rounding puts the last tangent tried just beyond the pole of the denominator, where the
+    radius is minus infinity."""
+    distortion = (-0.21704038890666294, -0.04974512324895835, 0.0004146353136183291, -0.00023144410004960334)
+    rational = (-0.04488481845697748, -0.024700984939316398, -0.17197159475241827, -0.06265940416793397)
+    focal_and_centre = (1363.6642418578524, 1364.6908712673348, 808.3415937044739, 615.260008997579)
+    camera = Brown((1624, 1240), np.array([*focal_and_centre, *distortion, *rational]))
+    u, v = np.meshgrid(np.linspace(0.0, 1623.0, 40), np.linspace(0.0, 1239.0, 30))
+    pixels = np.stack([u, v], axis=-1)
+    rays, valid = camera.unproject(pixels)
+    assert valid.all()
+    assert camera.project(rays)[0] == pytest.approx(pixels, abs=1e-6)

@@ -7,12 +7,12 @@ intrinsics, mounts and places of boards, and the boards' warps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rigkit.calibration.clustered import Clustered, clustered_covariance
-from rigkit.calibration.linearise import view_products
 from rigkit.calibration.normal_equations import NormalEquations, pose_inverses
 from rigkit.calibration.rig.solver import pose_jacobians, with_rig_priors
 from rigkit.calibration.rig.state import RigObservations, RigState
@@ -35,7 +35,7 @@ def clustered_by_frame(
     frame : (F,) int, number of the frame of every pose.
     sigma_px : standard deviation of a corner, from all residuals.
     """
-    information, score = _by_frame(observations, state, frame)
+    information, score = _by_frame(normal.products, observations, state, frame)
     n = score.shape[1]
     coupling = normal.gp[:, :n]
     back = coupling @ pose_inverses(normal.pp)
@@ -46,16 +46,18 @@ def clustered_by_frame(
     return clustered_covariance(unit[:n, :n], information, score, prior, sigma_px)
 
 
-def _by_frame(observations: RigObservations, state: RigState, frame: IntArray) -> tuple[FloatArray, FloatArray]:
+def _by_frame(
+    products: Sequence[FloatArray], observations: RigObservations, state: RigState, frame: IntArray
+) -> tuple[FloatArray, FloatArray]:
     """Return what every frame adds to the normal equations of the globals, released corners held, (frames, n, n)
-    and (frames, n)."""
+    and (frames, n), from the products of the views of each camera."""
     layout = state.layout(observations)
     warps = observations.shape.basis.shape[-1] if layout.shape.stop > layout.shape.start else 0
     n = layout.shape.start + warps
     information, score = np.zeros((int(frame.max()) + 1, n, n)), np.zeros((int(frame.max()) + 1, n))
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
-        product = view_products(own, alone, observations.weights[c])
+        product = products[c]
         p = alone.camera.parameters.size + warps
         by = pose_jacobians(observations, state, c, alone.translation_mm)
         at = frame[observations.frame[c]]

@@ -11,12 +11,13 @@ so the six columns of each view's own pose are carried over to target, mount and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations, Residuals
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.poses import refine_each
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.state import RigObservations, RigState
@@ -73,11 +74,11 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     gg, g = np.zeros((count, count)), np.zeros(count)
     gp, pp, p = np.zeros((poses, count, 6)), np.zeros((poses, 6, 6)), np.zeros((poses, 6))
     costs = np.zeros(poses)
-    residuals: tuple[Residuals, ...] = ()
+    each: list[NormalEquations] = []
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(own, alone, observations.weights[c])
-        residuals += n.residuals
+        each.append(n)
         f = observations.frame[c]
         by = pose_jacobians(observations, state, c, alone.translation_mm)
         k, size = layout.cameras[c], alone.camera.parameters.size
@@ -119,8 +120,14 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     released = None
     if observations.shape.kind == "released":
         released = layout.shape.start + observations.shape.basis.shape[-1]
-    normal = NormalEquations(gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, residuals=residuals, points_from=released)
-    return with_rig_priors(normal, observations, state, sigma_px)
+    whole = replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
+    return with_rig_priors(whole, observations, state, sigma_px)
+
+
+def _joined(each: Sequence[NormalEquations]) -> NormalEquations:
+    """Return the first with what those of all cameras know of their corners and views."""
+    residuals = tuple(own for normal in each for own in normal.residuals)
+    return replace(each[0], residuals=residuals, products=tuple(own for normal in each for own in normal.products))
 
 
 def with_rig_priors(
