@@ -33,8 +33,8 @@ from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
 from rigkit.io.files import write_atomic
 from rigkit.io.matcher_arrays import from_matcher
-from rigkit.io.numbers import MAX_NUMBER
-from rigkit.io.reading import csv_rows, read_bytes
+from rigkit.io.numbers import MAX_NUMBER, is_number
+from rigkit.io.reading import csv_table, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
@@ -77,7 +77,7 @@ def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Corres
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         raise InputError(f"correspondences '{source}': the file is empty; give another")
-    if _is_number(re.split(r"[\s,;]+", lines[0].strip())[0]):
+    if is_number(re.split(r"[\s,;]+", lines[0].strip())[0]):
         return _from_extractor(source, lines)
     return _from_csv(source)
 
@@ -110,8 +110,7 @@ def write_correspondences(path: str | Path, found: Correspondences, *, force: bo
 
 
 def _from_csv(source: Path) -> Correspondences:
-    lines = csv_rows(source, "correspondences")
-    header = [name.strip() for name in next(lines)[1]]
+    header, lines = csv_table(source, "correspondences")
     fixed = (*POINT_COLUMNS, *AFFINE, *SIGMA_COLUMNS)
     unknown = [name for name in header if name not in fixed and not DIRECTION.match(name)]
     if unknown or len(set(header)) != len(header):
@@ -119,19 +118,13 @@ def _from_csv(source: Path) -> Correspondences:
         known = ", ".join((*POINT_COLUMNS, *AFFINE, "du1_1", "...", *SIGMA_COLUMNS))
         raise InputError(f"correspondences '{source}': {what}; known: {known}")
     rows = []
-    for number, line in lines:
-        if line[0].lstrip().startswith("#"):
-            continue
+    for number, cells in lines:
         try:
-            rows.append([float(field) if field.strip() else np.nan for field in line])
+            rows.append([float(field) if field else np.nan for field in cells.values()])
         except ValueError as error:
             raise InputError(
                 f"correspondences '{source}', line {number}: {error}; write a number, or nothing"
             ) from error
-        if len(line) != len(header):
-            raise InputError(
-                f"correspondences '{source}', line {number}: {len(line)} fields for {len(header)} columns; correct it"
-            )
     table = dict(zip(header, np.array(rows, dtype=np.float64).reshape(-1, len(header)).T, strict=True))
     for group in (POINT_COLUMNS, AFFINE):
         lacking = [name for name in group if name not in table]
@@ -268,11 +261,3 @@ def _built(
         return Correspondences(pixels1, pixels2, A21, pairs, table.get("sigma_px"), table.get("sigma_A"))
     except InputError as error:
         raise InputError(f"correspondences '{source}': {error}; correct the columns") from error
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True

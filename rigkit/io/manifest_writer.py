@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.board_file import board_values
 from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.manifest import DATASET_SCHEMA
+from rigkit.io.toml_reader import relative_path, toml_text
 
 SIDES = (
     (re.compile(r"(left|_l|-l|view1|cam1|_1|-1|a)$", re.IGNORECASE), 1),
@@ -52,9 +52,9 @@ class ToldBoard:
 
     def lines(self, root: Path) -> list[str]:
         """Return the board as it stands in a manifest in the folder `root`."""
-        named = ["[[boards]]", f"id = {_quoted(self.board.board_id)}"]
+        named = ["[[boards]]", f"id = {toml_text(self.board.board_id)}"]
         if self.file is not None:
-            return [*named, f"file = {_quoted(_relative(self.file.resolve(), root))}", ""]
+            return [*named, f"file = {toml_text(relative_path(self.file, root))}", ""]
         values = board_values(self.board)
         return [*named, *(f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items()), ""]
 
@@ -181,7 +181,7 @@ def manifest_text(
         f'schema = "{DATASET_SCHEMA}"',
     ]
     most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
-    out += [f"name = {_quoted(name)}", ""]
+    out += [f"name = {toml_text(name)}", ""]
     if isinstance(told, float):
         counts = ", ".join(f"{n} of {c}x{r}" for (c, r), n in Counter(most).items())
         out.append(f"# Most boards in one image: {counts}.")
@@ -198,7 +198,7 @@ def manifest_text(
         out += ["# All taken as those of one camera that was moved. Where there are two, add another [[cameras]]"]
         out += ["# with its own calibration, and name it in camera2 below."]
     for camera, calibration in calibrations.items():
-        out += ["[[cameras]]", f"id = {_quoted(camera)}", f"calibration = {_quoted(calibration)}", ""]
+        out += ["[[cameras]]", f"id = {toml_text(camera)}", f"calibration = {toml_text(calibration)}", ""]
     for pair in pairs:
         out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], ids)
         out += _truth_lines(baselines.get(pair.name), angles.get(pair.name), ids)
@@ -214,9 +214,12 @@ def _pair_lines(
 ) -> list[str]:
     seen = " and ".join(_words(s) for s in (pair.first, pair.second))
     out = [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']
-    out += [f"camera{i} = {_quoted(camera)}" for i, camera in enumerate(cameras, start=1)]
-    out += [f"image{i} = {_quoted(_relative(s.image, root))}" for i, s in enumerate((pair.first, pair.second), start=1)]
-    return [*out, f'pose_type = "{pose_type}"', f"boards = [{', '.join(map(_quoted, boards))}]", ""]
+    out += [f"camera{i} = {toml_text(camera)}" for i, camera in enumerate(cameras, start=1)]
+    out += [
+        f"image{i} = {toml_text(relative_path(s.image, root))}"
+        for i, s in enumerate((pair.first, pair.second), start=1)
+    ]
+    return [*out, f'pose_type = "{pose_type}"', f"boards = [{', '.join(map(toml_text, boards))}]", ""]
 
 
 def _truth_lines(
@@ -231,18 +234,13 @@ def _truth_lines(
         out.append('# baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule between tripod marks" }')
     if angle is not None and len(boards) > 1:
         tail = f'value_deg = {angle[0]:g}, sigma_deg = {angle[1]:g}, how = "as told to rigkit init"'
-        rows = [f"    {{ a = {_quoted(a)}, b = {_quoted(b)}, {tail} }}," for a, b in combinations(boards, 2)]
+        rows = [f"    {{ a = {toml_text(a)}, b = {toml_text(b)}, {tail} }}," for a, b in combinations(boards, 2)]
         out += ["angles = [", *rows, "]"]
     else:
         out.append(
             '# angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
         )
     return [*out, ""]
-
-
-def _quoted(text: str) -> str:
-    """Return a basic string of TOML, which has the escapes of JSON."""
-    return json.dumps(text, ensure_ascii=False)
 
 
 def _pair_name(parent: Path, stem: str, root: Path) -> str:
@@ -253,7 +251,3 @@ def _pair_name(parent: Path, stem: str, root: Path) -> str:
 
 def _words(found: ImageBoards) -> str:
     return ", ".join(f"{columns}x{rows}" for columns, rows in found.boards)
-
-
-def _relative(path: Path, root: Path) -> str:
-    return Path(os.path.relpath(path, root)).as_posix()

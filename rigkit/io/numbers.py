@@ -23,3 +23,12 @@ def fault_of_number(value: object, *, positive: bool = True) -> str | None:
     if positive and value < MIN_POSITIVE:
         return f"at least {MIN_POSITIVE:g}"
     return None
+
+
+def is_number(text: str) -> bool:
+    """Say whether words are a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

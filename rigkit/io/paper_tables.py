@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 from rigkit.core.errors import InputError
-from rigkit.io.reading import read_text
+from rigkit.io.numbers import is_number
+from rigkit.io.reading import csv_table
 from rigkit.validation.tables import PaperTables
 
 PLANES_FILE = "planes.csv"
@@ -23,18 +22,14 @@ def load_paper_tables(folder: str | Path) -> PaperTables:
 
 
 def _read(path: Path) -> dict[str, dict[str, str]]:
-    head, *rows = list(csv.reader(io.StringIO(read_text(path, "the paper's table")))) or [[]]
-    names = [_without_unit(name) for name in head]
+    head, rows = csv_table(path, "the paper's table")
     out: dict[str, dict[str, str]] = {}
-    for number, row in enumerate(rows, start=2):
-        if len(row) != len(names):
-            raise InputError(f"{path}: line {number} has {len(row)} cells, the head has {len(names)}; correct it")
-        for cell in row[1:]:
-            try:
-                float(cell)
-            except ValueError as error:
-                raise InputError(f"{path}: line {number}: {cell!r} is not a number; correct it") from error
-        out[_without_unit(row[0])] = dict(zip(names[1:], row[1:], strict=True))
+    for line, row in rows:
+        name, *cells = row.values()
+        for cell in cells:
+            if not is_number(cell):
+                raise InputError(f"{path}: line {line}: {cell!r} is not a number; correct it")
+        out[_without_unit(name)] = dict(zip(map(_without_unit, head[1:]), cells, strict=True))
     if not out:
         raise InputError(f"{path}: no rows; restore the file")
     return out

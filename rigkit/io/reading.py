@@ -89,6 +89,32 @@ def csv_rows(path: str | Path, what: str = "", *, delimiter: str = ",") -> Itera
         raise InputError(f"{_named(path, what)}, line {reader.line_num}: {error}; correct the line") from error
 
 
+def csv_table(
+    path: str | Path, what: str = "", *, delimiter: str = ","
+) -> tuple[list[str], list[tuple[int, dict[str, str]]]]:
+    """Return the head of a CSV file and its rows, each with its line number, cells by column and without blanks around;
+    empty rows and those that begin with # are left out.
+
+    Raises InputError as `csv_rows` does, and for a row that has not as many cells as the head.
+    """
+    head: list[str] = []
+    rows = []
+    for line, row in csv_rows(path, what, delimiter=delimiter):
+        cells = [cell.strip() for cell in row]
+        if not any(cells) or cells[0].startswith("#"):
+            continue
+        if not head:
+            head = cells
+            continue
+        if len(cells) != len(head):
+            raise InputError(
+                f"{_named(path, what)}, line {line}: {len(cells)} cells, but the head has {len(head)}; correct "
+                "the row, with quotes around text that has a comma"
+            )
+        rows.append((line, dict(zip(head, cells, strict=True))))
+    return head, rows
+
+
 @contextmanager
 def about(*paths: str | Path) -> Iterator[None]:
     """Let errors of the block, which is about these files, name them."""

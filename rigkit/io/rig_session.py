@@ -52,7 +52,7 @@ from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.session import SESSION_SCHEMA, Session, beside_session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.io.truth_file import truth_from_table
+from rigkit.io.truth_file import measured_value, truth_from_table
 
 FRAMES = ("name", "number", "order")
 HINT_ID = 'id = "left"'
@@ -207,11 +207,9 @@ def _baselines(table: TomlTable, names: Sequence[str]) -> tuple[MeasuredBaseline
         a, b = (entry.text(key, hint=f'{key} = "{names[0]}"', choices=names) for key in "ab")
         if a == b:
             raise entry.error(f"'a' and 'b' are both '{a}'; name two cameras")
-        value = entry.number("value_mm", hint="value_mm = 300.0")
-        sigma = entry.number("sigma_mm", hint="sigma_mm = 0.5: how far off the measurement may well be")
-        how = entry.text("how", hint='how = "steel rule": by what it was measured')
+        measured = measured_value(entry, "mm")
         entry.done()
-        out.append(MeasuredBaseline(a, b, MeasuredLength(value, sigma, how)))
+        out.append(MeasuredBaseline(a, b, MeasuredLength(*measured)))
     return tuple(out)
 
 

@@ -21,7 +21,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.io.numbers import MAX_NUMBER
-from rigkit.io.reading import csv_rows
+from rigkit.io.reading import csv_table
 
 LENGTHS = {"mm": 1.0, "m": 1000.0}
 TURNS = {"rad": 1.0, "deg": np.pi / 180.0}
@@ -40,8 +40,7 @@ def read_robot_poses(path: str | Path, images: Sequence[str] = ()) -> dict[str, 
     around it.
     """
     source = Path(path)
-    rows = [(line, row) for line, row in csv_rows(source, "robot poses") if not row[0].lstrip().startswith("#")]
-    head = [cell.strip() for cell in rows[0][1]] if rows else []
+    head, rows = csv_table(source, "robot poses")
     length = next((unit for unit in LENGTHS if all(f"{axis}_{unit}" in head for axis in "xyz")), None)
     turn = next((unit for unit in TURNS if all(f"r{axis}_{unit}" in head for axis in "xyz")), None)
     key = "image" if "image" in head else "timestamp_ns"
@@ -51,11 +50,8 @@ def read_robot_poses(path: str | Path, images: Sequence[str] = ()) -> dict[str, 
             "qx, qy, qz, qw or rx_rad, ry_rad, rz_rad (or _deg)"
         )
     poses: dict[str, Rigid3] = {}
-    for line, row in rows[1:]:
+    for line, cells in rows:
         where = f"'{source}', line {line}"
-        if len(row) != len(head):
-            raise InputError(f"{where}: {len(row)} cells under {len(head)} columns; correct the row")
-        cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
         try:
             place = np.array([float(cells[f"{axis}_{length}"]) for axis in "xyz"]) * LENGTHS[length]
             keys = QUATERNION if turn is None else tuple(f"r{axis}_{turn}" for axis in "xyz")

@@ -85,7 +85,6 @@ _SHAPE = obj(
         "target?": DECLARED_BOARD,
     }
 )
-_RIVAL = obj({"name": said(TEXT, "among the candidates"), "likely": said(NUMBER, "0 to 1"), "camera": _CAMERA})
 CALIBRATION_FILE = file(
     "rigkit.calibration/1",
     "A calibrated camera; with `camera` alone, a camera of another tool",
@@ -97,10 +96,8 @@ CALIBRATION_FILE = file(
         "freedom?": _FREEDOM,
         "verdicts?": said(array(_FINDING), "what is good and what is not, the headline first"),
         "candidates?": said(array(of_dataclass(Candidate)), "models, degrees and board shapes tried"),
-        "rivals?": said(
-            array(
-                obj({"name": said(TEXT, "among the candidates"), "likely": said(NUMBER, "0 to 1"), "camera": _CAMERA})
-            ),
+        "rivals?": rows(
+            {"name": said(TEXT, "among the candidates"), "likely": said(NUMBER, "0 to 1"), "camera": _CAMERA},
             "lenses of other models that the images support about as well, and how likely each is the better one",
         ),
         "convergence?": said(of_dataclass(Convergence), "of the final solve"),

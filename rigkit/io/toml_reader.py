@@ -7,6 +7,7 @@ Every message names the file, the table and the key, and says what to write.
 from __future__ import annotations
 
 import difflib
+import json
 import os
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -49,6 +50,24 @@ def named_path(path: Path) -> Path:
     Frames, views and reports go by names of images; a store of data (git-annex, DVC) links them to checksums.
     """
     return path.parent.resolve() / path.name
+
+
+def toml_text(text: str) -> str:
+    """Return a basic string of TOML, which has the escapes of JSON; raises InputError for what UTF-8 cannot hold."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{text!r}: a file of UTF-8 cannot hold this name; rename the file") from error
+    return json.dumps(text, ensure_ascii=False)
+
+
+def relative_path(path: Path, folder: Path) -> str:
+    """Return a path as a file in `folder` names it: from there, under its own name (`named_path`), whole where it is on
+    another drive."""
+    try:
+        return Path(os.path.relpath(named_path(path), folder.resolve())).as_posix()
+    except ValueError:
+        return named_path(path).as_posix()
 
 
 class TomlTable:

@@ -21,7 +21,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.numbers import fault_of_number
-from rigkit.io.reading import csv_rows, read_text
+from rigkit.io.reading import csv_table, read_text
 from rigkit.io.truth_file import make_angle, make_distance
 
 TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
@@ -82,21 +82,7 @@ def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
     """Return the head and the rows that are not empty, each with its line."""
     first = read_text(source, "truth table").partition("\n")[0]
     delimiter = ";" if first.count(";") > first.count(",") else ","
-    head: list[str] = []
-    rows: list[tuple[int, Row]] = []
-    for line, cells in csv_rows(source, "truth table", delimiter=delimiter):
-        cleaned = [cell.strip() for cell in cells]
-        if not any(cleaned):
-            continue
-        if not head:
-            head = cleaned
-            continue
-        if len(cleaned) != len(head):
-            raise InputError(
-                f"{source}: line {line}: {len(cleaned)} cells, but the head has {len(head)}; put quotes "
-                "around text with a comma, and write numbers with a decimal point"
-            )
-        rows.append((line, dict(zip(head, cleaned, strict=True))))
+    head, rows = csv_table(source, "truth table", delimiter=delimiter)
     if not rows:
         raise InputError(f"{source}: no measurements; start with the head {EXAMPLE} and add a row each")
     return head, rows

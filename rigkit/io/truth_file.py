@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
 from rigkit.io.toml_reader import TomlTable
+
+Measured = TypeVar("Measured", MeasuredAngle, MeasuredDistance)
 
 HINT_BASELINE = 'baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule" }'
 HINT_ANGLES = 'angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
@@ -21,28 +24,34 @@ def truth_from_table(table: TomlTable, boards: Sequence[Board]) -> PairTruth:
     baseline = None
     if table.has("baseline"):
         inner = table.table("baseline", hint=HINT_BASELINE)
-        measured = _value(inner, "mm")
+        measured = measured_value(inner, "mm")
         inner.done()
         with inner.located():
             baseline = MeasuredLength(*measured)
-    angles = []
-    if table.has("angles"):
-        for inner in table.tables("angles", hint=HINT_ANGLES):
-            a, b = (inner.text(key, hint=f'{key} = "{boards[0].board_id}"') for key in "ab")
-            measured = _value(inner, "deg")
-            inner.done()
-            with inner.located():
-                angles.append(make_angle(a, b, *measured, boards))
-    distances = []
-    if table.has("distances"):
-        for inner in table.tables("distances", hint=HINT_DISTANCES):
-            a, b = (inner.text(key, hint=f'{key} = "{boards[0].board_id}.centre"') for key in "ab")
-            measured = _value(inner, "mm")
-            inner.done()
-            with inner.located():
-                distances.append(make_distance(a, b, *measured, boards))
+    angles = _between(table, "angles", HINT_ANGLES, ("deg", ""), boards, make_angle)
+    distances = _between(table, "distances", HINT_DISTANCES, ("mm", ".centre"), boards, make_distance)
     table.done()
-    return PairTruth(baseline, tuple(angles), tuple(distances))
+    return PairTruth(baseline, angles, distances)
+
+
+def _between(
+    table: TomlTable,
+    key: str,
+    hint: str,
+    unit_and_place: tuple[str, str],
+    boards: Sequence[Board],
+    make: Callable[[str, str, float, float, str, Sequence[Board]], Measured],
+) -> tuple[Measured, ...]:
+    """Return what was measured between two things each; none where the key is not there."""
+    unit, place = unit_and_place
+    out = []
+    for inner in table.tables(key, hint=hint) if table.has(key) else ():
+        a, b = (inner.text(end, hint=f'{end} = "{boards[0].board_id}{place}"') for end in "ab")
+        measured = measured_value(inner, unit)
+        inner.done()
+        with inner.located():
+            out.append(make(a, b, *measured, boards))
+    return tuple(out)
 
 
 def make_angle(a: str, b: str, value_deg: float, sigma_deg: float, how: str, boards: Sequence[Board]) -> MeasuredAngle:
@@ -85,7 +94,7 @@ def _board_of(board_id: str, boards: Sequence[Board]) -> Board:
     raise InputError(f"board '{board_id}' is not in this pair; known: {', '.join(b.board_id for b in boards)}")
 
 
-def _value(table: TomlTable, unit: str) -> tuple[float, float, str]:
+def measured_value(table: TomlTable, unit: str) -> tuple[float, float, str]:
     """Return (value, sigma, how); none has a default."""
     value = table.number(f"value_{unit}", hint=f"value_{unit} = 90.0" if unit == "deg" else f"value_{unit} = 300.0")
     sigma = table.number(f"sigma_{unit}", hint=f"sigma_{unit} = 0.5: how far off the measurement may well be")

@@ -17,7 +17,7 @@ import numpy as np
 
 from rigkit.core.errors import InputError
 from rigkit.io.images import Image, quiet_opencv, require_pixels
-from rigkit.io.reading import csv_rows
+from rigkit.io.reading import csv_table
 
 _log = logging.getLogger(__name__)
 
@@ -141,18 +141,16 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
     InputError
         Columns are missing, a field is no number, or a camera has no rows.
     """
-    lines = csv_rows(path, "timestamps")
-    head = [cell.strip() for cell in next(lines, (0, []))[1]]
+    head, lines = csv_table(path, "timestamps")
     if not set(TIMESTAMPS) <= set(head):
         raise InputError(f"'{path}': the first line must name the columns {', '.join(TIMESTAMPS)}, a row a frame")
-    places = [head.index(name) for name in TIMESTAMPS]
     named = {_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
     moments: dict[int, dict[str, int]] = {}
     for line, row in lines:
         try:
-            at, called, counted = (row[place] for place in places)
-            camera, moment, frame = named.get(called.strip()), int(at), int(counted)
-        except (IndexError, ValueError) as error:
+            at, called, counted = (row[column] for column in TIMESTAMPS)
+            camera, moment, frame = named.get(called), int(at), int(counted)
+        except ValueError as error:
             raise InputError(
                 f"'{path}', line {line}: sync_index and frame_index must be whole numbers; correct the line"
             ) from error

@@ -20,8 +20,7 @@ from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.calibration_facts import IMAGES, LEFT_OUT, NEXT, camera_facts, next_words, rig_facts
-from rigkit.report.facts_page import BADGES
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.facts_page import told
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.scene_view import boards_scene, rig_scene
@@ -108,7 +107,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
         "heldout": "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px",
         "training": f"{rig.rms_px:.3f} px",
         "findings": _findings(rig.verdicts),
-        "told": _told(facts),
+        "told": told(facts),
         "basis": facts.basis,
         "scene": rig_scene(rig),
         "tables": [shown_table(table) for table in facts.tables],
@@ -126,7 +125,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         "training": f"{c.rms_px:.3f} px",
         "basis": facts.basis,
         "findings": _findings(c.verdicts),
-        "told": _told(facts),
+        "told": told(facts),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
@@ -141,11 +140,6 @@ def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
         return []
     names = [str(row[0].value) for row in table.rows]
     return [sources.get(name) if name not in names[:k] else None for k, name in enumerate(names)]
-
-
-def _told(facts: PageFacts) -> dict[str, str]:
-    """Return the verdict that stands first: in a word or two, and the result in the user's units."""
-    return {"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline}
 
 
 def _kept(c: Calibration) -> Pixels:

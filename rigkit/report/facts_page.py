@@ -11,6 +11,11 @@ from rigkit.report.render import data_uri, drawing, render, shown_table
 BADGES = {None: "look", True: "pass", False: "fail"}
 
 
+def told(facts: PageFacts) -> dict[str, str]:
+    """Return the verdict that stands first: in a word or two, and the result in the user's units."""
+    return {"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline}
+
+
 def build_facts_page(
     title: str,
     facts: PageFacts,
@@ -35,7 +40,7 @@ def build_facts_page(
         "facts.html",
         title=title,
         lead="",
-        told={"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline},
+        told=told(facts),
         sentences=facts.sentences,
         links=links,
         pictures=[

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
+from rigkit.io.numbers import is_number
 
 MAX_DECIMALS = 6
 """Of a value with its sigma: nanometres."""
@@ -153,6 +154,14 @@ def tables_to_text(tables: Sequence[Table]) -> str:
     return "\n\n".join(parts)
 
 
+TABLE_WRITERS = {"md": tables_to_markdown, "csv": tables_to_csv, "tex": tables_to_latex, "json": tables_to_json}
+
+
+def table_files(tables: Sequence[Table], stem: str, *endings: str) -> dict[str, str]:
+    """Return tables as files (name -> content), of all kinds or of such `endings`."""
+    return {f"{stem}.{ending}": TABLE_WRITERS[ending](tables) for ending in endings or TABLE_WRITERS}
+
+
 def _cell_dict(cell: Cell) -> Any:
     value = None if isinstance(cell.value, float) and not np.isfinite(cell.value) else cell.value
     marks = {name: True for name in ("best", "failed") if getattr(cell, name)}
@@ -240,20 +249,12 @@ def _in_cell(text: str) -> str:
     """Return words in one line for a spreadsheet, which takes a cell that begins like a formula for one: those are
     quoted."""
     text = _one_line(text)
-    return f"'{text}" if text.lstrip().startswith(FORMULA) and not _is_number(text) else text
+    return f"'{text}" if text.lstrip().startswith(FORMULA) and not is_number(text) else text
 
 
 def _one_line(text: str) -> str:
     """Return words without line ends or other control characters, which a terminal would obey."""
     return "".join(letter if letter.isprintable() else " " for letter in text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _escape_markdown(text: str) -> str:

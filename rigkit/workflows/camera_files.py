@@ -13,7 +13,7 @@ from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.reading import read_text
-from rigkit.io.rig_file import is_rig_file, load_rig
+from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
 from rigkit.workflows.formats import READ_FORMATS
 
 OURS = re.compile(r'\A\s*\{\s*["}]')
@@ -64,6 +64,11 @@ def is_rig(path: str | Path) -> bool:
     return (kind == "kalibr" and "T_cn_cnm1" in text) or (kind == "opencv" and STEREO.search(text) is not None)
 
 
+def saved_rig(path: str | Path) -> SavedRig:
+    """Return what a rig's file says, of ours or, without a covariance, of another tool's; raises as `import_rig`."""
+    return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)
+
+
 def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     """Return camera and cam_from_rig (mm) by name: of our rig's file, Kalibr's camchain, or OpenCV's file of a pair.
 
@@ -83,3 +88,19 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     if kind == "rigkit":
         return load_rig(path)
     raise InputError(f"'{name}': no rig of rigkit, Kalibr (camchain) or OpenCV (M1, D1, M2, D2, R, T); check the file")
+
+
+def import_pair(
+    path: str | Path, names: tuple[str, str] | None = None
+) -> tuple[tuple[str, str], tuple[Camera, Camera], Rigid3]:
+    """Return the names of two cameras of a rig (None: its first two), the cameras, and cam2_from_cam1 (mm).
+
+    Raises InputError as `import_rig`, and for a camera that is not there.
+    """
+    rig = import_rig(path)
+    chosen = names or tuple(rig)[:2]
+    missing = [name for name in chosen if name not in rig]
+    if missing or len(chosen) != 2:
+        raise InputError(f"'{path}': no camera '{', '.join(missing)}'; there are {', '.join(rig)}")
+    (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in chosen)
+    return (chosen[0], chosen[1]), (camera1, camera2), cam2_from_rig @ cam1_from_rig.inverse()

@@ -10,7 +10,7 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
-from rigkit.report.tables import tables_to_json, tables_to_markdown
+from rigkit.report.tables import table_files
 from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.workflows.datasets import (
@@ -24,7 +24,7 @@ from rigkit.workflows.datasets import (
 )
 from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
 
-MARKDOWN, JSON = "crosscheck.md", "crosscheck.json"
+FILES = ("crosscheck.md", "crosscheck.json")
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -60,13 +60,13 @@ def crosscheck_dataset(
     A pair that cannot be reconstructed is among the failures; its error is raised where there is no other pair.
     """
     options = options or DatasetOptions()
-    known = ready_dataset(dataset, options, reserved=(MARKDOWN, JSON))
+    known = ready_dataset(dataset, options, reserved=FILES)
     cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
     reports, failures = over_pairs(
         _crosscheck, known.pairs, cameras, options, what="cross-checking pairs", progress=progress
     )
     table = crosscheck_table(reports)
-    files = {**cameras.files, MARKDOWN: tables_to_markdown([table]), JSON: tables_to_json([table])}
+    files = {**cameras.files, **table_files([table], "crosscheck", "md", "json")}
     write_for(known, options, files)
     return DatasetCrossCheck(reports=tuple(reports), failures=failures, table=table, files=files)
 

@@ -14,9 +14,9 @@ from rigkit.core.printing import brief
 from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import about
-from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs, load_saved_rig
+from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.report.figures import difference_png
-from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
+from rigkit.workflows.camera_files import import_camera, is_ours, is_rig, saved_rig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,7 +134,7 @@ def _cameras(a: Path, b: Path) -> CameraPair:
 
 
 def _rigs(a: Path, b: Path) -> RigPair:
-    first, second = _saved(a), _saved(b)
+    first, second = saved_rig(a), saved_rig(b)
     first, second = _named_like(first, second, a), _named_like(second, first, b)
     names = list(first.cameras)
     if names != list(second.cameras):
@@ -158,8 +158,3 @@ def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:
     if is_rig_file(path) or len(rig.cameras) != len(other.cameras):
         return rig
     return replace(rig, cameras=dict(zip(other.cameras, rig.cameras.values(), strict=True)))
-
-
-def _saved(path: Path) -> SavedRig:
-    """Return a rig of ours, or another tool's, which has no covariance."""
-    return load_saved_rig(path) if is_rig_file(path) else SavedRig(cameras=import_rig(path), covariance=None)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
 from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
+from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
 from rigkit.workflows.identify_board import suggested_words
 
@@ -98,10 +97,10 @@ def session_of_folders(
         f'schema = "{SESSION_SCHEMA}"',
         "",
         "# The board in the images; a rule over many of its squares tells their true size.",
-        f"board = {_quoted(names[0])}" if len(names) == 1 else f"boards = [{', '.join(map(_quoted, names))}]",
+        f"board = {toml_text(names[0])}" if len(names) == 1 else f"boards = [{', '.join(map(toml_text, names))}]",
         "",
         '# A camera model, or "auto": the one that predicts images best that it was not fitted to.',
-        f"model = {_quoted(model)}",
+        f"model = {toml_text(model)}",
         "",
         "# Images, relative to this file: names, or patterns such as *.jpg.",
     ]
@@ -119,18 +118,18 @@ def _cameras_in_words(cameras: Mapping[str, Sequence[tuple[Path, str]]], place: 
     if known.rig is not None:
         lines += [
             "# Its cameras stay as they are, lens and mount.",
-            f"rig = {_quoted(_relative(known.rig, place))}",
+            f"rig = {toml_text(relative_path(known.rig, place))}",
         ]
         lines += [""]
     lenses = known.of_cameras(list(cameras))
     for name, patterns in cameras.items():
-        lines += ["[[cameras]]", f"id = {_quoted(name)}", f"images = {_listed(patterns, place)}"]
-        lines += [f"calibration = {_quoted(_relative(lenses[name], place))}", ""] if name in lenses else [""]
+        lines += ["[[cameras]]", f"id = {toml_text(name)}", f"images = {_listed(patterns, place)}"]
+        lines += [f"calibration = {toml_text(relative_path(lenses[name], place))}", ""] if name in lenses else [""]
     lines += [
         "# What a rule says of the distance of two cameras is compared with the result:",
         "# [[baselines]]",
-        f"# a = {_quoted(next(iter(cameras)))}",
-        f"# b = {_quoted(list(cameras)[1])}",
+        f"# a = {toml_text(next(iter(cameras)))}",
+        f"# b = {toml_text(list(cameras)[1])}",
         "# value_mm = 100.0",
         "# sigma_mm = 1.0",
         '# how = "steel rule"',
@@ -143,14 +142,14 @@ def session_to_come(patterns: Mapping[str, str], boards: Sequence[str], place: P
     moment will have one name. Boards and errors as for `session_of_folders`."""
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]
-    lines = [f'schema = "{SESSION_SCHEMA}"', f"boards = [{', '.join(map(_quoted, names))}]"]
+    lines = [f'schema = "{SESSION_SCHEMA}"', f"boards = [{', '.join(map(toml_text, names))}]"]
     if len(patterns) == 1:
-        lines += [f"images = {_quoted(pattern)}" for pattern in patterns.values()]
+        lines += [f"images = {toml_text(pattern)}" for pattern in patterns.values()]
     else:
         lines.append('frames = "name"')
         for name, pattern in patterns.items():
             check_identifier(name, "camera")
-            lines += ["", "[[cameras]]", f"id = {_quoted(name)}", f"images = {_quoted(pattern)}"]
+            lines += ["", "[[cameras]]", f"id = {toml_text(name)}", f"images = {toml_text(pattern)}"]
     path = place / SESSION_NAME
     files[path] = "\n".join(lines) + "\n"
     return FolderSession(path, files)
@@ -259,7 +258,7 @@ def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
     """Return a board's file as the session names it; a new one is added to `files`."""
     board = board_of_words(words)
     if board_in_words(words) is None:
-        return _relative(Path(words), place)
+        return relative_path(Path(words), place)
     path = place / f"{board.board_id}.toml"
     files[path] = board_text(board, f"as told by --board {words}; squares are best measured over many", path)
     return path.name
@@ -268,23 +267,6 @@ def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:
 def _listed(patterns: Sequence[tuple[Path, str]], place: Path) -> str:
     texts = []
     for folder, pattern in patterns:
-        inside = _relative(folder, place)
-        texts.append(_quoted(pattern if inside == "." else f"{glob.escape(inside)}/{pattern}"))
+        inside = relative_path(folder, place)
+        texts.append(toml_text(pattern if inside == "." else f"{glob.escape(inside)}/{pattern}"))
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
-
-
-def _relative(path: Path, place: Path) -> str:
-    try:
-        return Path(os.path.relpath(path.resolve(), place.resolve())).as_posix()
-    except ValueError:
-        # On another drive.
-        return path.resolve().as_posix()
-
-
-def _quoted(text: str) -> str:
-    """Return a basic string of TOML, which has the escapes of JSON."""
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        raise InputError(f"{text!r}: a session is UTF-8, which cannot hold this name; rename the file") from error
-    return json.dumps(text, ensure_ascii=False)

@@ -15,9 +15,9 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import is_calibration, load_calibration
-from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
+from rigkit.io.rig_file import SavedRig, is_rig_file
 from rigkit.io.rig_session import RigSession
-from rigkit.workflows.camera_files import import_camera, import_rig, is_ours, is_rig
+from rigkit.workflows.camera_files import import_camera, is_ours, is_rig, saved_rig
 from rigkit.workflows.folder_session import Known
 
 _log = logging.getLogger(__name__)
@@ -125,12 +125,10 @@ def _places_in(rig: SavedRig, mounted: Sequence[str]) -> np.ndarray:
 
 def _saved(path: Path, names: Sequence[str]) -> SavedRig:
     """Return a rig of ours, or another tool's, whose cameras have numbers for names, with the first of `names`."""
-    if is_rig_file(path):
-        return load_saved_rig(path)
-    cameras = import_rig(path)
-    if not set(cameras) & set(names):
-        cameras = dict(zip(names, cameras.values(), strict=False))
-    return SavedRig(cameras=cameras, covariance=None)
+    rig = saved_rig(path)
+    if is_rig_file(path) or set(rig.cameras) & set(names):
+        return rig
+    return replace(rig, cameras=dict(zip(names, rig.cameras.values(), strict=False)))
 
 
 def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArray | None]:

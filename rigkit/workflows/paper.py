@@ -15,7 +15,7 @@ from rigkit.io.manifest import Dataset
 from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
 from rigkit.report.paper_page import paper_page
-from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.report.tables import table_files
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.paper_claims import claim_table, estimator_order_table
 from rigkit.validation.tables import (
@@ -93,13 +93,7 @@ def validate_as_paper(
     )
     reports = tuple(report for of_pair in found for report in of_pair)
     tables = _tables(reports, printed, known.images)
-    files = {
-        "tables.md": tables_to_markdown(tables),
-        "tables.csv": tables_to_csv(tables),
-        "tables.tex": tables_to_latex(tables),
-        "tables.json": tables_to_json(tables),
-    }
-    files |= cameras.files
+    files = {**table_files(tables, "tables"), **cameras.files}
     if options.pictures:
         files["report.html"] = paper_page(known.name, known.images, tables, software_facts())
     write_for(known, options, files)

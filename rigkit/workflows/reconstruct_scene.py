@@ -33,7 +33,7 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import cloud_png, epipolar_png
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera, import_rig, is_ours
+from rigkit.workflows.camera_files import import_camera, import_pair, is_ours
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
@@ -184,13 +184,8 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
     if options.rig is not None:
         if options.camera or options.camera2 or options.pose:
             raise InputError("a scene of a rig: the rig's file has the cameras and their pose; leave the others out")
-        cameras = import_rig(options.rig)
-        names = options.rig_names or tuple(cameras)[:2]
-        missing = [name for name in names if name not in cameras]
-        if missing or len(names) < 2:
-            raise InputError(f"'{options.rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
-        (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in names)
-        return camera1, camera2, KnownPose(cam2_from_rig @ cam1_from_rig.inverse(), np.zeros((6, 6))), []
+        _, cameras, cam2_from_cam1 = import_pair(options.rig, options.rig_names)
+        return *cameras, KnownPose(cam2_from_cam1, np.zeros((6, 6))), []
     if options.camera is None:
         raise InputError("a scene needs a calibration: of its camera, or of the rig that took both images")
     camera1 = import_camera(options.camera)

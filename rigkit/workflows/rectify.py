@@ -18,7 +18,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.images import IMAGE_ENDINGS, Image, quiet_opencv, read_image_of, require_pixels, require_size
+from rigkit.io.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
 from rigkit.io.npz import npz_bytes
 from rigkit.io.reading import about
 from rigkit.io.rig_session import frames_of_images
@@ -27,7 +27,8 @@ from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
-from rigkit.workflows.camera_files import import_camera, import_rig
+from rigkit.workflows.camera_files import import_camera, import_pair
+from rigkit.workflows.detect import images_in
 from rigkit.workflows.folder_session import cameras_in
 
 
@@ -155,14 +156,9 @@ def rectify_stereo_images(
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
-    cameras = import_rig(rig)
-    both = list(names or list(cameras)[:2])
-    missing = [name for name in both if name not in cameras]
-    if missing or len(both) != 2:
-        raise InputError(f"'{rig}': no camera '{', '.join(missing)}'; there are {', '.join(cameras)}")
-    (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (cameras[name] for name in both)
+    both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
     with ExitStack() as stack:
-        sources, single = _pairs(images, (both[0], both[1]), stack)
+        sources, single = _pairs(images, both, stack)
         out = options.output
         if _is_folder(out):
             jobs = [_outputs(own, out / name) for own, name in zip(sources, both, strict=True)]
@@ -176,9 +172,7 @@ def rectify_stereo_images(
         for own, camera in zip(sources, (camera1, camera2), strict=True):
             _require_sizes(own, camera.size_px, rig)
         with about(rig):
-            pair = rectify_pair(
-                camera1, camera2, cam2_from_rig @ cam1_from_rig.inverse(), projection=options.projection
-            )
+            pair = rectify_pair(camera1, camera2, cam2_from_cam1, projection=options.projection)
             if options.crop:
                 map1, map2 = cropped([pair.map1, pair.map2])
                 pair = replace(pair, map1=map1, map2=map2)
@@ -215,7 +209,7 @@ def _pairs(
         count = min(len(sources) for sources in own)
         return [sources[:count] for sources in own], {}
     else:
-        found = [_images(Path(image)) for image in images]
+        found = [list(images_in([Path(image)])) for image in images]
     try:
         of_moment = frames_of_images({str(k): [path.name for path in own] for k, own in enumerate(found)})
     except InputError:
@@ -236,7 +230,7 @@ def _pairs(
 def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _Frame]:
     """Return an image, those of a folder, or the frames of a video, which is open until `stack` ends."""
     if source.is_dir():
-        return _images(source)
+        return list(images_in([source]))
     if not is_video(source):
         return [source]
     with Video(source) as video:
@@ -260,13 +254,6 @@ def _require_sizes(sources: Sequence[Path | _Frame], size_px: tuple[int, int], c
         require_size(first.video.size_px, f"video '{first.video.source}'", size_px, calibration)
     elif len(sources) == 1:
         read_image_of(first, size_px, calibration)
-
-
-def _images(folder: Path) -> list[Path]:
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS)
-    if not found:
-        raise InputError(f"rectify: folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
-    return found
 
 
 def _is_folder(output: Path) -> bool:

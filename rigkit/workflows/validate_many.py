@@ -16,7 +16,7 @@ from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.manifest import load_dataset
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
-from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_markdown
+from rigkit.report.tables import table_files
 from rigkit.validation.tables import mean_normal_error
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
@@ -101,12 +101,7 @@ def validate_datasets(
         progress("data sets", len(found), len(named))
     outcomes = tuple(found[place] for place in range(len(named)))
     table = _table(outcomes)
-    files: dict[str, str | bytes] = {
-        "summary.md": tables_to_markdown([table]),
-        "summary.csv": tables_to_csv([table]),
-        "summary.json": tables_to_json([table]),
-        "summary.html": _page(outcomes, table),
-    }
+    files = {**table_files([table], "summary", "md", "csv", "json"), "summary.html": _page(outcomes, table)}
     return ManyValidation(outcomes, table, write_results(options.output, files, force=True))
 
 

@@ -9,7 +9,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.io.manifest import Dataset
 from rigkit.report.page import PairSection, build_page, validation_facts
 from rigkit.report.page_facts import PageFacts
-from rigkit.report.tables import tables_to_csv, tables_to_json, tables_to_latex, tables_to_markdown
+from rigkit.report.tables import TABLE_WRITERS, table_files
 from rigkit.report.validation_page import SUMMARY_WORDS, camera_remarks, camera_table, crosscheck_table, summary_table
 from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.checks import ValidationReport
@@ -19,7 +19,7 @@ from rigkit.workflows.datasets import DatasetOptions, LoadedCameras, PairFailure
 from rigkit.workflows.provenance import digest_line, software_facts
 
 PAGE = "report.html"
-RESERVED = ("tables.md", "tables.csv", "tables.tex", "tables.json", PAGE)
+RESERVED = (*(f"tables.{ending}" for ending in TABLE_WRITERS), PAGE)
 """Names of files of results, which no pair can have."""
 
 
@@ -66,13 +66,7 @@ def validation_files(
     tables = [summary, *build_tables(reports, paper, dataset.images)]
     if compared:
         tables.insert(-2, crosscheck_table(compared))
-    files: dict[str, str | bytes] = {
-        "tables.md": tables_to_markdown(tables),
-        "tables.csv": tables_to_csv(tables),
-        "tables.tex": tables_to_latex(tables),
-        "tables.json": tables_to_json(tables),
-    }
-    files |= cameras.files
+    files: dict[str, str | bytes] = {**table_files(tables, "tables"), **cameras.files}
     for pair in pairs:
         files |= pair.files
     sections = [pair.section for pair in pairs if pair.section is not None]

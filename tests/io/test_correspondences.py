@@ -98,7 +98,7 @@ def test_affine_extractor(tmp_path: Path, separator: str, rng: np.random.Generat
         ("u1_px,v1_px,u2_px,v2_px,a11\n1,2,3,4,5\n", "column 'a12' is missing"),
         ("u1_px,v1_px,u2_px,v2_px,a5\n1,2,3,4,5\n", "unknown column 'a5'"),
         ("u1_px,v1_px,u2_px,v2_px,v2_px\n1,2,3,4,5\n", "appears twice"),
-        ("u1_px,v1_px,u2_px,v2_px\n1,2,3\n", "line 2: 3 fields for 4"),
+        ("u1_px,v1_px,u2_px,v2_px\n1,2,3\n", "line 2: 3 cells, but the head has 4"),
         ("u1_px,v1_px,u2_px,v2_px\n1,2,x,4\n", "line 2: could not convert"),
         ("u1_px,v1_px,u2_px,v2_px\n1,2,,4\n", "NaN or infinite"),
         ("u1_px,v1_px,u2_px,v2_px,sigma_px\n1,2,3,4,0\n", "must be positive"),
