@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.measuring import read_off
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -98,11 +99,12 @@ def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[t
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=lens.model, degree=5 if lens.model == "brown" else None, folds=0)
     names = ("left", "right")
+    lenses, covariance = rig.with_departures()
     found = instrument_of_rig(
         names,
-        [c.camera for c in rig.cameras],
+        lenses,
         [c.cam_from_rig for c in rig.cameras],
-        rig.covariance,
+        covariance,
         names,
         sigma_px=rig.sigma_px,
         scale_sigma=rig.scale_sigma,
@@ -130,11 +132,12 @@ def alone_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator
     found = calibrate(
         views, SIZE_PX, model=lens.model, degree=5 if lens.model == "brown" else None, folds=0, board="flat"
     )
+    uncertain = uncertain_camera(found)
     known = Instrument(
         names=("camera",),
-        cameras=(found.camera,),
+        cameras=(uncertain.camera,),
         cam_from_rig=(Rigid3.identity(),),
-        covariance=found.covariance,
+        covariance=uncertain.covariance,
         sigma_px=found.sigma_px,
         freedom=found.freedom,
     )

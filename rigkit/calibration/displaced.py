@@ -11,13 +11,13 @@ parameters after those of its model. The model's parameters follow each mode as 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.calibration.departures import DISPLACEMENTS, displacements
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.base import Camera, RadialCurve, image_center
@@ -25,6 +25,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
+from rigkit.kernels.departures import DISPLACEMENTS, displacements
 
 MODES_GRID = (24, 18)
 """Columns and rows of pixels at which modes are weighed against the whole uncertainty."""
@@ -120,21 +121,49 @@ class DisplacedCamera(Camera):
         return u + du, v + dv, valid
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class LensModes:
+    """What a lens may do beyond its model: modes (J, M) of displacements, px, of one standard deviation each,
+    independent of each other, and how much all that was solved for (G, M) is off where a mode is there."""
+
+    modes: FloatArray
+    moves: FloatArray
+
+
 def uncertain_camera(calibration: Calibration) -> UncertainCamera:
     """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
     with boards all over the image and a model that fits none do, and the camera is the calibration's own."""
     far = FarProjection.of(calibration)
     modes = telling_modes(far)
-    if not modes.size:
-        return UncertainCamera(calibration.camera, calibration.covariance)
-    lens = calibration.camera
-    camera = DisplacedCamera(lens.size_px, np.append(lens.parameters, np.zeros(modes.shape[1])), lens, modes)
-    p = lens.parameters.size
-    # What is right differs from what was found by each mode, less what the parameters have followed of it.
-    moves = np.concatenate([-far.departures.followed @ modes, np.eye(modes.shape[1])])
-    covariance = moves @ moves.T
-    covariance[:p, :p] += calibration.covariance
+    known = LensModes(modes, -far.departures.followed @ modes)
+    (camera,), covariance = with_modes((calibration.camera,), calibration.covariance, (known,))
     return UncertainCamera(camera, covariance)
+
+
+def with_modes(
+    cameras: Sequence[Camera], covariance: FloatArray, modes: Sequence[LensModes]
+) -> tuple[tuple[Camera, ...], FloatArray]:
+    """Return cameras with the amounts of their modes as further parameters, and the covariance of all that was solved
+    for: of the parameters, camera by camera, then of the rest, as `covariance` (G, G) has it without modes."""
+    out: list[Camera] = []
+    known, amounts, end = [], [], 0
+    for camera, own in zip(cameras, modes, strict=True):
+        count = own.modes.shape[1]
+        known.append(np.arange(end, end + camera.parameters.size))
+        amounts.append(np.arange(end + camera.parameters.size, end + camera.parameters.size + count))
+        end = int(known[-1][-1]) + 1 + count
+        parameters = np.append(camera.parameters, np.zeros(count))
+        out.append(DisplacedCamera(camera.size_px, parameters, camera, own.modes) if count else camera)
+    known.append(np.arange(end, end + len(covariance) - sum(len(own) for own in known)))
+    at = np.concatenate(known)
+    size = len(at) + sum(len(own) for own in amounts)
+    whole = np.zeros((size, size))
+    whole[np.ix_(at, at)] = covariance
+    for where, own in zip(amounts, modes, strict=True):
+        move = np.zeros((size, len(where)))
+        move[at], move[where] = own.moves, np.eye(len(where))
+        whole += move @ move.T
+    return tuple(out), whole
 
 
 def telling_modes(far: FarProjection) -> FloatArray:

@@ -7,11 +7,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, zip_longest
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.displaced import LensModes
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
@@ -24,11 +27,13 @@ from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
 from rigkit.io.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
+from rigkit.kernels.departures import DISPLACEMENTS
 
 RIG_SCHEMA = "rigkit.rig/1"
 BOARDS_SCHEMA = "rigkit.board_rig/1"
 RIG_KEYS = keys_of(RIG_FILE)
 RIG_CAMERA_KEYS = keys_of(RIG_FILE, "cameras")
+_NO_MODES: dict[str, Any] = {"modes": [], "moves": []}
 PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 
@@ -39,7 +44,8 @@ class SavedRig:
     is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
     degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
     are those it was calibrated with, none in a file that does not say; `outlines` by name are convex, (N, 2) px, around
-    all corners that a camera saw, of those of which the file says it."""
+    all corners that a camera saw, of those of which the file says it; `departures` are what each lens may do beyond its
+    model, none in a file that does not say."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -49,6 +55,7 @@ class SavedRig:
     overdispersion: float = 1.0
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
+    departures: tuple[LensModes, ...] = ()
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
@@ -72,8 +79,9 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "cam_from_rig": c.cam_from_rig.matrix()[:3].tolist(),
                 "rms_px": c.rms_px,
                 "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
+                **({} if own is None else {"departures": _rows_of(own)}),
             }
-            for c in rig.cameras
+            for c, own in zip_longest(rig.cameras, rig.departures)
         ],
         "covariance": rig.covariance.tolist(),
         "boards": [{"board_id": b.board_id, "target": board_values(b)} for b in _boards_of(rig)],
@@ -100,9 +108,10 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     data = _read(path, RIG_SCHEMA, RIG_KEYS)
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
     outlines: dict[str, Pixels] = {}
+    departures: dict[str, Any] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) | {"outline_px"} != RIG_CAMERA_KEYS:
+            if set(entry) | {"outline_px", "departures"} != RIG_CAMERA_KEYS:
                 raise InputError(
                     f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
                 )
@@ -111,11 +120,14 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             if name in cameras:
                 raise InputError(f"'{path}': two cameras are called '{name}'; calibrate again")
             cameras[name] = (camera, Rigid3.from_matrix(reals(entry["cam_from_rig"])))
+            if "departures" in entry:
+                departures[name] = entry["departures"]
             if "outline_px" in entry:
                 outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
         size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
+        beyond = tuple(_modes(departures.get(name, _NO_MODES), size) for name in cameras) if departures else ()
         covariance = None
         if "covariance" in data:
             covariance = as_covariance(data["covariance"], "covariance", size)
@@ -133,7 +145,23 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         overdispersion=overdispersion,
         boards=boards,
         outlines=outlines,
+        departures=beyond,
     )
+
+
+def _rows_of(own: LensModes) -> dict[str, Any]:
+    return {"modes": own.modes.T.tolist(), "moves": own.moves.T.tolist()}
+
+
+def _modes(entry: dict[str, Any], size: int) -> LensModes:
+    """Return what a lens may do beyond its model, from the rows of its modes and of the moves that go with them."""
+    if set(entry) != set(_NO_MODES):
+        raise ValueError(f"departures have the keys {', '.join(_NO_MODES)}, no others")
+    modes, moves = reals(entry["modes"]), reals(entry["moves"])
+    count = len(modes)
+    if not count:
+        return LensModes(np.zeros((DISPLACEMENTS, 0)), np.zeros((size, 0)))
+    return LensModes(as_array(modes.T, (DISPLACEMENTS, count), "modes"), as_array(moves.T, (size, count), "moves"))
 
 
 def is_rig_file(path: str | Path) -> bool:

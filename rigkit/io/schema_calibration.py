@@ -121,6 +121,11 @@ RIG_FILE = file(
                 "cam_from_rig": _POSE,
                 "rms_px": said(NUMBER, "training error in the rig"),
                 "outline_px?": said(matrix(columns=2), "convex, around all corners that it saw"),
+                "departures?": said(
+                    obj({"modes": matrix(), "moves": matrix()}),
+                    "what its lens may do beyond its model: independent displacements of the image of one sigma each, "
+                    "and how much what `covariance` is of is off with them",
+                ),
             },
             "the first is the rig's frame",
             least=1,

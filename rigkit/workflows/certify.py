@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.displaced import uncertain_camera, with_modes
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
@@ -105,11 +105,14 @@ def load_instrument(
     names = list(saved.cameras)
     if len(names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
+    lenses, covariance = tuple(camera for camera, _ in saved.cameras.values()), saved.covariance
+    if saved.departures:
+        lenses, covariance = with_modes(lenses, covariance, saved.departures)
     return instrument_of_rig(
         names,
-        [camera for camera, _ in saved.cameras.values()],
+        lenses,
         [pose for _, pose in saved.cameras.values()],
-        saved.covariance,
+        covariance,
         cameras or (names[0], names[1]),
         sigma_px=sigma_px or saved.sigma_px,
         scale_sigma=saved.scale_sigma,

@@ -9,7 +9,6 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.departures import DISPLACEMENTS, displacements
 from rigkit.calibration.displaced import DisplacedCamera, uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_design
@@ -18,6 +17,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
+from rigkit.kernels.departures import DISPLACEMENTS, displacements
 
 DEPARTS = np.zeros(DISPLACEMENTS)
 DEPARTS[5:7] = 0.3, -0.2

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +27,9 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.io.rig_file import load_saved_rig, rig_text
+from rigkit.kernels.departures import displacements
+from rigkit.workflows.certify import load_instrument
 
 NOISE_PX = 0.2
 SIGMAS = 4.0
@@ -222,12 +227,14 @@ def test_transfer_follows_the_covariance(rng: np.random.Generator) -> None:
     assert seen.all()
     pixel = rig.cameras[1].camera.project(first)[0]
     length = np.linalg.norm(first, axis=1, keepdims=True)
-    ends = np.cumsum([0, *(c.camera.parameters.size for c in rig.cameras)])
+    lenses, known = rig.with_departures()
+    assert len(known) > len(rig.covariance)
+    ends = np.cumsum([0, *(camera.parameters.size for camera in lenses)])
 
     def there(x: np.ndarray) -> np.ndarray:
         cameras = [
-            c.camera.with_parameters(c.camera.parameters + x[a:b])
-            for c, a, b in zip(rig.cameras, ends[:-1], ends[1:], strict=True)
+            camera.with_parameters(camera.parameters + x[a:b])
+            for camera, a, b in zip(lenses, ends[:-1], ends[1:], strict=True)
         ]
         moves = x[ends[-1] :].reshape(-1, 6)
         poses = [
@@ -236,9 +243,9 @@ def test_transfer_follows_the_covariance(rng: np.random.Generator) -> None:
         ]
         return cameras[2].project((poses[1] @ poses[0].inverse()).apply(length * cameras[1].unproject(pixel)[0]))[0]
 
-    sigma = np.sqrt(np.diag(rig.covariance))
+    sigma = np.sqrt(np.diag(known))
     slope = np.array([(there(d) - there(-d)) / (2e-3 * s) for d, s in zip(np.diag(1e-3 * sigma), sigma, strict=True)])
-    expected = np.einsum("anx,ab,bny->nxy", slope, rig.covariance, slope)
+    expected = np.einsum("anx,ab,bny->nxy", slope, known, slope)
     assert np.abs(covariance - expected).max() < 1e-3 * np.abs(expected).max()
 
 
@@ -360,3 +367,65 @@ def test_a_turn_of_the_lens_that_the_mount_takes_up_is_no_motion(rigs: list[Moun
 def test_mounts_of_a_rig_that_does_not_say_how_sure_it_is_have_no_chance(rigs: list[Mounted]) -> None:
     found = compare_mounts(rigs[0], Mounted(rigs[1].cameras, None))
     assert found.chance is None and found.same is None and found.mounts[0].shift_mm > 0.0
+
+
+def calibrated(views: Views) -> RigCalibration:
+    return calibrate_rig(views, sizes(), model=MODELS, board="flat", folds=0)
+
+
+def globals_of(rig: RigCalibration, start: RigCalibration) -> np.ndarray:
+    """Return how intrinsics and mounts differ from those of another rig, in the order of its covariance."""
+    out = [c.camera.parameters - s.camera.parameters for c, s in zip(rig.cameras, start.cameras, strict=True)]
+    for c, s in zip(rig.cameras[1:], start.cameras[1:], strict=True):
+        now, then = c.cam_from_rig, s.cam_from_rig
+        out += [log_so3(now.rotation @ then.rotation.T), now.translation_mm - then.translation_mm]
+    return np.concatenate(out)
+
+
+def test_the_rig_follows_a_departure_as_a_new_fit_does(rng: np.random.Generator) -> None:
+    """One lens moved by its largest mode: all intrinsics and mounts of a new calibration are off by the moves."""
+    views = rig_views(rng, 12)
+    start = calibrated(views)
+    own = start.departures[2]
+    size = start.cameras[2].camera.size_px
+    moved = dict(views)
+    moved["fish"] = [
+        (frame, replace(v, pixels=v.pixels + np.einsum("ijn,j->ni", displacements(v.pixels, size), own.modes[:, -1])))
+        for frame, v in views["fish"]
+    ]
+    # What is right is the fit less what it has followed.
+    off, sigma = -globals_of(calibrated(moved), start), np.sqrt(np.diag(start.covariance))
+    expected = own.moves[:, -1] / sigma
+    assert np.abs(expected).max() > 0.05
+    assert off / sigma == pytest.approx(expected, abs=0.1 * np.abs(expected).max())
+    assert np.abs(expected[-12:]).max() > 0.02
+
+
+def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.Generator, tmp_path: Path) -> None:
+    rig = calibrated(rig_views(rng, 8))
+    path = tmp_path / "rig.json"
+    path.write_text(rig_text(rig))
+    saved = load_saved_rig(path)
+    for own, back in zip(rig.departures, saved.departures, strict=True):
+        assert (own.modes == back.modes).all() and (own.moves == back.moves).all()
+    lenses, _ = rig.with_departures()
+    instrument = load_instrument(path, ("reg", "fish"))
+    assert [c.parameters.size for c in instrument.cameras] == [lenses[k].parameters.size for k in (0, 2)]
+    assert instrument.intrinsic_count > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))
+    # A file of before files said so, and damaged ones.
+    data = json.loads(path.read_text())
+    for camera in data["cameras"]:
+        camera.pop("departures")
+    path.write_text(json.dumps(data))
+    assert load_saved_rig(path).departures == ()
+    assert load_instrument(path).intrinsic_count == sum(rig.cameras[k].camera.parameters.size for k in (0, 1))
+    damages: list[dict[str, object]] = [
+        {"modes": [[1.0]], "moves": [[1.0]]},
+        {"modes": []},
+        {"modes": [["x"]], "moves": []},
+    ]
+    for damage in damages:
+        data["cameras"][0]["departures"] = damage
+        path.write_text(json.dumps(data))
+        with pytest.raises(InputError, match=r"rig\.json"):
+            load_saved_rig(path)

@@ -13,6 +13,7 @@ from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.clustered import clustered_by_frame
+from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.observations import Places
@@ -79,6 +80,10 @@ def assemble_rig(
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
+        departures=tuple(
+            lens_modes(observations, joint.solution, c, camera.calibration, last.stop)
+            for c, camera in enumerate(cameras)
+        ),
         board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale),
     )
 

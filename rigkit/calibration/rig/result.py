@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.cameras.base import Camera
@@ -61,6 +62,8 @@ class RigCalibration:
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured.
     board_rigs : boards that are mounted to each other.
     verdicts : what is good and what is not, the headline first.
+    departures : of each camera what its lens may do beyond its model, and how the rest of the rig is off with it; empty
+        where that is not known.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -78,6 +81,7 @@ class RigCalibration:
     scale_sigma: float = 0.0
     board_rigs: tuple[BoardRig, ...] = ()
     verdicts: tuple[Finding, ...] = ()
+    departures: tuple[LensModes, ...] = ()
 
     _repr_html_ = drawn
 
@@ -125,7 +129,14 @@ class RigCalibration:
             if k > 0:
                 row[self.mount(k)] += sign * (difference / length @ self._centre_jacobian(k))
         variance = float(row @ self.covariance @ row)
+        variance += sum(float(((row @ own.moves) ** 2).sum()) for own in self.departures)
         return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
+
+    def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray]:
+        """Return the cameras, with what their lenses may do beyond their models as further parameters, and the
+        covariance of these, camera by camera, and of the mounts."""
+        cameras = tuple(c.camera for c in self.cameras)
+        return with_modes(cameras, self.covariance, self.departures) if self.departures else (cameras, self.covariance)
 
     def mount(self, k: int) -> slice:
         """Return where the mount of camera `k` > 0 stands in the covariance."""

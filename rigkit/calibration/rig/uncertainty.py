@@ -57,11 +57,12 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
     """Return the covariance (N, 2, 2), px^2, of where `points` (N, 3) mm in camera `a` appear in camera `b`, their
     pixels in `a` and their distances given, and whether they do (N,)."""
     i, j = rig.index(a), rig.index(b)
-    first, second = rig.cameras[i], rig.cameras[j]
+    cameras, known = rig.with_departures()
+    first, second = cameras[i], cameras[j]
     motion = rig.cam2_from_cam1(a, b)
     there = motion.apply(points)
-    _, seen1, d_pixels1_d_point, d_pixels1_d_parameters = first.camera.project_with_jacobians(points)
-    pixels, seen2, d_pixels2_d_point, d_pixels2_d_parameters = second.camera.project_with_jacobians(there)
+    _, seen1, d_pixels1_d_point, d_pixels1_d_parameters = first.project_with_jacobians(points)
+    pixels, seen2, d_pixels2_d_point, d_pixels2_d_parameters = second.project_with_jacobians(there)
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
     # Across the ray: the distance is given, so the third row keeps it.
     system = np.concatenate([d_pixels1_d_point, rays[:, None, :]], axis=1)
@@ -69,16 +70,16 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
         [-d_pixels1_d_parameters, np.zeros((len(points), 1, d_pixels1_d_parameters.shape[-1]))], axis=1
     )
     by_own = np.linalg.solve(system, held)
-    ends = np.cumsum([0, *(c.camera.parameters.size for c in rig.cameras)])
-    design = np.zeros((len(points), 2, len(rig.covariance)))
+    ends = np.cumsum([0, *(camera.parameters.size for camera in cameras)])
+    design = np.zeros((len(points), 2, len(known)))
     turned = d_pixels2_d_point @ motion.rotation
     design[:, :, ends[i] : ends[i + 1]] += turned @ by_own
     design[:, :, ends[j] : ends[j + 1]] += d_pixels2_d_parameters
     for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, d_pixels2_d_point, 1.0)):
         if k > 0:
             lever = skew(x - rig.cameras[k].cam_from_rig.translation_mm)
-            run = rig.mount(k)
-            design[:, :, run.start : run.start + 3] += sign * by_x @ -lever
-            design[:, :, run.start + 3 : run.stop] += sign * by_x
-    covariance = design @ rig.covariance @ np.swapaxes(design, -1, -2)
-    return covariance, seen1 & seen2 & second.camera.on_image(pixels)
+            run = int(ends[-1]) + 6 * (k - 1)
+            design[:, :, run : run + 3] += sign * by_x @ -lever
+            design[:, :, run + 3 : run + 6] += sign * by_x
+    covariance = design @ known @ np.swapaxes(design, -1, -2)
+    return covariance, seen1 & seen2 & second.on_image(pixels)

@@ -118,7 +118,10 @@ def variances(
     covariance = instrument.covariance
     lens, mount = by_calibration[..., :split], by_calibration[..., split:]
     own = covariance[:split, :split]
-    follows = covariance[split:, :split] @ np.linalg.pinv(own, hermitian=True)
+    # Parameters have units of their own: in standard deviations they can be compared.
+    sigma = np.sqrt(np.diag(own))
+    known = np.where(sigma > 0.0, sigma, 1.0)
+    follows = covariance[split:, :split] / known @ np.linalg.pinv(own / np.outer(known, known), hermitian=True) / known
     with_lens = lens + mount @ follows
     variance = {
         CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),

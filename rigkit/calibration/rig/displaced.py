@@ -1,0 +1,66 @@
+"""What the lenses of a rig may do beyond their models, and how all that was solved for moves with it.
+
+As a camera alone (`rigkit.calibration.displaced`); in a rig the poses of the boards are those of all cameras, so that
+mounts move along with a lens's displacements: globals follow by the rig's normal equations, the boards' shape held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.calibration.displaced import LensModes, telling_modes
+from rigkit.calibration.observations import Observations
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.solver import RigSolution, pose_jacobians
+from rigkit.calibration.rig.state import RigObservations
+from rigkit.calibration.state import State
+from rigkit.calibration.uncertainty import FarProjection
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rotation import skew
+from rigkit.kernels.departures import displacements
+
+
+def lens_modes(
+    observations: RigObservations, solution: RigSolution, c: int, calibration: Calibration, count: int
+) -> LensModes:
+    """Return what the lens of camera `c`, with its calibration as the rig has it, may do beyond its model, and how the
+    first `count` globals, intrinsics and mounts, are off."""
+    modes = telling_modes(FarProjection.of(calibration))
+    if not modes.size:
+        return LensModes(modes, np.zeros((count, 0)))
+    state, normal = solution.state, solution.normal
+    layout = state.layout(observations)
+    alone, own, f = state.of_camera(c, observations), observations.cameras[c], observations.frame[c]
+    n = layout.shape.start
+    by_globals = np.zeros((n, modes.shape[1]))
+    by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes)
+    by = pose_jacobians(observations, state, c, alone.translation_mm)
+    runs = [(layout.mounts[c], by.mount, np.arange(len(f)))]
+    if by.place is not None:
+        runs += [(run, by.place, np.flatnonzero(own.board == b)) for b, run in enumerate(layout.boards)]
+    for run, how, views in runs:
+        if run is not None:
+            by_globals[run] += (np.swapaxes(how[views], -1, -2) @ by_own[views]).sum(axis=0)
+    by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
+    np.add.at(by_pose, f, np.swapaxes(by.target, -1, -2) @ by_own)
+    inverse, back, _ = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None).covariance
+    moves = -inverse @ (by_globals - np.tensordot(back, by_pose, axes=((0, 1), (0, 1))))
+    return LensModes(modes, moves[:count])
+
+
+def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted products of the modes with the derivatives by the parameters (P, M), and with those by the
+    pose of each view (V, 6, M)."""
+    points, lever = alone.points_in_cam(own)
+    pixels, valid, by_point, by_parameters = alone.camera.project_with_jacobians(points)
+    used = valid & (weight > 0.0)
+    moved = np.zeros((*used.shape, 2, modes.shape[1]))
+    moved[used] = (displacements(pixels[used], alone.camera.size_px).transpose(2, 0, 1) @ modes) * (
+        weight[used, None, None] ** 2
+    )
+    by_point, by_parameters = (np.where(used[..., None, None], by, 0.0) for by in (by_point, by_parameters))
+    by_view = np.concatenate([-by_point @ skew(lever), by_point], axis=-1)
+    of_views = np.einsum("vcik,vcim->vkm", by_view, moved)
+    return np.einsum("vcip,vcim->pm", by_parameters, moved), of_views
