@@ -35,6 +35,11 @@ MIN_CLUSTERS = 4
 """Fewer images (or frames) say nothing about how they differ."""
 MIN_LEFT = 0.05
 """What is left of an image's pull in a direction that it alone determines: less is rounding."""
+MAX_FOR_EIGENVALUES = 24
+"""Of so few unknowns all eigenvalues are found as quickly."""
+MAX_FOR_SERIES, SERIES_LEFT_OUT = 0.8, 1e-13
+"""Up to such a leverage x a series of Chebyshev polynomials approximates (1 - x)^-1/2; its coefficients fall by
+(1 - sqrt(1 - x)) / (1 + sqrt(1 - x)) each, down to about the second."""
 NULL_DRAWS = 4000
 """Draws of a null distribution: a chance is then known to 0.002 near 0.01."""
 RANK = 1e-12
@@ -89,9 +94,7 @@ def clustered_covariance(
     known = values > RANK * values[-1]
     root = scale[:, None] * vectors[:, known] / np.sqrt(values[known])
     leverage = root.T @ information @ root
-    left, axes = np.linalg.eigh(np.eye(root.shape[1]) - leverage)
-    pull = np.swapaxes(axes, -1, -2) @ (score @ root / sigma_px)[..., None]
-    pull = (axes @ (pull / np.sqrt(np.maximum(left, MIN_LEFT))[..., None]))[..., 0]
+    pull = _without_leverage(leverage, score @ root / sigma_px)
     expected = root.T @ data @ root
     # Images of much leverage count for several.
     share = np.einsum("vii->v", leverage)
@@ -102,6 +105,33 @@ def clustered_covariance(
     covariance += factor * (unit - root @ root.T)
     covariance *= sigma_px**2
     return Clustered(0.5 * (covariance + covariance.T), float(np.sqrt(factor)), freedom)
+
+
+def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
+    """Return (I - M)^-1/2 z (N, n) of clusters with leverages M (N, n, n) and z (N, n)."""
+    out, size = np.empty_like(pull), np.linalg.norm(leverage, axis=(1, 2))
+    # Frobenius' norm bounds the eigenvalues of M. Where it is well below one, powers of M take less than all of those.
+    small = (size < MAX_FOR_SERIES) & (pull.shape[1] > MAX_FOR_EIGENVALUES)
+    if small.any():
+        bound = float(size[small].max())
+        fall = (1.0 - np.sqrt(1.0 - bound)) / (1.0 + np.sqrt(1.0 - bound))
+        count = max(1, int(np.log(SERIES_LEFT_OUT) / np.log(fall)))
+        # Interpolated at the zeros of the first polynomial left out.
+        angle = np.pi * (np.arange(count + 1) + 0.5) / (count + 1)
+        values = 1.0 / np.sqrt(1.0 - 0.5 * bound * (1.0 + np.cos(angle)))
+        series = 2.0 / len(angle) * np.cos(np.outer(np.arange(count + 1), angle)) @ values
+        series[0] *= 0.5
+        centred = leverage[small] * (2.0 / bound) - np.eye(pull.shape[1])
+        before, term = pull[small], (centred @ pull[small][..., None])[..., 0]
+        out[small] = series[0] * before + series[1] * term
+        for factor in series[2:]:
+            before, term = term, 2.0 * (centred @ term[..., None])[..., 0] - before
+            out[small] += factor * term
+    if not small.all():
+        left, axes = np.linalg.eigh(np.eye(pull.shape[1]) - leverage[~small])
+        along = np.swapaxes(axes, -1, -2) @ pull[~small, :, None]
+        out[~small] = (axes @ (along / np.sqrt(np.maximum(left, MIN_LEFT))[..., None]))[..., 0]
+    return out
 
 
 def _shrunk(moments: FloatArray, expected: FloatArray, freedom: float) -> FloatArray:

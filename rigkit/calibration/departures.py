@@ -28,7 +28,7 @@ import numpy as np
 from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
-from rigkit.kernels.departures import DISPLACEMENTS, POSE, RADIAL_POWERS, LensCorners, displacements
+from rigkit.kernels.departures import POSE, LensCorners, averaged_amounts, displacements
 
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
 """A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
@@ -81,18 +81,7 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     information = (axes * np.maximum(values, 0.0)) @ axes.T
     # The middles of so many equal parts.
     sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, 2 * SIZES_TRIED + 1)[1::2]
-    along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
-    prior = np.where(np.arange(DISPLACEMENTS) < RADIAL_POWERS, along[:, None], others[:, None])
-    scaled = np.eye(DISPLACEMENTS) + prior[:, :, None] * information * prior[:, None, :]
-    root = np.linalg.cholesky(scaled)
-    variance = np.linalg.inv(scaled) * prior[:, :, None] * prior[:, None, :]
-    mean = variance @ score
-    evidence = 0.5 * mean @ score - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-    weight = np.exp(evidence - evidence.max())
-    weight /= weight.sum()
-    return np.asarray(
-        (weight @ variance.reshape(len(weight), -1)).reshape(DISPLACEMENTS, DISPLACEMENTS) + (mean.T * weight) @ mean
-    )
+    return averaged_amounts(information, score, sizes)
 
 
 def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, int]:

@@ -73,12 +73,14 @@ def _partners(
     ends = ends.transpose(2, 0, 3, 1) + centre[:, None]
     chosen = (number[starts, None] != number) & (boards[starts, None] == boards)
     chosen &= ((ends - usual) ** 2).sum(axis=-1).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
-    if not chosen.any():
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     i, j = np.nonzero(chosen)
     i, ends = starts[i], ends[chosen]
     flat = ends.reshape(-1, 12)
-    near = np.linalg.norm(flat - flat[int(np.argmax(_neighbours(flat, reach)))], axis=1) <= reach
+    alike = _neighbours(flat, reach) if len(flat) else np.zeros(0, np.int64)
+    if alike.max(initial=0) < 2:
+        # No motion comes twice.
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    near = np.linalg.norm(flat - flat[int(np.argmax(alike))], axis=1) <= reach
     best = np.flatnonzero(near)
     # The motion of the one that lies in the middle of those.
     middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]

@@ -31,7 +31,6 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays
 from rigkit.geometry.rotation import exp_so3, skew
-from rigkit.kernels.departures import DISPLACEMENTS
 
 CORNERS = 400
 """So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
@@ -95,6 +94,7 @@ class FarProjection:
     rays, corners : (N, 3) those, and (2, P + 3, N) `projection_design` along them.
     hides : (3, P) the rotation that hides a step of one standard deviation of each parameter.
     departures, hides_departures : what the lens may do beyond its model, and (3, J) the rotations that hide that.
+    corners_left : (2, P + J, N) what that leaves, at the corners, of such steps and of the displacements.
     rivals : lenses of other models, each with how the parameters (P,) follow it and the rotation of its rays (3, 3):
         where boards were it is followed, elsewhere the two go apart.
     """
@@ -108,6 +108,7 @@ class FarProjection:
     hides: FloatArray
     departures: Departures
     hides_departures: FloatArray
+    corners_left: FloatArray
     rivals: tuple[tuple[Rival, FloatArray, Mat3], ...]
 
     @classmethod
@@ -126,12 +127,15 @@ class FarProjection:
         # Parameters have units of their own: in standard deviations they can be compared.
         sigmas = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
         design = projection_design(camera, rays)
-        there = design.transpose(1, 0, 2).reshape(p + 3, -1)
         departures, pixels = Departures.of(calibration), camera.project(rays)[0]
-        beyond = departures.left_over(pixels, design).transpose(1, 0, 2).reshape(DISPLACEMENTS, -1)
-        hidden = np.concatenate([sigmas[:, None] * there[:p], beyond]).T
-        turned = there[p:]
-        hides = np.linalg.pinv(turned @ turned.T, hermitian=True) @ (turned @ hidden)
+        left = np.concatenate([sigmas[:, None] * design[:, :p], departures.left_over(pixels, design)], axis=1)
+        turned = design[:, p:]
+        square, across = (
+            (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0),
+            (turned @ np.swapaxes(left, 1, 2)).sum(axis=0),
+        )
+        hides = np.linalg.pinv(square, hermitian=True) @ across
+        left -= hides.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         return cls(
             camera=camera,
@@ -143,6 +147,7 @@ class FarProjection:
             hides=hides[:, :p],
             departures=departures,
             hides_departures=hides[:, p:],
+            corners_left=left,
             rivals=tuple((one, *followed(camera, one.camera, rays, sigmas)) for one in calibration.rivals),
         )
 
@@ -154,7 +159,10 @@ class FarProjection:
     def beyond_model(self, rays: FloatArray, design: FloatArray) -> FloatArray:
         """Return what of the covariance (M, 2, 2) along `rays` (M, 3) is what the lens may do beyond its model, from
         `projection_design` there."""
-        out = _propagated(self.departures.covariance, self.left_over(rays, design))
+        return self._beyond(self.left_over(rays, design), rays, design)
+
+    def _beyond(self, left: FloatArray, rays: FloatArray, design: FloatArray) -> FloatArray:
+        out = _propagated(self.departures.covariance, left)
         for rival, away in self.away(rays, design):
             out += rival.likely * away[:, :, None] * away[:, None, :]
         return out
@@ -167,6 +175,8 @@ class FarProjection:
 
     def away(self, rays: FloatArray, design: FloatArray) -> list[tuple[Rival, FloatArray]]:
         """Return how far each rival, followed where the boards were, projects `rays` (M, 3) elsewhere, (M, 2) px."""
+        if not self.rivals:
+            return []
         out, pixels, p = [], self.camera.project(rays)[0], len(self.sigmas)
         for rival, step, turn in self.rivals:
             there, seen = rival.camera.project(rays @ turn.T)
@@ -177,13 +187,17 @@ class FarProjection:
     @cached_property
     def at_corners_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (M,) px, at the corners; NaN where one has no ray."""
-        beyond = self.beyond_model(self.rays, self.corners)
-        return self._over_all(self._of_parameters(self.corners) + beyond)
+        beyond = self._beyond(self.corners_left[:, len(self.sigmas) :], self.rays, self.corners)
+        return self._over_all(self._corners_of_parameters + beyond)
 
     @property
     def of_parameters_px(self) -> FloatArray:
         """The same (M,) where the model were known to be right."""
-        return self._over_all(self._of_parameters(self.corners))
+        return self._over_all(self._corners_of_parameters)
+
+    @cached_property
+    def _corners_of_parameters(self) -> FloatArray:
+        return _propagated(self.correlation, self.corners_left[:, : len(self.sigmas)])
 
     def _over_all(self, covariance: FloatArray) -> FloatArray:
         out = np.full(len(self.rays_valid), np.nan)

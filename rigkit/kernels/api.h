@@ -211,6 +211,9 @@ EXPORT void lens_products(
     const lens_corners_t *corners, ARRAY(double, memory, lens_memory(corners.parameters)),
     ARRAY(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
     ARRAY(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
+EXPORT void average_amounts(
+    ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
+    ARRAY(const double, sizes, count), int64_t count, ARRAY(double, out, DISPLACEMENTS, DISPLACEMENTS));
 
 /* edges.c */
 

@@ -117,3 +117,56 @@ EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *me
         for (int64_t j = 0; j < i; j++)
             products[i * kept + j] = products[j * kept + i];
 }
+
+EXPORT FOR_EACH_PROCESSOR void average_amounts(
+    const double *information, const double *score, const double *sizes, int64_t count, double *out)
+{
+    enum { N = DISPLACEMENTS };
+    double best = -INFINITY, total = 0.0;
+    memset(out, 0, N * N * sizeof(double));
+    for (int64_t pair = 0; pair < count * count; pair++) {
+        const double along = sizes[pair % count], other = sizes[pair / count];
+        /* L L' = 1 + D F D with the information F and the sizes D; E = L^-1 D. */
+        double L[N][N], E[N][N] = {{0.0}}, mean[N] = {0.0}, evidence = 0.0;
+        for (int64_t i = 0; i < N; i++) {
+            const double d = i < RADIAL_POWERS ? along : other;
+            for (int64_t j = 0; j <= i; j++) {
+                double sum = d * (j < RADIAL_POWERS ? along : other) * information[N * i + j] + (i == j ? 1.0 : 0.0);
+                for (int64_t k = 0; k < j; k++)
+                    sum -= L[i][k] * L[j][k];
+                L[i][j] = i == j ? sqrt(sum) : sum / L[j][j];
+            }
+            E[i][i] = d;
+            for (int64_t k = 0; k < i; k++)
+                for (int64_t j = 0; j <= k; j++)
+                    E[i][j] -= L[i][k] * E[k][j];
+            double part = 0.0;
+            for (int64_t j = 0; j <= i; j++) {
+                E[i][j] /= L[i][i];
+                part += E[i][j] * score[j];
+            }
+            for (int64_t j = 0; j <= i; j++)
+                mean[j] += E[i][j] * part;
+            evidence += 0.5 * part * part - log(L[i][i]);
+        }
+        if (evidence > best) {
+            const double less = exp(best - evidence);
+            total *= less;
+            for (int64_t k = 0; k < N * N; k++)
+                out[k] *= less;
+            best = evidence;
+        }
+        const double weight = exp(evidence - best);
+        total += weight;
+        /* The covariance is E' E. */
+        for (int64_t i = 0; i < N; i++)
+            for (int64_t j = 0; j < N; j++)
+                out[N * i + j] += weight * mean[i] * mean[j];
+        for (int64_t k = 0; k < N; k++)
+            for (int64_t i = 0; i <= k; i++)
+                for (int64_t j = 0; j <= k; j++)
+                    out[N * i + j] += weight * E[k][i] * E[k][j];
+    }
+    for (int64_t k = 0; k < N * N; k++)
+        out[k] /= total;
+}

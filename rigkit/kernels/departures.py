@@ -75,6 +75,19 @@ class LensCorners(Struct):
         return with_pose, out
 
 
+def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return E[a a^T] (J, J) of the amounts a of displacements, px, of which images give the information (J, J) and the
+    score (J,).
+
+    Beforehand a is normal with mean zero, those along the radius of one of the `sizes` (S,), the others of one, all
+    pairs alike; each counts as far as the images bear it out.
+    """
+    information, score, sizes = (np.ascontiguousarray(a, np.float64) for a in (information, score, sizes))
+    out = np.empty((DISPLACEMENTS, DISPLACEMENTS))
+    kernels().average_amounts(information, score, sizes, len(sizes), out)
+    return out
+
+
 def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
     """Return the displacements (2, J, M) at pixels (M, 2), px: of about one px in the corners of the image.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference import departures as reference
 
-from rigkit.kernels.departures import DISPLACEMENTS, LensCorners, displacements
+from rigkit.kernels.departures import DISPLACEMENTS, LensCorners, averaged_amounts, displacements
 
 SIZE = (641, 480)
 ROUNDING = 1e-12
@@ -18,6 +18,17 @@ def test_displacements_are_as_defined(rng: np.random.Generator) -> None:
     ours, theirs = displacements(pixels, SIZE), reference.displacements(pixels, SIZE)
     assert ours.shape == (2, DISPLACEMENTS, 101)
     np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("told", [0.0, 1.0, 1e6])
+def test_amounts_are_averaged_as_defined(told: float, rng: np.random.Generator) -> None:
+    """Where nothing is told, a little, and all: other sizes are the likely ones."""
+    root = rng.normal(size=(DISPLACEMENTS, 2 * DISPLACEMENTS))
+    information = told * root @ root.T
+    score = information @ rng.normal(0.0, 0.1, DISPLACEMENTS)
+    sizes = np.geomspace(1e-3, 1.0, 5)
+    ours, theirs = (one(information, score, sizes) for one in (averaged_amounts, reference.averaged_amounts))
+    assert np.abs(ours - theirs).max() < 1e-9 * np.abs(theirs).max()
 
 
 @pytest.mark.parametrize("parameters", [1, 8, 10, 13])

@@ -243,7 +243,8 @@ def _transfer_px(
     if places:
         own, lever = _places_of(entries, places)
         turn, place = turn @ own, place + (turn @ lever[..., None])[..., 0]
-    in_cam = (np.repeat(turn, counts, axis=0) @ second.points[mask, :, None])[..., 0] + np.repeat(place, counts, axis=0)
+    in_cam = np.einsum("nij,nj->ni", np.repeat(turn, counts, axis=0), second.points[mask])
+    in_cam += np.repeat(place, counts, axis=0)
     pixels, valid = camera.project(in_cam)
     use = valid & second.kept[mask]
     off = pixels - second.pixels[mask]

@@ -179,11 +179,12 @@ def _solved(
 def _boards_px(seen: Sequence[FrameObservations]) -> float:
     """Return how large boards are in the images, px: the median over views of twice the corners' rms distance from
     their middle."""
-    sizes = []
-    for entry in (entry for own in seen for entry in own.values()):
-        corners = entry.view.pixels[entry.kept] if entry.kept.any() else entry.view.pixels
-        sizes.append(2.0 * float(np.sqrt(((corners - corners.mean(axis=0)) ** 2).sum(axis=1).mean())))
-    return float(np.median(sizes))
+    entries = [entry for own in seen for entry in own.values()]
+    shown = [entry.view.pixels[entry.kept] if entry.kept.any() else entry.view.pixels for entry in entries]
+    count = np.array([len(corners) for corners in shown])
+    start, every = np.cumsum(count) - count, np.concatenate(shown)
+    off = every - np.repeat(np.add.reduceat(every, start) / count[:, None], count, axis=0)
+    return float(np.median(2.0 * np.sqrt(np.add.reduceat((off**2).sum(axis=1), start) / count)))
 
 
 def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool) -> Finding:

@@ -74,12 +74,14 @@ def turns_of(board: Board) -> tuple[Rigid3, ...]:
 def frame_observations(own: Sequence[tuple[str, BoardView]], result: Calibration) -> FrameObservations:
     """Return the views that the camera's own calibration used, numbered as it numbers them; every board is a target of
     its own."""
-    used = {(v.image, v.board_id): v for v in result.views}
+    every = np.nan_to_num((result.corners.residuals_px**2).sum(axis=1))
+    each = np.split(every, np.cumsum(result.corners.count)[:-1])
+    used = {(v.image, v.board_id): (v, squared) for v, squared in zip(result.views, each, strict=True)}
     out = {}
     for frame, view in own:
-        entry = used.get((view.image, view.board.board_id))
-        if entry is not None:
-            squared = np.nan_to_num((entry.residuals_px**2).sum(axis=1))
+        found = used.get((view.image, view.board.board_id))
+        if found is not None:
+            entry, squared = found
             if (view.grid != entry.grid).any():
                 view = replace(view, grid=entry.grid)
             key = (frame, view.board.board_id)

@@ -39,13 +39,14 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
     """Return how sure it is where the boards' corners in camera `a` must appear in camera `b`; None where `b` has none
     of their places in its image."""
     calibration = rig.cameras[rig.index(a)].calibration
-    boards = {shape.board_id: shape.points_mm for shape in calibration.boards}
-    shown = [
-        view.cam_from_board.apply(boards[view.board_id])[:: max(1, len(boards[view.board_id]) // 8)]
-        for view in calibration.views
-    ]
-    points = np.concatenate(shown)
-    points = points[np.linspace(0, len(points) - 1, min(TRANSFER_POINTS, len(points))).astype(np.int64)]
+    shown = {shape.board_id: shape.points_mm[:: max(1, len(shape.points_mm) // 8)] for shape in calibration.boards}
+    boards = [shown[view.board_id] for view in calibration.views]
+    end = np.cumsum([len(points) for points in boards])
+    chosen = np.linspace(0, end[-1] - 1, min(TRANSFER_POINTS, end[-1])).astype(np.int64)
+    view = np.searchsorted(end, chosen, side="right")
+    on_board = np.array([boards[v][k] for v, k in zip(view, chosen - end[view], strict=True)])
+    corners = calibration.corners
+    points = np.einsum("nij,nj->ni", corners.rotation[view], on_board) + corners.translation_mm[view]
     covariance, seen = transfer_covariance(rig, a, b, points)
     if not seen.any():
         return None

@@ -18,6 +18,19 @@ def displacements(pixels: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     return np.moveaxis(np.array([*radial, *decentring, *prisms, (x, -y), (y, x)]), 0, 1)
 
 
+def averaged_amounts(information: np.ndarray, score: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return E[a a^T] (J, J), averaged over all pairs of sizes."""
+    along, others = (size.ravel() for size in np.meshgrid(sizes, sizes))
+    prior = np.where(np.arange(len(score)) < len(RADIAL_POWERS), along[:, None], others[:, None])
+    scaled = np.eye(len(score)) + prior[:, :, None] * information * prior[:, None, :]
+    variance = np.linalg.inv(scaled) * prior[:, :, None] * prior[:, None, :]
+    mean = variance @ score
+    evidence = 0.5 * (mean @ score - np.linalg.slogdet(scaled)[1])
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    return np.asarray(np.einsum("h,hij->ij", weight, variance + mean[:, :, None] * mean[:, None]))
+
+
 def products(
     d_pixels_d_point: np.ndarray,
     d_pixels_d_parameters: np.ndarray,
