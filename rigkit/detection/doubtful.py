@@ -11,7 +11,8 @@ from rigkit.detection.lattices import candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
-from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.subpixel import refine
 
 MIN_DOUBTFUL_CORNERS = 20
 """Chance makes smaller grids out of anything."""

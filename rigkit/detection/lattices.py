@@ -29,7 +29,8 @@ from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
-from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.subpixel import refine
 
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""

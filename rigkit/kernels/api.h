@@ -317,6 +317,43 @@ EXPORT void fit_tags(
     ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
     ARRAY(double, scratch, most, TAG_SPOT), ARRAY(double, out, count, TAG_OUTCOMES));
 
+/* boards.c */
+
+/* Planes of the picture of a board: the pattern, its slopes along u and v, what lies beyond each of the four sides, how the
+ * pattern changes as they go further out. */
+enum { BOARD_PLANES = 11 };
+
+EXPORT void board_places(
+    ARRAY(const double, coefficients, rows + 2, columns + 2, 2), int64_t rows, int64_t columns, int64_t left, int64_t top,
+    int64_t width, int64_t height, double around, ARRAY(double, places, height, width, 2));
+EXPORT void board_picture(
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
+    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp, ARRAY(float, out, BOARD_PLANES, height, width));
+EXPORT void board_shares(
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing,
+    double most, int64_t cubic, int64_t margin, ARRAY(int32_t, nodes, height, width, 2),
+    ARRAY(float, weights, height, width, 2, 4), ARRAY(int64_t, boxes, rows * columns, 4));
+EXPORT void board_values(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const double, values, count, rows, columns), int64_t count,
+    ARRAY(float, out, count, height, width));
+EXPORT void move_blocks(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const float, gradient, 2, height, width),
+    ARRAY(const float, weight, height, width), ARRAY(const float, taps, 2 * radius + 1), int64_t radius,
+    ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
+    ARRAY(float, scratch, 3 * room), int64_t size, ARRAY(float, data, size));
+EXPORT void share_blocks(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const float, planes, wide_by, height, width), int64_t wide_by,
+    ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
+    ARRAY(float, scratch, room), int64_t size, ARRAY(float, data, size));
+EXPORT void block_products(
+    ARRAY(const int64_t, boxes, count, 4), ARRAY(const int64_t, starts, count), ARRAY(const int64_t, wide_by, count),
+    ARRAY(const int64_t, first, count), int64_t count, int64_t size, ARRAY(const float, data, size),
+    ARRAY(const float, rest, height, width), int64_t width, int64_t height, int64_t unknowns,
+    ARRAY(double, out, unknowns, unknowns), ARRAY(double, right, unknowns));
+
 /* circles.c */
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness

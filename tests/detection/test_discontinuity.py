@@ -17,7 +17,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.photometry import develop

@@ -11,7 +11,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.guided.rejoin import rejoined
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.pairs import trihedral_pair

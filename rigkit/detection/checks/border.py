@@ -19,7 +19,7 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 MIN_CELL_PX = 6.0
 """In smaller squares a quarter of one is not told from its edges."""

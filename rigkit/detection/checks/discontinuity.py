@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of, upper_median
 from rigkit.detection.checks.validate import stray_row
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 SUSPECT_FACTOR = 2.0
 """A corner whose residual, relative to its contrast, exceeds the typical one of the board by this factor is suspect:

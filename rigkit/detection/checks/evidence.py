@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.core.arrays import upper_median
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.spacing import spacing_changes
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 MIN_MISFIT, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
 """Smaller values are those of any sharp board seen straight on, and speak no further for it."""

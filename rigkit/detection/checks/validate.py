@@ -13,7 +13,7 @@ from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.local_fit import STIFF, fit_cells
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.kernels import lattice as native
 
 STRAY_ROW = 2

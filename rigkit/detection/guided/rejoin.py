@@ -15,7 +15,7 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.detection.lattice.lattice import Lattice, margins
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.geometry.board_pose import board_poses
 from rigkit.geometry.rigid3 import Rigid3
 

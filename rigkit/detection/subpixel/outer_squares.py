@@ -83,6 +83,16 @@ def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatAr
     return replace(geometry, gaps=gaps, paper=paper)
 
 
+def outer_squares(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray) -> FloatArray:
+    """Return how wide the outermost squares beside N corners are, (N, 2, 2), in squares; NaN where none is seen to end.
+
+    Arguments as for `with_paper`.
+    """
+    beside = with_paper(image, geometry, fit, sign, owner)
+    seen = np.full(geometry.gaps.shape, np.nan) if beside.paper is None else beside.paper
+    return np.where(np.isfinite(seen), beside.gaps / geometry.gaps, np.nan)
+
+
 @functools.cache
 def _rules() -> PaperRules:
     return PaperRules.of(

@@ -6,22 +6,23 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
-from rigkit.detection.lattice.lattice import Lattice, LatticeStack, padded, turned
+from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
-from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
+from rigkit.detection.subpixel.outer_squares import beside_paper, outer_squares, with_paper
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
+from rigkit.detection.subpixel.whole_board import small_squares, with_whole_boards
 
 Part = tuple[slice, slice]
 
@@ -72,71 +73,6 @@ alike. On rendered boards under a ruler the factor is 12 and more, on boards wit
 noise is 0.065 and more. Glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class RefinedLattice:
-    """A lattice with what the fit says of each corner, (R, C) each and NaN where unknown.
-
-    Attributes
-    ----------
-    lattice : the corners.
-    sigma_px, blur_px : predicted standard deviation, width of the edges.
-    residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
-    scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
-        the noise in the image explains.
-    """
-
-    lattice: Lattice
-    sigma_px: FloatArray
-    blur_px: FloatArray
-    residual: FloatArray
-    noise: FloatArray
-    scatter: float = 1.0
-
-    @property
-    def worst_sigma_px(self) -> FloatArray:
-        """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
-        # Of few pixels, those with mirror images may have more noise than all of them have residuals.
-        worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
-        return worst
-
-    def without(self, drop: BoolArray) -> RefinedLattice:
-        """Return this with the corners `drop` (R, C) forgotten."""
-        rest = (np.where(drop, np.nan, values) for values in self._values())
-        return _refined(self.lattice.without(drop), rest, self.scatter)
-
-    def cut(self, rows: slice, columns: slice) -> RefinedLattice:
-        """Return the part of `rows` and `columns`."""
-        rest = (values[rows, columns] for values in self._values())
-        return _refined(self.lattice.cut(rows, columns), rest, self.scatter)
-
-    def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
-        """Return this with so many empty rows and columns before and after."""
-        rest = (padded(values, rows, columns) for values in self._values())
-        return _refined(self.lattice.padded(rows, columns), rest, self.scatter)
-
-    def turned(self, quarter_turns: int) -> RefinedLattice:
-        """Return this numbered from another corner, as `Lattice.turned`."""
-        rest = (turned(values, quarter_turns) for values in self._values())
-        return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
-
-    def filled(self, other: RefinedLattice) -> RefinedLattice:
-        """Return this with the corners of `other`, of the same size, where it has none."""
-        known = self.lattice.known
-        pairs = zip(self._values(), other._values(), strict=True)
-        scatter = max(self.scatter, other.scatter)
-        rest = (np.where(known, *pair) for pair in pairs)
-        return _refined(self.lattice.filled(other.lattice), rest, scatter)
-
-    def _values(self) -> tuple[FloatArray, ...]:
-        return (self.sigma_px, self.blur_px, self.residual, self.noise)
-
-
-def _refined(lattice: Lattice, values: Iterable[FloatArray], scatter: float) -> RefinedLattice:
-    """Return the refined `lattice` of `values` as `RefinedLattice._values`."""
-    sigma_px, blur_px, residual, noise = values
-    return RefinedLattice(lattice, sigma_px, blur_px, residual, noise, scatter)
-
-
 def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
@@ -156,7 +92,7 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
         # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
         once = last.without(~reached)
         blur = _typical_blur(once, sheet.parts)
-        again, _ = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts)
+        again, _ = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts, again=True)
         last = last.without(reached).filled(again)
     if holes.any():
         last = _confirmed(last, start, holes)
@@ -217,9 +153,11 @@ def _last_pass(
     blur: FloatArray,
     sigma_px: FloatArray,
     parts: Sequence[Part],
+    *,
+    again: bool = False,
 ) -> tuple[RefinedLattice, BoolArray]:
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out. Say (R, C) which
-    are of boards whose neighbouring lines reach into the windows.
+    are of boards whose neighbouring lines reach into the windows, and so are to be fitted `again`.
 
     Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
@@ -254,20 +192,42 @@ def _last_pass(
     if _reached_by_others(geometry.gaps, blur[known], mine).any():
         geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
-    again = beside_paper(geometry, fit, mine)
+    fit = _fitted_beside_paper(image, geometry, fit, fitted, signs[known], mine)
+    factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
+    reached = np.zeros(known.shape, np.bool_)
+    reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
+    refined = _spread(start, fit, fit.sigma_px * factors[mine])
+    small = small_squares(geometry, fit.blur, mine, len(parts))
+    if not again:
+        small[mine[reached[known]]] = False
+    if small.any():
+        outer = np.full((*known.shape, 4), np.nan)
+        outer[known] = outer_squares(image, geometry, fit, signs[known], mine).reshape(-1, 4)
+        whole = [(part, factor) for part, factor, here in zip(parts, factors.tolist(), small, strict=True) if here]
+        refined = with_whole_boards(image, refined, outer, whole)
+    return refined, reached
+
+
+def _fitted_beside_paper(
+    image: GreyImage,
+    geometry: Geometry,
+    fit: EdgeFit,
+    fitted: Callable[[BoolArray, Geometry], EdgeFit],
+    signs: FloatArray,
+    owner: IntArray,
+) -> EdgeFit:
+    """Return the `fit` of N corners with those `fitted` again that see what lies beyond their board, `owner` (N,)."""
+    again = beside_paper(geometry, fit, owner)
     moving = again
     for _ in range(PAPER_ROUNDS if again.any() else 0):
-        beside = with_paper(image, geometry.of(again), fit.of(again), signs[known][again], mine[again])
+        beside = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])
         before, which = fit.pixels[moving], moving[again]
         fit = fit.with_part(moving, fitted(moving, beside.of(which)))
         moving = moving.copy()
         moving[moving] = np.linalg.norm(fit.pixels[moving] - before, axis=1) >= SETTLED_PX
         if not moving.any():
             break
-    factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
-    reached = np.zeros(known.shape, np.bool_)
-    reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
-    return _spread(start, fit, fit.sigma_px * factors[mine]), reached
+    return fit
 
 
 def _reached_by_others(gaps: FloatArray, blur: FloatArray, owner: IntArray) -> BoolArray:

@@ -15,7 +15,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.lattices import MIN_BOARD_CORNERS, find_lattices, fitted
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 
 
 class Search:

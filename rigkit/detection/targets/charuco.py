@@ -22,7 +22,8 @@ from rigkit.detection.guided.guided import completed, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
-from rigkit.detection.subpixel.subpixel import RefinedLattice, refine
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.tags.codes import homographies, transferred
 from rigkit.detection.targets.base import Finder, Search
 

@@ -15,7 +15,7 @@ from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
 from rigkit.detection.lattice.origin import quarter_turns
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.subpixel import RefinedLattice
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.targets.base import Finder, Search
 
 SEEN_OF_LINE = 0.5

@@ -1,0 +1,76 @@
+"""Lattices with what the sub-pixel fit says of their corners."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.detection.lattice.lattice import Lattice, padded, turned
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RefinedLattice:
+    """A lattice with what the fit says of each corner, (R, C) each and NaN where unknown.
+
+    Attributes
+    ----------
+    lattice : the corners.
+    sigma_px, blur_px : predicted standard deviation, width of the edges.
+    residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
+    scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
+        the noise in the image explains.
+    """
+
+    lattice: Lattice
+    sigma_px: FloatArray
+    blur_px: FloatArray
+    residual: FloatArray
+    noise: FloatArray
+    scatter: float = 1.0
+
+    @property
+    def worst_sigma_px(self) -> FloatArray:
+        """(R, C) standard deviation if all that the fit leaves were noise: large for what is no chessboard."""
+        # Of few pixels, those with mirror images may have more noise than all of them have residuals.
+        worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
+        return worst
+
+    def without(self, drop: BoolArray) -> RefinedLattice:
+        """Return this with the corners `drop` (R, C) forgotten."""
+        rest = (np.where(drop, np.nan, values) for values in self._values())
+        return _refined(self.lattice.without(drop), rest, self.scatter)
+
+    def cut(self, rows: slice, columns: slice) -> RefinedLattice:
+        """Return the part of `rows` and `columns`."""
+        rest = (values[rows, columns] for values in self._values())
+        return _refined(self.lattice.cut(rows, columns), rest, self.scatter)
+
+    def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
+        """Return this with so many empty rows and columns before and after."""
+        rest = (padded(values, rows, columns) for values in self._values())
+        return _refined(self.lattice.padded(rows, columns), rest, self.scatter)
+
+    def turned(self, quarter_turns: int) -> RefinedLattice:
+        """Return this numbered from another corner, as `Lattice.turned`."""
+        rest = (turned(values, quarter_turns) for values in self._values())
+        return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
+
+    def filled(self, other: RefinedLattice) -> RefinedLattice:
+        """Return this with the corners of `other`, of the same size, where it has none."""
+        known = self.lattice.known
+        pairs = zip(self._values(), other._values(), strict=True)
+        scatter = max(self.scatter, other.scatter)
+        rest = (np.where(known, *pair) for pair in pairs)
+        return _refined(self.lattice.filled(other.lattice), rest, scatter)
+
+    def _values(self) -> tuple[FloatArray, ...]:
+        return (self.sigma_px, self.blur_px, self.residual, self.noise)
+
+
+def _refined(lattice: Lattice, values: Iterable[FloatArray], scatter: float) -> RefinedLattice:
+    """Return the refined `lattice` of `values` as `RefinedLattice._values`."""
+    sigma_px, blur_px, residual, noise = values
+    return RefinedLattice(lattice, sigma_px, blur_px, residual, noise, scatter)

@@ -1,0 +1,481 @@
+/* The picture of a whole chessboard, how it changes as corners move, and the products of such changes. What it is for and
+ * the numbers are in rigkit.detection.subpixel.whole_board, checks against closed forms in tests/kernels/test_boards.py.
+ *
+ * Places on the board, in squares from its first corner, are a cubic spline of the board's corners. The picture is drawn
+ * sharp, by the distances to the lines that are near, and blurred as a picture; so are its changes. */
+#include "kernels.h"
+
+enum { TAPS = 4, ORDERS = 4, NEWTON_STEPS = 8, LANES = 16 };
+
+/* Edges of a sharp picture are looked at so far away, standard deviations of its blur. */
+#define NEAR_SIGMAS 6.0
+
+/* So near, in px, is a place to the pixel that it is sought for. */
+#define PLACED_PX 1e-6
+
+/* The third derivative of a cubic that is 1 at a node and 0 at all others, as the spline through the nodes nearly is. */
+#define CARDINAL 0.75
+
+/* One beyond another by less than this, in squares, lies in the same square. */
+#define SQUARE_SLACK 1e-9
+
+INLINE void spline(double t, double value[TAPS], double slope[TAPS])
+{
+    const double rest = 1.0 - t;
+    value[0] = rest * rest * rest / 6.0;
+    value[1] = (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0;
+    value[2] = (-3.0 * t * t * t + 3.0 * t * t + 3.0 * t + 1.0) / 6.0;
+    value[3] = t * t * t / 6.0;
+    slope[0] = -0.5 * rest * rest;
+    slope[1] = 1.5 * t * t - 2.0 * t;
+    slope[2] = -1.5 * t * t + t + 0.5;
+    slope[3] = 0.5 * t * t;
+}
+
+/* Set `at` to where (x, y) of the square whose coefficients begin at `first` is seen, and `grow` to how that grows. */
+INLINE void seen_at(const double *first, int64_t stride, double x, double y, double at[2], double grow[2][2])
+{
+    double wx[TAPS], dx[TAPS], wy[TAPS], dy[TAPS];
+    spline(x, wx, dx);
+    spline(y, wy, dy);
+    for (int axis = 0; axis < 2; axis++)
+        at[axis] = grow[axis][0] = grow[axis][1] = 0.0;
+    for (int j = 0; j < TAPS; j++)
+        for (int axis = 0; axis < 2; axis++) {
+            double value = 0.0, slope = 0.0;
+            for (int i = 0; i < TAPS; i++) {
+                const double part = first[2 * (j * stride + i) + axis];
+                value += wx[i] * part;
+                slope += dx[i] * part;
+            }
+            at[axis] += wy[j] * value;
+            grow[axis][0] += wy[j] * slope;
+            grow[axis][1] += dy[j] * value;
+        }
+}
+
+/* Set (x, y) to the place in the square that is seen at (u, v); return whether it is in the square. */
+INLINE int place_in_square(const double *first, int64_t stride, double u, double v, double *x, double *y)
+{
+    double at[2], grow[2][2];
+    *x = *y = 0.5;
+    for (int turn = 0; turn < NEWTON_STEPS; turn++) {
+        seen_at(first, stride, *x, *y, at, grow);
+        const double off_u = u - at[0], off_v = v - at[1];
+        if (fabs(off_u) + fabs(off_v) < PLACED_PX)
+            return *x >= -SQUARE_SLACK && *y >= -SQUARE_SLACK && *x <= 1.0 + SQUARE_SLACK && *y <= 1.0 + SQUARE_SLACK;
+        const double area = grow[0][0] * grow[1][1] - grow[0][1] * grow[1][0];
+        if (fabs(area) < 1e-9)
+            return 0;
+        *x += limited((off_u * grow[1][1] - off_v * grow[0][1]) / area, 1.0);
+        *y += limited((off_v * grow[0][0] - off_u * grow[1][0]) / area, 1.0);
+        /* Beyond its square a cubic is another one's. */
+        if (fabs(*x - 0.5) > 1.5 || fabs(*y - 0.5) > 1.5)
+            return 0;
+    }
+    return 0;
+}
+
+void board_places(
+    const double *coefficients, int64_t rows, int64_t columns, int64_t left, int64_t top, int64_t width, int64_t height,
+    double around, double *places)
+{
+    const int64_t stride = columns + 2;
+    for (int64_t k = 0; k < 2 * width * height; k++)
+        places[k] = NAN;
+    for (int64_t j = 0; j + 1 < rows; j++)
+        for (int64_t i = 0; i + 1 < columns; i++) {
+            const double *first = coefficients + 2 * (j * stride + i);
+            double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
+            for (int corner = 0; corner < 4; corner++) {
+                double at[2], grow[2][2];
+                seen_at(first, stride, (double)(corner % 2), (double)(corner / 2), at, grow);
+                for (int axis = 0; axis < 2; axis++) {
+                    low[axis] = at[axis] < low[axis] ? at[axis] : low[axis];
+                    high[axis] = at[axis] > high[axis] ? at[axis] : high[axis];
+                }
+            }
+            /* Its sides may be bent. */
+            const double more_u = around * (high[0] - low[0]), more_v = around * (high[1] - low[1]);
+            double from_u = ceil(low[0] - more_u) - (double)left, to_u = floor(high[0] + more_u) - (double)left;
+            double from_v = ceil(low[1] - more_v) - (double)top, to_v = floor(high[1] + more_v) - (double)top;
+            if (!(from_u <= (double)width && to_u >= 0.0 && from_v <= (double)height && to_v >= 0.0))
+                continue;
+            from_u = from_u > 0.0 ? from_u : 0.0;
+            from_v = from_v > 0.0 ? from_v : 0.0;
+            to_u = to_u < (double)(width - 1) ? to_u : (double)(width - 1);
+            to_v = to_v < (double)(height - 1) ? to_v : (double)(height - 1);
+            for (int64_t v = (int64_t)from_v; v <= (int64_t)to_v; v++)
+                for (int64_t u = (int64_t)from_u; u <= (int64_t)to_u; u++) {
+                    double *place = places + 2 * (v * width + u), x, y;
+                    if (isfinite(place[0])
+                        || !place_in_square(first, stride, (double)(u + left), (double)(v + top), &x, &y))
+                        continue;
+                    place[0] = (double)i + x;
+                    place[1] = (double)j + y;
+                }
+        }
+}
+
+/* How the picture changes along one side of the board: the squares, what lies before the first line and beyond the last,
+ * and derivatives along the distance over the blur; the lines where the board ends, per square; the normal, per px. */
+typedef struct {
+    double squares[ORDERS], before[ORDERS], beyond[ORDERS], ends[2], normal[2];
+} along_t;
+
+/* Add `part` times the edge at `line` to `into`, and return its density per square. */
+INLINE double add_line(double place, double line, double slope, double bend, double turn, double sharp, double part, double into[ORDERS])
+{
+    const double straight = (place - line) / slope;
+    if (straight < -NEAR_SIGMAS * sharp)
+        return 0.0;
+    if (straight > NEAR_SIGMAS * sharp) {
+        into[0] += part;
+        return 0.0;
+    }
+    /* The distance from what bends, and is bent; a blurred arc lies inside the arc. */
+    const double away = straight - 0.5 * bend * straight * straight + 0.5 * turn * sharp * sharp;
+    float edge[5];
+    blurred_edge((float)limited(away / sharp, NEAR_SIGMAS), 0.0f, edge);
+    into[0] += part * (0.5 + 0.5 * (double)edge[0]);
+    for (int order = 1; order < ORDERS; order++)
+        into[order] += part * 0.5 * (double)edge[order];
+    return 0.5 * (double)edge[1] / (slope * sharp);
+}
+
+/* Set `out` to the picture along one axis at a place whose neighbours are `near` (3 x 3). */
+INLINE void look_along(const double near[3][3], int64_t lines, const double ends[2], double sharp, along_t *out)
+{
+    const double place = near[1][1], gu = 0.5 * (near[1][2] - near[1][0]), gv = 0.5 * (near[2][1] - near[0][1]);
+    const double uu = near[1][2] - 2.0 * place + near[1][0], vv = near[2][1] - 2.0 * place + near[0][1];
+    const double uv = 0.25 * (near[2][2] - near[2][0] - near[0][2] + near[0][0]);
+    double slope = hypot(gu, gv);
+    slope = slope > 1e-6 ? slope : 1e-6;
+    const double nu = gu / slope, nv = gv / slope;
+    const double bend = limited((uu * nu * nu + 2.0 * uv * nu * nv + vv * nv * nv) / slope, 0.5 / sharp);
+    const double turn = limited((uu * nv * nv - 2.0 * uv * nu * nv + vv * nu * nu) / slope, 0.5 / sharp);
+    memset(out, 0, sizeof *out);
+    out->normal[0] = nu;
+    out->normal[1] = nv;
+    double high[ORDERS] = {0.0}, low[ORDERS] = {0.0};
+    out->ends[0] = add_line(place, ends[0], slope, bend, turn, sharp, 1.0, low);
+    out->ends[1] = add_line(place, ends[1], slope, bend, turn, sharp, 1.0, high);
+    const double last = lines % 2 ? 1.0 : -1.0;
+    for (int order = 0; order < ORDERS; order++) {
+        out->squares[order] = low[order] + last * high[order];
+        out->before[order] = (order ? 0.0 : 1.0) - low[order];
+        out->beyond[order] = high[order];
+    }
+    for (int64_t line = 0; line < lines; line++)
+        add_line(place, (double)line, slope, bend, turn, sharp, line % 2 ? 2.0 : -2.0, out->squares);
+}
+
+/* The product of both directions, and its derivatives along them: blur along two normals is correlated (edges.c). */
+INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho, double part, double out[3])
+{
+    out[0] += part * (a[0] * b[0] + rho * (a[1] * b[1] + rho * (0.5 * a[2] * b[2] + rho / 6.0 * a[3] * b[3])));
+    out[1] += part * (a[1] * b[0] + rho * (a[2] * b[1] + 0.5 * rho * a[3] * b[2]));
+    out[2] += part * (a[0] * b[1] + rho * (a[1] * b[2] + 0.5 * rho * a[2] * b[3]));
+}
+
+void board_picture(
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends,
+    const double *paper, double sharp, float *out)
+{
+    const int64_t area = width * height;
+    const double mean = 0.25 * (paper[0] + paper[1] + paper[2] + paper[3]);
+    for (int64_t v = 0; v < height; v++)
+        for (int64_t u = 0; u < width; u++) {
+            float *to = out + v * width + u;
+            double near[2][3][3], known = 0.0;
+            for (int64_t down = -1; down <= 1; down++)
+                for (int64_t over = -1; over <= 1; over++)
+                    for (int axis = 0; axis < 2; axis++) {
+                        const int64_t row = v + down < 0 ? 0 : v + down < height ? v + down : height - 1;
+                        const int64_t column = u + over < 0 ? 0 : u + over < width ? u + over : width - 1;
+                        known += near[axis][down + 1][over + 1] = places[2 * (row * width + column) + axis];
+                    }
+            for (int plane = 0; plane < BOARD_PLANES; plane++)
+                to[plane * area] = 0.0f;
+            if (!isfinite(known)) {
+                to[0] = (float)mean;
+                continue;
+            }
+            along_t one, two;
+            look_along(near[0], columns, ends, sharp, &one);
+            look_along(near[1], rows, ends + 2, sharp, &two);
+            const double rho = one.normal[0] * two.normal[0] + one.normal[1] * two.normal[1];
+            /* Where two sides meet, half of what lies beyond is of each. */
+            double rest1[ORDERS], rest2[ORDERS];
+            for (int order = 0; order < ORDERS; order++) {
+                rest1[order] = (order ? 0.0 : 1.0) - 0.5 * (one.before[order] + one.beyond[order]);
+                rest2[order] = (order ? 0.0 : 1.0) - 0.5 * (two.before[order] + two.beyond[order]);
+            }
+            const double *parts[4][2] = {
+                {one.before, rest2}, {one.beyond, rest2}, {rest1, two.before}, {rest1, two.beyond}};
+            double all[3] = {0.0};
+            multiply(one.squares, two.squares, rho, 1.0, all);
+            for (int side = 0; side < 4; side++) {
+                double beyond[3] = {0.0};
+                multiply(parts[side][0], parts[side][1], rho, 1.0, beyond);
+                to[(3 + side) * area] = (float)beyond[0];
+                for (int k = 0; k < 3; k++)
+                    all[k] += paper[side] * beyond[k];
+            }
+            to[0] = (float)all[0];
+            to[area] = (float)((all[1] * one.normal[0] + all[2] * two.normal[0]) / sharp);
+            to[2 * area] = (float)((all[1] * one.normal[1] + all[2] * two.normal[1]) / sharp);
+            /* An end further out: squares in place of paper. */
+            const double last1 = columns % 2 ? -1.0 : 1.0, last2 = rows % 2 ? -1.0 : 1.0;
+            const double aside1 = 0.5 * (paper[2] * two.before[0] + paper[3] * two.beyond[0]);
+            const double aside2 = 0.5 * (paper[0] * one.before[0] + paper[1] * one.beyond[0]);
+            to[7 * area] = (float)(one.ends[0] * (two.squares[0] - paper[0] * rest2[0] + aside1));
+            to[8 * area] = (float)(one.ends[1] * (last1 * two.squares[0] - paper[1] * rest2[0] + aside1));
+            to[9 * area] = (float)(two.ends[0] * (one.squares[0] - paper[2] * rest1[0] + aside2));
+            to[10 * area] = (float)(two.ends[1] * (last2 * one.squares[0] - paper[3] * rest1[0] + aside2));
+        }
+}
+
+/* Set `out` to how much of each of TAPS nodes from the one returned there is at `at`, in nodes: a cubic between them, or a
+ * straight line. Beyond the first and the last ones, so far as `most`, they go on as these three, or two, do. */
+INLINE int64_t node_shares(double at, int64_t count, double most, int cubic, float out[TAPS])
+{
+    at = at < -most ? -most : at > (double)(count - 1) + most ? (double)(count - 1) + most : at;
+    const int64_t before = (int64_t)floor(at);
+    const double t = at - (double)before, r = 1.0 - t;
+    double weights[TAPS] = {0.0, r, t, 0.0};
+    if (cubic) {
+        weights[0] = -CARDINAL * t * r * r;
+        weights[3] = -CARDINAL * r * t * t;
+        weights[1] = ((2.0 - CARDINAL) * t - (3.0 - CARDINAL)) * t * t + 1.0;
+        weights[2] = ((2.0 - CARDINAL) * r - (3.0 - CARDINAL)) * r * r + 1.0;
+    }
+    const int64_t last = count > TAPS ? count - TAPS : 0;
+    const int64_t first = before - 1 < 0 ? 0 : before - 1 < last ? before - 1 : last;
+    double sums[TAPS] = {0.0};
+    for (int64_t k = 0; k < TAPS; k++) {
+        const int64_t node = before - 1 + k;
+        const int64_t further = node < 0 ? -node : node > count - 1 ? node - count + 1 : 0;
+        const int64_t end = node < 0 ? 0 : count - 1, inwards = node < 0 ? 1 : -1;
+        const double far = (double)further, part = weights[k];
+        if (further && cubic) {
+            sums[end - first] += 0.5 * (far + 1.0) * (far + 2.0) * part;
+            sums[end + inwards - first] -= far * (far + 2.0) * part;
+            sums[end + 2 * inwards - first] += 0.5 * far * (far + 1.0) * part;
+        } else if (further) {
+            sums[end - first] += (1.0 + far) * part;
+            sums[end + inwards - first] -= far * part;
+        } else {
+            sums[node - first] += weights[k];
+        }
+    }
+    for (int k = 0; k < TAPS; k++)
+        out[k] = (float)sums[k];
+    return first;
+}
+
+void board_shares(
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing, double most,
+    int64_t cubic, int64_t margin, int32_t *nodes, float *weights, int64_t *boxes)
+{
+    for (int64_t n = 0; n < rows * columns; n++) {
+        boxes[4 * n] = width;
+        boxes[4 * n + 1] = height;
+        boxes[4 * n + 2] = boxes[4 * n + 3] = -1;
+    }
+    for (int64_t v = 0; v < height; v++)
+        for (int64_t u = 0; u < width; u++) {
+            const int64_t k = v * width + u;
+            float *along = weights + 2 * TAPS * k, *down = along + TAPS;
+            memset(along, 0, 2 * TAPS * sizeof(float));
+            nodes[2 * k] = nodes[2 * k + 1] = 0;
+            if (!isfinite(places[2 * k]))
+                continue;
+            const int64_t i = node_shares(places[2 * k] / spacing, columns, most / spacing, (int)cubic, along);
+            const int64_t j = node_shares(places[2 * k + 1] / spacing, rows, most / spacing, (int)cubic, down);
+            nodes[2 * k] = (int32_t)i;
+            nodes[2 * k + 1] = (int32_t)j;
+            for (int64_t row = 0; row < TAPS; row++)
+                for (int64_t column = 0; column < TAPS; column++) {
+                    if (along[column] == 0.0f || down[row] == 0.0f)
+                        continue;
+                    int64_t *box = boxes + 4 * ((j + row) * columns + i + column);
+                    box[0] = u < box[0] ? u : box[0];
+                    box[1] = v < box[1] ? v : box[1];
+                    box[2] = u > box[2] ? u : box[2];
+                    box[3] = v > box[3] ? v : box[3];
+                }
+        }
+    for (int64_t n = 0; n < rows * columns; n++) {
+        int64_t *box = boxes + 4 * n;
+        if (box[2] < box[0]) {
+            box[0] = box[1] = 0;
+            box[2] = box[3] = -1;
+            continue;
+        }
+        box[0] = box[0] > margin ? box[0] - margin : 0;
+        box[1] = box[1] > margin ? box[1] - margin : 0;
+        box[2] = box[2] + margin < width ? box[2] + margin : width - 1;
+        box[3] = box[3] + margin < height ? box[3] + margin : height - 1;
+    }
+}
+
+/* Set `out` to how much of node (i, j) there is in the box's pixels, row by row. */
+INLINE void shares(
+    const int32_t *nodes, const float *weights, int64_t width, const int64_t box[4], int64_t i, int64_t j, float *out)
+{
+    for (int64_t v = box[1]; v <= box[3]; v++)
+        for (int64_t u = box[0]; u <= box[2]; u++, out++) {
+            const int64_t k = v * width + u, column = i - nodes[2 * k], row = j - nodes[2 * k + 1];
+            const int there = column >= 0 && column < TAPS && row >= 0 && row < TAPS;
+            *out = there ? weights[2 * TAPS * k + column] * weights[2 * TAPS * k + TAPS + row] : 0.0f;
+        }
+}
+
+void board_values(
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns,
+    const double *values, int64_t count, float *out)
+{
+    const int64_t area = width * height;
+    for (int64_t k = 0; k < area; k++) {
+        const float *along = weights + 2 * TAPS * k, *down = along + TAPS;
+        for (int64_t n = 0; n < count; n++) {
+            float sum = 0.0f;
+            for (int64_t j = 0; j < TAPS; j++)
+                for (int64_t i = 0; i < TAPS; i++)
+                    if (along[i] != 0.0f && down[j] != 0.0f)
+                        sum += along[i] * down[j] * (float)values[(n * rows + nodes[2 * k + 1] + j) * columns + nodes[2 * k] + i];
+            out[n * area + k] = sum;
+        }
+    }
+}
+
+/* Blur `wide` x `high` values of `from` into `to`, nothing beyond. */
+FOR_EACH_PROCESSOR
+static void blur_box(const float *from, int64_t wide, int64_t high, const float *taps, int64_t radius, float *between, float *to)
+{
+    for (int64_t v = 0; v < high; v++) {
+        float *row = between + v * wide;
+        memset(row, 0, (size_t)wide * sizeof(float));
+        for (int64_t down = -radius; down <= radius; down++) {
+            if (v + down < 0 || v + down >= high)
+                continue;
+            const float tap = taps[down + radius], *beside = from + (v + down) * wide;
+            for (int64_t u = 0; u < wide; u++)
+                row[u] += tap * beside[u];
+        }
+    }
+    for (int64_t v = 0; v < high; v++) {
+        float *row = to + v * wide;
+        memset(row, 0, (size_t)wide * sizeof(float));
+        for (int64_t over = -radius; over <= radius; over++) {
+            const int64_t first = over < 0 ? -over : 0, last = over > 0 ? wide - over : wide;
+            const float tap = taps[over + radius], *beside = between + v * wide + over;
+            for (int64_t u = first; u < last; u++)
+                row[u] += tap * beside[u];
+        }
+    }
+}
+
+void move_blocks(
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns,
+    const float *gradient, const float *weight, const float *taps, int64_t radius, const int64_t *boxes, const int64_t *starts, int64_t room,
+    float *scratch, int64_t size, float *data)
+{
+    (void)size;
+    float *share = scratch, *sharp = scratch + room, *between = scratch + 2 * room;
+    for (int64_t n = 0; n < rows * columns; n++) {
+        const int64_t *box = boxes + 4 * n, wide = box[2] - box[0] + 1, high = box[3] - box[1] + 1;
+        if (wide <= 0)
+            continue;
+        shares(nodes, weights, width, box, n % columns, n / columns, share);
+        for (int axis = 0; axis < 2; axis++) {
+            float *to = data + starts[n] + axis * wide * high;
+            const float *slope = gradient + axis * width * height;
+            for (int64_t v = 0; v < high; v++) {
+                const float *row = slope + (v + box[1]) * width + box[0];
+                for (int64_t u = 0; u < wide; u++)
+                    sharp[v * wide + u] = -share[v * wide + u] * row[u];
+            }
+            blur_box(sharp, wide, high, taps, radius, between, to);
+            for (int64_t v = 0; v < high; v++) {
+                const float *row = weight + (v + box[1]) * width + box[0];
+                for (int64_t u = 0; u < wide; u++)
+                    to[v * wide + u] *= row[u];
+            }
+        }
+    }
+}
+
+void share_blocks(
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *planes, int64_t wide_by, const int64_t *boxes, const int64_t *starts, int64_t room, float *scratch,
+    int64_t size, float *data)
+{
+    (void)size;
+    for (int64_t n = 0; n < rows * columns; n++) {
+        const int64_t *box = boxes + 4 * n, wide = box[2] - box[0] + 1, high = box[3] - box[1] + 1;
+        if (wide <= 0)
+            continue;
+        shares(nodes, weights, width, box, n % columns, n / columns, scratch);
+        for (int64_t plane = 0; plane < wide_by; plane++)
+            for (int64_t v = 0; v < high; v++) {
+                const float *row = planes + (plane * height + v + box[1]) * width + box[0];
+                float *to = data + starts[n] + (plane * high + v) * wide;
+                for (int64_t u = 0; u < wide; u++)
+                    to[u] = scratch[v * wide + u] * row[u];
+            }
+    }
+    (void)room;
+}
+
+/* Return the sum of the products of `high` rows of `wide` values that begin `next_a` and `next_b` apart. */
+INLINE double box_product(const float *a, int64_t next_a, const float *b, int64_t next_b, int64_t wide, int64_t high)
+{
+    float sums[LANES] = {0.0f};
+    double total = 0.0;
+    for (int64_t v = 0; v < high; v++, a += next_a, b += next_b) {
+        int64_t k = 0;
+        for (; k + LANES <= wide; k += LANES)
+            for (int lane = 0; lane < LANES; lane++)
+                sums[lane] += a[k + lane] * b[k + lane];
+        float rest = 0.0f;
+        for (; k < wide; k++)
+            rest += a[k] * b[k];
+        total += (double)rest;
+    }
+    for (int lane = 0; lane < LANES; lane++)
+        total += (double)sums[lane];
+    return total;
+}
+
+FOR_EACH_PROCESSOR
+void block_products(
+    const int64_t *boxes, const int64_t *starts, const int64_t *wide_by, const int64_t *first, int64_t count, int64_t size,
+    const float *data, const float *rest, int64_t width, int64_t height, int64_t unknowns, double *N, double *right)
+{
+    (void)size;
+    (void)height;
+    memset(N, 0, (size_t)(unknowns * unknowns) * sizeof(double));
+    memset(right, 0, (size_t)unknowns * sizeof(double));
+    for (int64_t n = 0; n < count; n++) {
+        const int64_t *a = boxes + 4 * n, wide_a = a[2] - a[0] + 1, high_a = a[3] - a[1] + 1;
+        for (int64_t p = 0; p < wide_by[n]; p++)
+            right[first[n] + p] = box_product(
+                data + starts[n] + p * high_a * wide_a, wide_a, rest + a[1] * width + a[0], width, wide_a, high_a);
+        for (int64_t m = 0; m <= n; m++) {
+            const int64_t *b = boxes + 4 * m, wide_b = b[2] - b[0] + 1, high_b = b[3] - b[1] + 1;
+            const int64_t left = a[0] > b[0] ? a[0] : b[0], end = a[2] < b[2] ? a[2] : b[2];
+            const int64_t top = a[1] > b[1] ? a[1] : b[1], bottom = a[3] < b[3] ? a[3] : b[3];
+            if (end < left || bottom < top)
+                continue;
+            for (int64_t p = 0; p < wide_by[n]; p++)
+                for (int64_t q = 0; q < wide_by[m]; q++) {
+                    const double sum = box_product(
+                        data + starts[n] + (p * high_a + top - a[1]) * wide_a + left - a[0], wide_a,
+                        data + starts[m] + (q * high_b + top - b[1]) * wide_b + left - b[0], wide_b, end - left + 1,
+                        bottom - top + 1);
+                    N[(first[n] + p) * unknowns + first[m] + q] = N[(first[m] + q) * unknowns + first[n] + p] = sum;
+                }
+        }
+    }
+}

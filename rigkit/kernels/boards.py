@@ -1,0 +1,167 @@
+"""The kernels in boards.c: the picture of a whole chessboard, and how it changes as corners move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.kernels import kernels
+from rigkit.kernels.declarations import header
+
+BOARD_PLANES = header().constants["BOARD_PLANES"]
+
+Picture = NDArray[np.float32]
+"""(H, W), or several of them."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Blocks:
+    """What a picture changes by with each of N blocks of unknowns, which is nothing beyond a box.
+
+    Attributes
+    ----------
+    boxes : (N, 4) the first column and row of each, and the last ones; without pixels where these are before the first.
+    starts : (N,) where in `data` the changes by its first unknown begin, row by row; those of others follow.
+    each : unknowns of every block.
+    data : the changes.
+    """
+
+    boxes: IntArray
+    starts: IntArray
+    each: int
+    data: Picture
+
+    @staticmethod
+    def empty(boxes: IntArray, each: int) -> Blocks:
+        """Return blocks with room for the changes in the `boxes`."""
+        sizes = areas(boxes)
+        return Blocks(boxes, each * (np.cumsum(sizes) - sizes), each, np.empty(each * int(sizes.sum()), np.float32))
+
+
+def areas(boxes: IntArray) -> IntArray:
+    """Return the numbers of pixels in `boxes` (N, 4)."""
+    sides = np.maximum(boxes[:, 2:] - boxes[:, :2] + 1, 0)
+    return np.asarray(sides[:, 0] * sides[:, 1], np.int64)
+
+
+def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], around: float) -> FloatArray:
+    """Return the places (H, W, 2) along columns and rows, from the first node, NaN where no square is seen.
+
+    Parameters
+    ----------
+    coefficients : (R + 2, C + 2, 2) of a cubic B-spline through the pixels of R x C nodes.
+    box : first column and row of the picture in the image, its width and height.
+    around : squares are looked for so far beside the box of their corners, in sides of that.
+    """
+    left, top, width, height = box
+    rows, columns = coefficients.shape[0] - 2, coefficients.shape[1] - 2
+    places = np.empty((height, width, 2))
+    spline = np.ascontiguousarray(coefficients, np.float64)
+    kernels().board_places(spline, rows, columns, left, top, width, height, around, places)
+    return places
+
+
+def board_picture(
+    places: FloatArray, size: tuple[int, int], ends: FloatArray, paper: FloatArray, sharp_px: float
+) -> Picture:
+    """Return the `BOARD_PLANES` of the picture, (11, H, W), blurred by `sharp_px`, of a board of R x C corners, `size`.
+
+    `ends` (2, 2): where, in squares, it begins and ends along columns and along rows; `paper` (4,) what is beyond each
+    of these, where squares are 1 and -1.
+    """
+    height, width = places.shape[:2]
+    out = np.empty((BOARD_PLANES, height, width), np.float32)
+    kernels().board_picture(places, width, height, *size, ends, paper, sharp_px, out)
+    return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Shares:
+    """How much of the nodes of a grid there is at each pixel.
+
+    Attributes
+    ----------
+    size : rows and columns of the grid.
+    nodes : (H, W, 2) the first node along columns and rows of which there is some.
+    weights : (H, W, 2, 4) of four nodes from that.
+    boxes : (R * C, 4) of the pixels with some of each node, and a margin.
+    """
+
+    size: tuple[int, int]
+    nodes: NDArray[np.int32]
+    weights: Picture
+    boxes: IntArray
+
+    @staticmethod
+    def at(
+        places: FloatArray, size: tuple[int, int], *, spacing: float, beyond: float, cubic: bool, margin: int
+    ) -> Shares:
+        """Return those at `places` (H, W, 2), in squares, of nodes that are `spacing` squares apart.
+
+        Between nodes the shares are those of a cubic, or of a straight line; up to `beyond` squares beyond the nodes
+        the last two go on on a straight line.
+        """
+        height, width = places.shape[:2]
+        nodes, weights = np.empty((height, width, 2), np.int32), np.empty((height, width, 2, 4), np.float32)
+        boxes = np.empty((size[0] * size[1], 4), np.int64)
+        kernels().board_shares(
+            *(places, width, height, *size, spacing, beyond, int(cubic), margin, nodes, weights, boxes)
+        )
+        return Shares(size, nodes, weights, boxes)
+
+    def interpolated(self, values: FloatArray) -> Picture:
+        """Return `values` (K, R, C) at the nodes as pictures (K, H, W)."""
+        height, width = self.nodes.shape[:2]
+        out = np.empty((len(values), height, width), np.float32)
+        known = np.ascontiguousarray(values, np.float64)
+        kernels().board_values(self.nodes, self.weights, width, height, *self.size, known, len(known), out)
+        return out
+
+
+def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture) -> Blocks:
+    """Return how a blurred picture changes as each of R x C corners moves along u and v, times `weight` (H, W).
+
+    `slopes` (2, H, W) are those of the sharp picture along u and v, `taps` (2 K + 1,) the blur, for which the boxes of
+    `shares` have their margin.
+    """
+    height, width = weight.shape
+    blocks = Blocks.empty(shares.boxes, 2)
+    room = int(areas(blocks.boxes).max(initial=1))
+    kernels().move_blocks(
+        *(shares.nodes, shares.weights, width, height, *shares.size, np.ascontiguousarray(slopes), weight, taps),
+        *(len(taps) // 2,),
+        *(blocks.boxes, blocks.starts, room, np.empty(3 * room, np.float32), len(blocks.data), blocks.data),
+    )
+    return blocks
+
+
+def share_blocks(shares: Shares, planes: Picture) -> Blocks:
+    """Return how a picture changes with values at nodes, that are interpolated and times `planes` (K, H, W)."""
+    count, height, width = planes.shape
+    blocks = Blocks.empty(shares.boxes, count)
+    room = int(areas(blocks.boxes).max(initial=1))
+    kernels().share_blocks(
+        *(shares.nodes, shares.weights, width, height, *shares.size, planes, count, blocks.boxes, blocks.starts),
+        *(room, np.empty(room, np.float32), len(blocks.data), blocks.data),
+    )
+    return blocks
+
+
+def block_products(groups: Sequence[Blocks], rest: Picture) -> tuple[FloatArray, FloatArray]:
+    """Return the products (U, U) of the changes by the unknowns of the groups, in order, and those with `rest`."""
+    boxes = np.concatenate([group.boxes for group in groups])
+    before = np.cumsum([0, *(len(group.data) for group in groups)])
+    starts = np.concatenate([group.starts + at for group, at in zip(groups, before, strict=False)])
+    each = np.concatenate([np.full(len(group.boxes), group.each, np.int64) for group in groups])
+    data = np.concatenate([group.data for group in groups])
+    unknowns, (height, width) = int(each.sum()), rest.shape
+    out, right = np.empty((unknowns, unknowns)), np.empty(unknowns)
+    kernels().block_products(
+        *(boxes, starts, each, np.cumsum(each) - each, len(boxes), len(data), data, rest, width, height),
+        *(unknowns, out, right),
+    )
+    return out, right
