@@ -25,7 +25,7 @@ from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
-from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_field
+from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
 from rigkit.reconstruction.metric import POSE_STEP_RAD
 from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
@@ -134,7 +134,7 @@ def grow_scene(
     grown, sweep = filled(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
     rays = PairRays.of(grown, r.camera1, r.camera2)
     measured = rays.measured(pose)
-    surface = fit_surface(measured, step, even.pose.amplitude_px)
+    surface = fit_surface(measured, step, even.pose.misfit_px)
     if sweep is not None:
         at = surface.valid
         keep = at.copy()
@@ -142,7 +142,7 @@ def grow_scene(
         surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(rays, pose, covariance)
     if calibrations is not None:
-        moves = _moved_poses(even, r, calibrations, view1.size_px, fixed=pose_is_known)
+        moves = _moved_poses(even, r, calibrations, fixed=pose_is_known)
         by_pose, of_pose = _with_calibrations(rays, pose, moves, by_pose, of_pose)
         covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
@@ -196,6 +196,7 @@ def _pose_from_grown(
     """Return the pose of evenly spread pairs, grown until it does not move any more; where it is `fixed`, as it was."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
+    cameras = view1.camera, view2.camera
     gate = max(MAX_DISTANCE_PX, GATE * sparse.sigma_px)
     for k in range(MAX_GROWTHS):
         known = LineKnowledge(essential_from_pose(pose), gate)
@@ -212,14 +213,14 @@ def _pose_from_grown(
             even = kept.matches.select(kept.inliers)
             # What pairs err by together across their epipolar lines they err by along them too.
             there = kept.refined.cam2_from_cam1
-            misfit = pose_with_field(even, there, view1.size_px, PoseType.STANDARD, None, OVERLAP).amplitude_px
+            misfit = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, OVERLAP).misfit_px
             return _EvenPose(SystematicPose(there, kept.refined.covariance, misfit), even)
         # Without a level a type holds exactly.
         level = r.level_sigma_rad or 0.0
         fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
-        found = pose_with_field(
-            even, fit.refined.cam2_from_cam1, view1.size_px, fit.pose_type, fit.level_sigma_rad, OVERLAP
+        found = pose_with_lens_errors(
+            even, cameras, fit.refined.cam2_from_cam1, fit.pose_type, fit.level_sigma_rad, OVERLAP
         )
         before, pose = pose, found.cam2_from_cam1
         turn = rotation_angle(pose.rotation @ before.rotation.T)
@@ -275,9 +276,7 @@ class _Moved(NamedTuple):
     change: FloatArray
 
 
-def _moved_poses(
-    even: _EvenPose, r: Reconstruction, calibrations: Calibrations, size_px: tuple[int, int], *, fixed: bool
-) -> list[_Moved]:
+def _moved_poses(even: _EvenPose, r: Reconstruction, calibrations: Calibrations, *, fixed: bool) -> list[_Moved]:
     """Return the moved cameras with their poses, found from the same pairs unless the pose is `fixed`."""
     pixels1, pixels2, sigma = even.matches.pixels1, even.matches.pixels2, even.matches.sigma1_px
     each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None)]
@@ -291,7 +290,7 @@ def _moved_poses(
         matches = Matches.from_cameras(
             *cameras, pixels1[seen], pixels2[seen], sigma1_px=sigma[seen], sigma2_px=sigma[seen]
         )
-        poses.append(pose_with_field(matches, start, size_px, r.pose_type, level, OVERLAP).cam2_from_cam1)
+        poses.append(pose_with_lens_errors(matches, cameras, start, r.pose_type, level, OVERLAP).cam2_from_cam1)
     base, length = poses[0], r.baseline_mm
     return [
         _Moved(

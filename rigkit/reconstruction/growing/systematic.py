@@ -1,110 +1,184 @@
-"""The pose of many pairs whose errors are not independent: calibrations, compression and lenses err alike nearby.
+"""The pose of many pairs whose errors are not independent: lenses err alike nearby.
 
-Thousands of pairs average their noise away; what is left is what the cameras' models are off by, a smooth field over
-the image. Taken for independent noise it turns the pose by many of its stated standard deviations. Here the distance
-of a pair from its epipolar line is the sum of the pose's, a field of cosines over image 1, and noise. The field's
-amplitude is what makes the distances most likely, with the field and the pose integrated out (empirical Bayes); its
-variance falls with the wave number, so that a wide bowl is likelier than ripples. The pose's covariance contains it.
+Thousands of pairs average their noise away; what is left is what the cameras' models are off by. Taken for independent
+noise it turns the pose by many of its stated standard deviations. Here the distance of a pair from its epipolar line is
+the sum of the pose's, of smooth errors of both lenses (`lens_errors`), and noise. The pose is the mean of its posterior
+distribution with the lenses' errors and their amplitudes, one a family of them, integrated out; its covariance contains
+what these leave open. Nothing that a lens may err by is believed, and nothing is left out that the pairs show.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.geometry.rotation import exp_so3, skew, unit
+from rigkit.geometry.sampson import epipolar_normals
+from rigkit.reconstruction.growing.lens_errors import ErrorModes, error_modes
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.residuals import level_terms, point_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-MAX_WAVES = 10
-"""Half waves over the image, both ways together: less than a tenth of the image wide, it is noise to a pose."""
-AMPLITUDES_PX = tuple(np.geomspace(0.03, 1.0, 14))
-"""Standard deviations of the field that are compared. The least is what lenses, interpolation and compression leave at
-best: a field that looks like another pose leaves no trace in the distances, so that none seen is not none there."""
-FIELD_STEPS = 4
+AMPLITUDES_PX = np.geomspace(0.003, 3.0, 9)
+"""Of a family of a lens's errors over its image, rms, that are weighed against each other."""
+USUAL_PX = 0.1
+"""Scale of the half-Cauchy distribution of an amplitude before any pair is seen (A. Gelman, "Prior Distributions for
+Variance Parameters in Hierarchical Models", Bayesian Analysis 2006): half of all careful calibrations leave less. What
+looks like another pose leaves no trace in the distances, so that none seen is not none there."""
+LENS_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SystematicPose:
-    """A pose with |translation| = 1, its covariance (6, 6) of (left rotation perturbation rad, translation), and the
-    standard deviation of the field over the image, px."""
+    """A pose with |translation| = 1, its covariance (6, 6) of (left rotation perturbation rad, translation), and what
+    the lenses' errors move pairs by across their epipolar lines, px rms."""
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray
-    amplitude_px: float
+    misfit_px: float
 
 
-def pose_with_field(
+def pose_with_lens_errors(
     matches: Matches,
+    cameras: tuple[Camera, Camera],
     start: Rigid3,
-    size_px: tuple[int, int],
     pose_type: PoseType,
     level_sigma_rad: float | None,
     overlap: float,
 ) -> SystematicPose:
-    """Return the pose of maximum posterior probability near `start`, with the field integrated out.
+    """Return the mean of the posterior distribution of the pose near `start`, lenses' errors integrated out.
 
     Parameters
     ----------
     matches : that agree with `start`; their sigmas are those that they show.
-    size_px : of image 1.
-    pose_type, level_sigma_rad : as in `refine_pose`. Without freedom the pose stays, and only the field is measured.
-    overlap : pairs that share their pixels, so that their noise is that of one. To waves much longer than a window
-        that is independent noise of so many times its variance.
+    cameras : of both images.
+    pose_type, level_sigma_rad : as in `refine_pose`. Without freedom the pose stays, and only the misfit is measured.
+    overlap : pairs that share their pixels, so that their noise is that of one. To errors much wider than a window that
+        is independent noise of so many times its variance.
     """
     R, t = start.rotation, unit(start.translation_mm)
-    waves, falling = _waves(matches.pixels1, size_px)
-    field = waves / (np.sqrt(2.0) * matches.sigma1_px[:, None])
+    lenses = error_modes(cameras[0], matches.pixels1), error_modes(cameras[1], matches.pixels2)
+    rows_of_lenses, families = _lens_rows(matches, lenses, R, t)
     free = free_directions(PoseType.GENERAL if level_sigma_rad is not None else pose_type)
     count = len(free)
-    amplitude = 0.0
-    covariance: FloatArray = np.zeros((count, count))
     basis = translation_basis(t)
-    for _ in range(FIELD_STEPS):
+    for _ in range(LENS_STEPS):
         basis = translation_basis(t)
         r, J = point_terms(matches, R, t, basis)
         weight = cauchy_weights(r) / overlap
-        rows = np.concatenate([J[:, free], field], axis=1)
+        rows = np.concatenate([J[:, free], rows_of_lenses], axis=1)
         normal, right = rows.T @ (weight[:, None] * rows), rows.T @ (weight * r)
         if level_sigma_rad is not None:
             deviation, by_pose = (v / level_sigma_rad for v in level_terms(pose_type, R, t, basis))
             normal[:count, :count] += by_pose.T @ by_pose
             right[:count] += by_pose.T @ deviation
-        amplitude = min(AMPLITUDES_PX, key=lambda tau: _cost(normal, right, falling * tau**2))
-        inverse = np.linalg.inv(_with_prior(normal, falling * amplitude**2))
+        found = _posterior(normal, right, count, families)
         change = np.zeros(5)
-        change[free] = -(inverse @ right)[:count]
+        change[free] = found.mean
         R, t = exp_so3(change[:3]) @ R, unit(t + change[3:] @ basis)
-        covariance = np.array(inverse[:count, :count])
+    covariance = found.covariance + _of_frames(lenses, found.variances, R, t, basis)[np.ix_(free, free)]
     to_six = np.zeros((6, 5))
     to_six[:3, :3], to_six[3:, 3:] = np.eye(3), basis.T
     spread = to_six[:, free]
-    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, amplitude)
+    # Sampson's distance is shared by both images.
+    in_px = np.sqrt(2.0) * matches.sigma1_px[:, None] * rows_of_lenses
+    misfit = np.sqrt(np.mean(np.sum(in_px @ found.lens_moment * in_px, axis=1)))
+    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, float(misfit))
 
 
-def _waves(pixels: Pixels, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the cosines (N, W) at pixels (N, 2), and their variances (W,), which sum up to one."""
-    number = np.arange(MAX_WAVES + 1)
-    along, down = (np.cos(np.pi * number * (x[:, None] + 0.5) / s) for x, s in zip(pixels.T, size_px, strict=True))
-    i, j = np.nonzero(number[:, None] + number <= MAX_WAVES)
-    falling = 1.0 / (1.0 + i**2 + j**2)
-    return along[:, i] * down[:, j], falling / falling.sum()
+def _lens_rows(
+    matches: Matches, lenses: tuple[ErrorModes, ErrorModes], R: FloatArray, t: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Return by how many of their standard deviations modes of both lenses (N, K) move pairs off their epipolar lines,
+    and the modes' families (K,), in order."""
+    m = matches
+    _, n1, n2 = epipolar_normals(skew(t) @ R, m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+    sigma = np.sqrt(m.sigma1_px**2 * np.sum(n1**2, axis=1) + m.sigma2_px**2 * np.sum(n2**2, axis=1))
+    sigma = np.where(sigma > 0.0, sigma, np.inf)[:, None]
+    rows = [np.einsum("ni,nik->nk", n / sigma, lens.displacements) for n, lens in zip((n1, n2), lenses, strict=True)]
+    families = np.concatenate([lens.families for lens in lenses])
+    order = np.argsort(families, kind="stable")
+    return np.concatenate(rows, axis=1)[:, order], families[order]
 
 
-def _with_prior(normal: FloatArray, variances: FloatArray) -> FloatArray:
-    out = normal.copy()
-    at = np.arange(len(normal) - len(variances), len(normal))
-    out[at, at] += 1.0 / variances
+def _of_frames(
+    lenses: tuple[ErrorModes, ErrorModes], variances: FloatArray, R: FloatArray, t: FloatArray, basis: FloatArray
+) -> FloatArray:
+    """Return the covariance (5, 5) of the pose that the cameras' frames leave open, which turn with lenses' errors of
+    these `variances`, one a family."""
+    out = np.zeros((5, 5))
+    for lens, turn, swing in ((lenses[0], R, np.zeros((2, 3))), (lenses[1], np.eye(3), -basis @ skew(t))):
+        by_mode = np.concatenate([turn, swing]) @ lens.turns
+        out += by_mode @ (variances[lens.families][:, None] * by_mode.T)
     return out
 
 
-def _cost(normal: FloatArray, right: FloatArray, variances: FloatArray) -> float:
-    """Return -2 log of the likelihood of the distances, field and pose integrated out, up to a constant."""
-    full = _with_prior(normal, variances)
-    return float(-right @ np.linalg.solve(full, right) + np.linalg.slogdet(full)[1] + np.sum(np.log(variances)))
+class _PoseAndLenses(NamedTuple):
+    """Mean (P,) and covariance (P, P) of the pose's change; the variance of each family, px^2; the second moment (K, K)
+    of the lenses' modes where their amplitudes are likeliest."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    variances: FloatArray
+    lens_moment: FloatArray
+
+
+def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntArray) -> _PoseAndLenses:
+    """Return what normal equations of `count` numbers of the pose and of the modes say, whatever their amplitudes.
+
+    Notes
+    -----
+    For amplitudes s, with D their prior's inverse variances and F = N + D, -2 log of the likelihood with pose and modes
+    integrated out is -b^T F^-1 b + log |F| - log |D|, up to a constant. The many modes of the last family are
+    eliminated first.
+    """
+    size = np.bincount(families)
+    few = len(normal) - int(size[-1])
+    others = np.array(list(product(AMPLITUDES_PX, repeat=len(size) - 1)))
+    each = np.repeat(others, size[:-1], axis=1)
+    at = np.arange(count, few)
+    scores, means, covariances, amplitudes = [], [], [], []
+    for last in AMPLITUDES_PX:
+        many = normal[few:, few:] + np.eye(size[-1]) / last**2
+        solved = np.linalg.solve(many, np.concatenate([normal[few:, :few], right[few:, None]], axis=1))
+        full = np.broadcast_to(
+            normal[:few, :few] - normal[:few, few:] @ solved[:, :few], (len(others), few, few)
+        ).copy()
+        full[:, at, at] += each**-2.0
+        inverse = np.linalg.inv(full)
+        b = right[:few] - normal[:few, few:] @ solved[:, few]
+        mean = -inverse @ b
+        cost = mean @ b - right[few:] @ solved[:, few] + np.linalg.slogdet(full)[1] + np.linalg.slogdet(many)[1]
+        cost += 2.0 * (np.log(each).sum(axis=1) + size[-1] * np.log(last))
+        amplitudes.append(np.column_stack([others, np.full(len(others), last)]))
+        scores.append(-0.5 * cost + _log_prior(amplitudes[-1]))
+        means.append(mean[:, :count])
+        covariances.append(inverse[:, :count, :count])
+    score = np.concatenate(scores)
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    mean = np.concatenate(means)
+    middle = weight @ mean
+    off = mean - middle
+    covariance = np.einsum("k,kij->ij", weight, np.concatenate(covariances)) + off.T @ (weight[:, None] * off)
+    every = np.concatenate(amplitudes)
+    whole = normal.copy()
+    modes = np.arange(count, len(normal))
+    whole[modes, modes] += every[score.argmax()][families] ** -2.0
+    inverse = np.linalg.inv(whole)
+    mode = (inverse @ right)[count:]
+    moment = inverse[count:, count:] + np.outer(mode, mode)
+    return _PoseAndLenses(middle, covariance, weight @ every**2, moment)
+
+
+def _log_prior(amplitudes_px: FloatArray) -> FloatArray:
+    """Return the logarithm of the density (A,) of the logarithms of amplitudes (A, F)."""
+    return np.asarray(np.sum(np.log(amplitudes_px) - np.log1p((amplitudes_px / USUAL_PX) ** 2), axis=1))
