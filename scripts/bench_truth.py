@@ -43,6 +43,7 @@ BENCHES: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
     "charuco-lifecam": one_camera("*.jpg", False),
     "charuco-lifecam-legacy": one_camera("*.jpg", False),
     "charuco-stereo": stereo("left*.png", "right*.png", ()),
+    "pose2sim": one_camera("*/*.jpg", False),
     "multicam-video": multicam,
 }
 

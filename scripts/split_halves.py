@@ -68,6 +68,7 @@ CAPTURES = {
     "ocam": Capture("real/ocam-fisheye1", "*.jpg", Board("b", 8, 6, 32.5, 32.5)),
     "ov-plane": Capture("real/ov-plane/corners", "*/*.orpc", Board("ov", 22, 22, 7.5, 7.5)),
     "caliper": Capture("public/caliper-board", "*.png", Board("b", 16, 10, 15.0, 15.0)),
+    "pose2sim": Capture("public/pose2sim", "*/*.jpg", Board("b", 7, 4, 60.0, 60.0)),
     "fisheye-chess": Capture("public/fisheye-chess", "*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "cylinder": Capture("public/cylinder/201", "*", Board("b", 19, 14, 10.0, 10.0)),
     "cylinder-202": Capture("public/cylinder/202", "*", Board("b", 19, 14, 10.0, 10.0)),

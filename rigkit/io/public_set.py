@@ -28,6 +28,7 @@
 
     [urls]                           # whence to fetch them; a file without is not fetchable yet
     "left01.jpg" = "https://..."
+    "left02.jpg" = "https://.../archive.tar.gz#folder/left02.jpg"      # in a .tar or .zip
 """
 
 from __future__ import annotations

@@ -296,6 +296,6 @@ PUBLIC_FILE = file(
             "what is known of it",
         ),
         "files": said(table(TEXT), "SHA-256 of each file"),
-        "urls?": said(table(TEXT), "whence to fetch them"),
+        "urls?": said(table(TEXT), "whence to fetch them; after # a file in a .tar or .zip"),
     },
 )

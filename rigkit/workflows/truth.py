@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import os
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
-from rigkit.io.files import ensure_folder_writable
+from rigkit.io.files import ensure_folder_writable, write_atomic
 from rigkit.io.public_set import PublicSet, load_public_set
 
 CATALOGUE = "datasets/public"
@@ -81,18 +85,26 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
     if root is not None and root.exists() and not root.is_dir():
         raise InputError(f"'{root}' is a file, not a folder; give the folder of captures")
     present, fetched, missing = [], [], []
+    packed: dict[str, dict[str, list[str]]] = {}
     for k, (name, expected) in enumerate(described.sha256.items()):
         progress(f"fetch {described.name}", k, len(described.sha256))
-        path = folder / name
-        if path.is_file():
-            _require(path, expected)
-        elif name in described.urls:
-            _download(described.urls[name], path, expected)
+        url, _, member = described.urls.get(name, "").partition("#")
+        if (folder / name).is_file():
+            _require(folder / name, expected)
+        elif member:
+            packed.setdefault(url, {}).setdefault(member, []).append(name)
+            fetched.append(name)
+        elif url:
+            _download(url, folder / name, expected)
             fetched.append(name)
         else:
             missing.append(name)
             continue
         present.append(name)
+    for url, members in packed.items():
+        for member, data in _members(url, list(members)):
+            for name in members[member]:
+                _write(data, f"{url}: {member}", folder / name, described.sha256[name])
     progress(f"fetch {described.name}", len(described.sha256), len(described.sha256))
     return FetchedSet(
         described=described,
@@ -105,37 +117,72 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
 
 def _require(path: Path, expected: str) -> None:
     """Raise InputError where the file has another hash."""
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    _require_hash(path.read_bytes(), str(path), expected, "remove the file and fetch it anew")
+
+
+def _require_hash(data: bytes, source: str, expected: str, remedy: str) -> None:
+    found = hashlib.sha256(data).hexdigest()
     if found != expected:
-        raise InputError(
-            f"{path}: its SHA-256 is {found[:12]}..., the description says {expected[:12]}...; remove the file and "
-            "fetch it anew"
-        )
+        raise InputError(f"{source}: its SHA-256 is {found[:12]}..., the description says {expected[:12]}...; {remedy}")
 
 
-def _download(url: str, path: Path, expected: str) -> None:
-    """Fetch one file; it appears whole and with its hash, or not at all."""
+def _download(url: str, path: Path, expected: str | None) -> None:
+    """Fetch one file; it appears whole and with its hash, where one is known, or not at all."""
     ensure_folder_writable(path.parent)
     if url.startswith("file://"):
-        _copy(Path(url.removeprefix("file://")), path, expected)
+        source = Path(url.removeprefix("file://"))
+        if not source.is_file():
+            raise InputError(f"'{source}' cannot be fetched: there is no such file; correct the address")
+        _write(source.read_bytes(), str(source), path, expected)
         return
     import pooch
     import requests
 
+    # What it says of a file whose hash is not known is not for the user: the members of an archive have theirs.
+    pooch.get_logger().setLevel("ERROR")
     try:
-        pooch.retrieve(url, f"sha256:{expected}", fname=path.name, path=path.parent)
+        pooch.retrieve(url, expected and f"sha256:{expected}", fname=path.name, path=path.parent)
     except (requests.RequestException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{url} cannot be fetched: {reason}; look whether the address still holds") from error
 
 
-def _copy(source: Path, path: Path, expected: str) -> None:
-    from rigkit.io.files import write_atomic
+def _write(data: bytes, source: str, path: Path, expected: str | None) -> None:
+    if expected is not None:
+        _require_hash(data, source, expected, "correct the address, or the hash")
+    ensure_folder_writable(path.parent)
+    write_atomic(path, data)
 
-    if not source.is_file():
-        raise InputError(f"'{source}' cannot be fetched: there is no such file; correct the address")
-    _require(source, expected)
-    write_atomic(path, source.read_bytes())
+
+def _members(url: str, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+    """Fetch a .tar or .zip and yield what its members hold; the archive itself is not kept."""
+    with tempfile.TemporaryDirectory(prefix="rigkit-") as place:
+        path = Path(place) / "archive"
+        _download(url, path, None)
+        left = set(names)
+        for name, data in _read_zip(path, left) if zipfile.is_zipfile(path) else _read_tar(path, left, url):
+            left.discard(name)
+            yield name, data
+    if left:
+        raise InputError(f"{url}: there is no '{min(left)}' in it; correct the address")
+
+
+def _read_zip(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
+    with zipfile.ZipFile(path) as archive:
+        for name in names & set(archive.namelist()):
+            yield name, archive.read(name)
+
+
+def _read_tar(path: Path, names: set[str], url: str) -> Iterator[tuple[str, bytes]]:
+    try:
+        # As a stream: going back would unpack it anew for every member.
+        with tarfile.open(path, "r|*") as archive:
+            for entry in archive:
+                found = archive.extractfile(entry) if entry.name in names else None
+                if found is not None:
+                    yield entry.name, found.read()
+    except tarfile.TarError as error:
+        raise InputError(f"{url} is no .tar or .zip; an address with # names a file in such an archive") from error
 
 
 def _catalogue() -> Path:

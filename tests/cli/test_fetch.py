@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -87,6 +88,44 @@ def test_fetched_from_a_server_and_not_again(tmp_path: Path, server: str, capsys
     (tmp_path / "served" / "01.png").unlink()
     assert main(["fetch", "small", *where]) == ExitCode.WELL
     assert "0 of them new" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["gztar", "tar", "zip"])
+def test_files_of_an_archive(tmp_path: Path, server: str, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    inside = tmp_path / "inside/set"
+    inside.mkdir(parents=True)
+    (inside / "01.png").write_bytes(CONTENT)
+    (inside / "other.txt").write_bytes(b"of no use")
+    archive = Path(shutil.make_archive(str(tmp_path / "served" / "all"), kind, inside.parent, "set"))
+    urls = {f"{side}/01.png": f"{server}/{archive.name}#set/01.png" for side in ("left", "right")}
+    where = ["--catalogue", str(described(tmp_path, urls)), "-o", str(tmp_path / "data")]
+    assert main(["fetch", "small", *where]) == ExitCode.WELL
+    found = sorted(path.relative_to(tmp_path / "data") for path in (tmp_path / "data").rglob("*") if path.is_file())
+    assert found == [Path("public/small/left/01.png"), Path("public/small/right/01.png")]
+    archive.unlink()
+    assert main(["fetch", "small", *where]) == ExitCode.WELL
+    assert "0 of them new" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("served", "member", "says"),
+    [
+        (None, "set/none.png", "there is no 'set/none.png' in it"),
+        (b"no archive", "set/01.png", "no .tar or .zip"),
+        (None, "set/other.txt", "SHA-256"),
+    ],
+)
+def test_a_wrong_archive_leaves_nothing(tmp_path: Path, served: bytes | None, member: str, says: str) -> None:
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/01.png").write_bytes(CONTENT)
+    (tmp_path / "set/other.txt").write_bytes(b"of no use")
+    archive = Path(shutil.make_archive(str(tmp_path / "all"), "gztar", tmp_path, "set"))
+    if served is not None:
+        archive.write_bytes(served)
+    catalogue = described(tmp_path, {"left/01.png": f"{archive.as_uri()}#{member}"})
+    with pytest.raises(InputError, match=says):
+        fetch_public_set(public_sets(catalogue)["small"], tmp_path / "data")
+    assert not [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
 
 
 def test_what_cannot_be_fetched_yet_is_said(
