@@ -18,7 +18,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
+from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
@@ -31,6 +31,7 @@ from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
+from rigkit.relative_pose.refinement.residuals import point_terms
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.weights import affinity_residuals
 
@@ -142,7 +143,7 @@ def grow_scene(
         surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(rays, pose, covariance)
     if calibrations is not None:
-        moves = _moved_poses(even, r, calibrations, fixed=pose_is_known)
+        moves = _moved_poses(even, r, calibrations)
         by_pose, of_pose = _with_calibrations(rays, pose, moves, by_pose, of_pose)
         covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
     cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
@@ -213,8 +214,8 @@ def _pose_from_grown(
             even = kept.matches.select(kept.inliers)
             # What pairs err by together across their epipolar lines they err by along them too.
             there = kept.refined.cam2_from_cam1
-            misfit = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, OVERLAP).misfit_px
-            return _EvenPose(SystematicPose(there, kept.refined.covariance, misfit), even)
+            found = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, OVERLAP)
+            return _EvenPose(replace(found, cam2_from_cam1=there, covariance=kept.refined.covariance), even)
         # Without a level a type holds exactly.
         level = r.level_sigma_rad or 0.0
         fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
@@ -276,34 +277,21 @@ class _Moved(NamedTuple):
     change: FloatArray
 
 
-def _moved_poses(even: _EvenPose, r: Reconstruction, calibrations: Calibrations, *, fixed: bool) -> list[_Moved]:
-    """Return the moved cameras with their poses, found from the same pairs unless the pose is `fixed`."""
-    pixels1, pixels2, sigma = even.matches.pixels1, even.matches.pixels2, even.matches.sigma1_px
-    each = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None)]
-    seen = np.logical_and.reduce([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in each])
-    start, level = even.pose.cam2_from_cam1, r.level_sigma_rad
-    poses = []
-    for cameras in each:
-        if fixed:
-            poses.append(start)
-            continue
-        matches = Matches.from_cameras(
-            *cameras, pixels1[seen], pixels2[seen], sigma1_px=sigma[seen], sigma2_px=sigma[seen]
+def _moved_poses(even: _EvenPose, r: Reconstruction, calibrations: Calibrations) -> list[_Moved]:
+    """Return the moved cameras with their poses, as the same pairs move these."""
+    pose, m = even.pose.cam2_from_cam1, even.matches
+    t, to_length = pose.translation_mm, np.repeat([1.0, r.baseline_mm], 3)
+    moves = []
+    for cameras in moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None):
+        seen = np.flatnonzero(cameras[0].unproject(m.pixels1)[1] & cameras[1].unproject(m.pixels2)[1])
+        here = m.select(seen)
+        there = Matches.from_cameras(
+            *cameras, here.pixels1, here.pixels2, sigma1_px=here.sigma1_px, sigma2_px=here.sigma2_px
         )
-        poses.append(pose_with_lens_errors(matches, cameras, start, r.pose_type, level, OVERLAP).cam2_from_cam1)
-    base, length = poses[0], r.baseline_mm
-    return [
-        _Moved(
-            cameras,
-            np.concatenate(
-                [
-                    log_so3(pose.rotation @ base.rotation.T),
-                    length * (pose.translation_mm - base.translation_mm),
-                ]
-            ),
-        )
-        for cameras, pose in zip(each[1:], poses[1:], strict=True)
-    ]
+        before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
+        change = to_length * (even.pose.by_distance[:, seen] @ (after - before))
+        moves.append(_Moved(cameras, change))
+    return moves
 
 
 def _with_calibrations(

@@ -38,12 +38,19 @@ LENS_STEPS = 3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SystematicPose:
-    """A pose with |translation| = 1, its covariance (6, 6) of (left rotation perturbation rad, translation), and what
-    the lenses' errors move pairs by across their epipolar lines, px rms."""
+    """A pose with |translation| = 1 and what it rests on.
+
+    Attributes
+    ----------
+    covariance : (6, 6) of (left rotation perturbation rad, translation).
+    misfit_px : what the lenses' errors move pairs by across their epipolar lines, rms.
+    by_distance : (6, N) change of the pose by those of the pairs' distances in sigmas (`point_terms`).
+    """
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray
     misfit_px: float
+    by_distance: FloatArray
 
 
 def pose_with_lens_errors(
@@ -88,10 +95,12 @@ def pose_with_lens_errors(
     to_six = np.zeros((6, 5))
     to_six[:3, :3], to_six[3:, 3:] = np.eye(3), basis.T
     spread = to_six[:, free]
+    by_row = -found.inverse @ (rows * weight[:, None]).T
     # Sampson's distance is shared by both images.
     in_px = np.sqrt(2.0) * matches.sigma1_px[:, None] * rows_of_lenses
-    misfit = np.sqrt(np.mean(np.sum(in_px @ found.lens_moment * in_px, axis=1)))
-    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, float(misfit))
+    moment = found.inverse[count:, count:] + np.outer(found.modes, found.modes)
+    misfit = np.sqrt(np.mean(np.sum(in_px @ moment * in_px, axis=1)))
+    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, float(misfit), spread @ by_row[:count])
 
 
 def _lens_rows(
@@ -122,13 +131,14 @@ def _of_frames(
 
 
 class _PoseAndLenses(NamedTuple):
-    """Mean (P,) and covariance (P, P) of the pose's change; the variance of each family, px^2; the second moment (K, K)
-    of the lenses' modes where their amplitudes are likeliest."""
+    """Mean (P,) and covariance (P, P) of the pose's change; the variance of each family, px^2; where amplitudes are
+    likeliest, the inverse of the normal equations with their prior, and the modes (K,)."""
 
     mean: FloatArray
     covariance: FloatArray
     variances: FloatArray
-    lens_moment: FloatArray
+    inverse: FloatArray
+    modes: FloatArray
 
 
 def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntArray) -> _PoseAndLenses:
@@ -171,12 +181,10 @@ def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntA
     covariance = np.einsum("k,kij->ij", weight, np.concatenate(covariances)) + off.T @ (weight[:, None] * off)
     every = np.concatenate(amplitudes)
     whole = normal.copy()
-    modes = np.arange(count, len(normal))
-    whole[modes, modes] += every[score.argmax()][families] ** -2.0
-    inverse = np.linalg.inv(whole)
-    mode = (inverse @ right)[count:]
-    moment = inverse[count:, count:] + np.outer(mode, mode)
-    return _PoseAndLenses(middle, covariance, weight @ every**2, moment)
+    at = np.arange(count, len(normal))
+    whole[at, at] += every[score.argmax()][families] ** -2.0
+    known = np.asarray(np.linalg.inv(whole))
+    return _PoseAndLenses(middle, covariance, weight @ every**2, known, -(known @ right)[count:])
 
 
 def _log_prior(amplitudes_px: FloatArray) -> FloatArray:
