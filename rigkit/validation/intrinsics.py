@@ -24,7 +24,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import moved_cameras
+from rigkit.reconstruction.moved_cameras import moved_cameras, moved_sights
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -155,23 +155,14 @@ def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts)
 def _normals(reconstruction: Reconstruction, moved: Reconstruction, known: BoolArray) -> Normals:
     """Return the normals (n, 3) of the `known` points as moved cameras have them."""
     m = reconstruction.matches.select(known)
-    rays, jacobians = [], []
-    for camera, was, pixels, by_pixel in (
-        (moved.camera1, reconstruction.camera1, reconstruction.pixels1[known], m.jacobians1),
-        (moved.camera2, reconstruction.camera2, reconstruction.pixels2[known], m.jacobians2),
-    ):
-        rays.append(camera.unproject(pixels)[0])
-        # The coordinates of the affinities (rectified, or the captured pixels) move with the pixels as they did.
-        captured_by_pixel = np.linalg.pinv(was.ray_jacobian(pixels)) @ by_pixel
-        jacobians.append(camera.ray_jacobian(pixels) @ captured_by_pixel)
-    J1, J2 = pair_projection_jacobians(
-        moved.cloud.points_mm[known], rays[0], jacobians[0], rays[1], jacobians[1], moved.cam2_from_cam1
-    )
+    rays1, by1 = moved_sights(moved.camera1, reconstruction.camera1, reconstruction.pixels1[known], m.jacobians1)
+    rays2, by2 = moved_sights(moved.camera2, reconstruction.camera2, reconstruction.pixels2[known], m.jacobians2)
+    J1, J2 = pair_projection_jacobians(moved.cloud.points_mm[known], rays1, by1, rays2, by2, moved.cam2_from_cam1)
     A21 = m.A21
     if needs_epipolar(reconstruction.affine_method):
         assert reconstruction.geometry is not None and reconstruction.kept is not None
         E21 = essential_from_pose(moved.cam2_from_cam1)
-        seen = EpipolarNormals.from_rays(rays[0], jacobians[0], rays[1], jacobians[1], E21)
+        seen = EpipolarNormals.from_rays(rays1, by1, rays2, by2, E21)
         chosen = np.flatnonzero(reconstruction.kept)[known]
         n1, n2 = np.full((2, len(reconstruction.kept), 2), np.nan)
         n1[chosen], n2[chosen] = seen.n1, seen.n2

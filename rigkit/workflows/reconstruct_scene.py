@@ -29,6 +29,7 @@ from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+from rigkit.reconstruction.scene_calibrations import with_scene_calibrations
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import cloud_png, epipolar_png
@@ -164,9 +165,12 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     with about(*(path for path in told if path is not None)):
         scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
+    known, of = known_pose is not None, _calibrations(options, camera1, camera2)
     if images and options.grow:
-        known, of = known_pose is not None, _calibrations(options, camera1, camera2)
         scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known, of=of)
+    if of is not None and not maps:
+        sparse = with_scene_calibrations(scene.reconstruction, *of, pose_is_known=known)
+        scene = replace(scene, reconstruction=sparse)
     r = scene.reconstruction
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)

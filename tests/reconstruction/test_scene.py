@@ -13,11 +13,14 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.reconstruction.scene import reconstruct_scene
+from rigkit.reconstruction.scene_calibrations import with_scene_calibrations
+from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.refinement.refine import refine_pose
 
 NOISE_PX, NOISE_A = 0.5, 0.05
@@ -182,3 +185,30 @@ def test_colours_of_deep_images_are_no_darker(rng, bits):
     scene = reconstruct_scene(found, REGULAR, REGULAR, image1=image)
     column = np.rint(found.pixels1[scene.kept, 0]).astype(int)
     np.testing.assert_array_equal(scene.reconstruction.cloud.colours[:, 0], grey[0, column])
+
+
+@pytest.mark.parametrize("pose_is_known", [False, True])
+def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_known):
+    """Points and normals of a sparse cloud through cameras drawn from their covariance, against the right one."""
+    found, _, pose, _, _ = contaminated(rng, count=60, outliers=0.0)
+    known = KnownPose(pose, np.zeros((6, 6))) if pose_is_known else None
+    exact = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=300.0, known_pose=known)
+    # A pose that is known contradicts cameras that are far off.
+    covariance = (0.01 if pose_is_known else 1.0) * np.diag([4.0, 4.0, 3.0, 3.0]) ** 2
+    moves, tilts = [], []
+    for _ in range(20):
+        camera = REGULAR.with_parameters(rng.multivariate_normal(REGULAR.parameters, covariance))
+        scene = reconstruct_scene(found, camera, camera, baseline_mm=300.0, known_pose=known)
+        alone = scene.reconstruction
+        whole = with_scene_calibrations(alone, UncertainCamera(camera, covariance), None, pose_is_known=pose_is_known)
+        assert whole.cloud.calibration_in_sigmas and not alone.cloud.calibration_in_sigmas
+        _, a, b = np.intersect1d(exact.kept, scene.kept, return_indices=True)
+        off = (whole.cloud.points_mm[b] - exact.reconstruction.cloud.points_mm[a]) ** 2
+        tilt = (whole.cloud.normals[b] - exact.reconstruction.cloud.normals[a]) ** 2
+        share = (whole.cloud.sigma_mm**2 - alone.cloud.sigma_mm**2)[b]
+        turned = (whole.cloud.normal_sigma_rad**2 - alone.cloud.normal_sigma_rad**2)[b]
+        moves.append([off.sum(), share.sum()])
+        tilts.append([tilt.sum(), turned.sum()])
+    for observed, stated in (np.sum(moves, axis=0), np.sum(tilts, axis=0)):
+        # Twenty draws of four parameters know a standard deviation to a quarter.
+        assert 0.6 < np.sqrt(observed / stated) < 1.6
