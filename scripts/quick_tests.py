@@ -7,8 +7,8 @@ quick run can do without a test where its other tests reach every line and every
 out are the dearest of these, until the rest takes --total seconds of processor time: of the tests that take longer than
 a limit, which falls until that is so, the quick run keeps those that together reach what the shorter ones do not,
 chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979). It also
-keeps one of every file, `KEPT`, tests that fail under coverage, and those that start programs which are not Python's:
-what these reach is not seen. Prints seconds, lines and branches of both.
+keeps a short one of every file, `KEPT`, tests that fail under coverage, and those that start programs which are not
+Python's: what these reach is not seen. Prints seconds, lines and branches of both.
 """
 
 from __future__ import annotations
@@ -51,6 +51,8 @@ HEAD = """\
 LIMITS_S = (5.0, 3.0, 2.0, 1.5, 1.0, 0.7, 0.5, 0.3, 0.2, 0.1)
 MAX_STARTED_S = 0.05
 """Of a test's processes that are not seen: a browser takes more."""
+MAX_OF_FILE_S = 1.0
+"""A longer test does not stay for its file alone."""
 OF_PROCESSES = """\
 [run]
 branch = true
@@ -259,11 +261,12 @@ class Reach:
             out[best] = False
             wanted &= ~self.parts[best]
             open_tests = open_tests[open_tests != best]
-        # Of every file at least one stays: what it is about is looked at.
+        # Of every file at least one stays, if it is short: what it is about is looked at.
         files = np.array([test.partition("::")[0] for test in self.tests])
         for file in set(files) - set(files[~out]):
             own = np.flatnonzero(files == file)
-            out[own[each_s[own].argmin()]] = False
+            shortest = own[each_s[own].argmin()]
+            out[shortest] = each_s[shortest] > MAX_OF_FILE_S
         return out
 
     def describe(self, name: str, chosen: NDArray[np.bool_]) -> str:

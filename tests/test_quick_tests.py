@@ -30,6 +30,7 @@ def test_the_dear_go_where_others_reach_what_they_reach(chooser: ModuleType) -> 
         ("tests/a.py::failed", 0.0, np.inf, None, "1...."),
         ("tests/c.py::dear_too", 2.0, 0.0, None, "1...."),
         ("tests/c.py::of_its_file_the_shortest", 1.0, 0.0, None, "1...."),
+        ("tests/d.py::dear_and_alone_in_its_file", 2.0, 0.0, None, "1...."),
         ("tests/real/test_a.py::captures", 9.0, 0.0, None, "....1"),
         ("tests/b_in_browser.py::dear", 9.0, 0.0, None, "1...."),
         ("tests/b_in_browser.py::short", 0.1, 0.0, None, ".1..."),
@@ -44,7 +45,14 @@ def test_the_dear_go_where_others_reach_what_they_reach(chooser: ModuleType) -> 
     )
     out = reach.left_out(0.5)
     names = {name.split("::")[1] for name, is_out in zip(reach.tests, out, strict=True) if is_out}
-    assert names == {"short_of_a_dear_room", "same_as_short", "one_of_them", "dear", "dear_too"}
+    assert names == {
+        "short_of_a_dear_room",
+        "same_as_short",
+        "one_of_them",
+        "dear",
+        "dear_too",
+        "dear_and_alone_in_its_file",
+    }
     assert reach.total_s(~out) == pytest.approx(0.1 + 2.0 + 3.0 + 4.0 + 1.0 + 9.0 + 0.1)
     assert reach.parts[~out].any(axis=0).all()
     assert not reach.left_out(20.0).any()

@@ -18,6 +18,7 @@ from helpers.calibration_scenes import (
 )
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.fit import fit_model, robust_sigma
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import find_poses
@@ -45,6 +46,20 @@ def test_start_needs_no_guess(name: str, count: int, rng: np.random.Generator) -
     best = next(initialise(observations, SIZE, MODELS[MODEL[name]], None))
     norm = evaluate(best, observations).norm(observations)
     assert np.median(norm[observations.present]) < START_PX
+
+
+def test_pixels_of_no_board_are_refused_or_badly_explained() -> None:
+    grid, refused = BOARD.grid(), 0
+    for seed in range(4):
+        pixels = np.random.default_rng(seed).uniform(0.0, 600.0, (3, *grid.shape))
+        views = [BoardView(f"{k}", BOARD, grid, own, np.full(len(grid), 0.1)) for k, own in enumerate(pixels)]
+        observations = Observations.from_views(views)
+        try:
+            assert robust_sigma(fit_model(observations, (640, 480), MODELS["brown"], None), observations) > 100.0
+        except DegenerateError as error:
+            assert "no brown camera explains the views even roughly" in str(error)
+            refused += 1
+    assert refused
 
 
 @pytest.mark.parametrize("name", ["reg", "wide", "fish", "fish200"])

@@ -15,18 +15,21 @@ from helpers.stereo_pictures import CAMERA, FRAMES, RIGHT_FROM_LEFT, of_one_came
 from rigkit.cameras.base import Camera
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
-from rigkit.io.calibration_file import load_calibration
+from rigkit.io.calibration_file import camera_to_json, load_calibration
+from rigkit.io.corner_cache import FoundCorners
 from rigkit.io.corners_file import read_corners
 from rigkit.io.rig_file import load_rig, load_saved_rig
 from rigkit.io.rig_session import load_rig_session
 from rigkit.io.session import load_session
-from rigkit.workflows.calibrate import CalibrateOptions
+from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.camera_files import import_rig
-from rigkit.workflows.folder_session import cameras_in, session_of_folders
+from rigkit.workflows.corners import first_camera
+from rigkit.workflows.folder_session import Known, cameras_in, session_of_folders
 from rigkit.workflows.known_cameras import known_cameras, with_known_first
 
 SAME_LENS_PX = 0.1
@@ -217,15 +220,20 @@ def write_vnl(csv: Path, vnl: Path) -> None:
 def test_a_session_file_from_python_too(pictures: Path, tmp_path: Path) -> None:
     (tmp_path / "board.toml").write_text('schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n')
     (tmp_path / "session.toml").write_text(
-        f'schema = "rigkit.session/1"\nimages = "{pictures}/left*.jpg"\nboard = "board.toml"\n'
+        f'schema = "rigkit.session/1"\nimages = "{pictures}/left*.jpg"\nboard = "board.toml"\nmodel = "brown"\n'
     )
-    done = calibrate_session_file(tmp_path / "session.toml", CalibrateOptions())
+    session = tmp_path / "session.toml"
+    done = calibrate_session_file(session, CalibrateOptions())
     assert done.written == (tmp_path / "calibration.json",)
+    again = calibrate_session(session)
+    assert not again.written
+    assert isinstance(done, SessionCalibration)
+    np.testing.assert_array_equal(again.calibration.camera.parameters, done.calibration.camera.parameters)
+    # No camera is found of nothing; why, the calibration itself says.
+    assert first_camera(load_session(session), {"left01.jpg": FoundCorners((640, 480), ())}) is None
 
 
-def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
-    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Path, tmp_path: Path) -> None:
     """Only the mount is found with the lenses of files; a camera joins a rig that stays as it is; the session written
     says so, and does the same again."""
     folder = tmp_path / "rig"
@@ -245,11 +253,10 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     assert undated(folder / "rig.json") == before
 
     # The right camera anew, with the left one as a rig of its own frame has it.
-    saved = before
-    saved["cameras"], saved["covariance"] = saved["cameras"][:1], np.eye(9).tolist()
-    saved["covariance"] = (1e-12 * np.eye(9)).tolist()
+    left = {key: before["cameras"][0][key] for key in ("name", "camera", "cam_from_rig", "rms_px")}
+    saved = {"schema": before["schema"], "cameras": [left], "covariance": (1e-12 * np.eye(9)).tolist()}
     known = tmp_path / "known.json"
-    known.write_text(json.dumps(saved | {"baselines": []}))
+    known.write_text(json.dumps(saved))
     added = tmp_path / "out" / "rig.json"
     added.parent.mkdir()
     assert main([*command, "--add-camera", str(known), "-o", str(added), "--model", "brown"]) == 0
@@ -261,13 +268,31 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(
     told, saved_rig = known_cameras(session), load_saved_rig(added)
     assert told is not None and told.covariance is not None and saved_rig.covariance is not None
     np.testing.assert_array_equal(told.covariance, saved_rig.covariance[9:18, 9:18])
+
+
+def test_what_is_known_of_cameras_stands_in_their_session(
+    pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    lens, known = tmp_path / "lens.yaml", tmp_path / "known.json"
+    lens.write_text(write_opencv(CAMERA).text)
+    cameras = [
+        {"name": name, "camera": camera_to_json(CAMERA), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, pose in (("left", Rigid3.identity()), ("top", RIGHT_FROM_LEFT))
+    ]
+    known.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": cameras}))
+    wanted = session_of_folders([pictures], ["9x6x30"], tmp_path / "session.toml", known=Known(rig=known))
+    for path, text in wanted.files.items():
+        path.write_text(text)
+    session = load_rig_session(wanted.path)
+    assert session.known_rig == known and list(session.cameras) == ["left", "right"]
+    # Of the rig's file nobody knows how sure it is, nor of another tool's lens.
+    told = known_cameras(replace(session, lenses={"right": lens}))
+    assert told is not None and list(told.cameras) == ["left", "right"] and told.covariance is None
     # A camera of the rig that has no images is not lost without a word.
-    left_alone = {"left": session.cameras["left"]}
-    with_known_first(replace(session, cameras=left_alone, lenses={}, known_rig=added))
-    assert "without images here, right will not be in the new rig" in caplog.text
-    capsys.readouterr()
-    assert main([*command, "--only-extrinsics", str(lens), str(lens), str(lens), "--force"]) == 2
-    assert "3 lenses for 2 cameras" in capsys.readouterr().err
+    with_known_first(session)
+    assert "without images here, top will not be in the new rig" in caplog.text
+    with pytest.raises(InputError, match="3 lenses for 2 cameras"):
+        Known(lenses=(lens, lens, lens)).of_cameras(["left", "right"])
     one = of_one_camera(pictures, tmp_path / "one")
     assert main(["calibrate", str(one), "--board", "9x6x30", "--only-extrinsics", str(lens)]) == 2
     assert "rigkit pose" in capsys.readouterr().err
@@ -280,8 +305,9 @@ def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_pa
         shutil.copy(path, folder)
     assert main(["calibrate", str(folder), "--square-mm", "30", "--model", "brown"]) == 0
     assert 'board = "board-9x6x30.toml"' in (folder / "session.toml").read_text()
-    # What the session says is kept: again without a word.
+    # What the session says is kept: again without a word, or with the same ones.
     assert main(["calibrate", str(folder), "--force"]) == 0
+    assert main(["calibrate", str(folder), "--board", "9x6x30", "--model", "brown", "--force"]) == 0
 
 
 @pytest.mark.parametrize(

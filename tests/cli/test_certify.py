@@ -45,8 +45,8 @@ def rig(tmp_path: Path) -> Path:
 
 def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page, sheet = rig.with_name("c.html"), rig.with_name("c.pdf")
-    asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--report", str(page), "--pdf", str(sheet)]
-    assert main([*asked, "--limit", "1000"]) == 0
+    asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--report", str(page)]
+    assert main([*asked, "--pdf", str(sheet), "--limit", "1000"]) == 0
     words = capsys.readouterr().out
     assert "A length of 300 mm across the line of sight, 1200 mm away: 95 % of errors within" in words
     assert "To halve the worst error: " in words

@@ -12,19 +12,23 @@ import pytest
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import load_camera, save_calibration
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.board_words import board_of_words
+from rigkit.io.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.render import render
+from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
+from rigkit.workflows.check import CheckOptions, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -71,6 +75,27 @@ def test_a_patterned_box_in_the_room_is_no_board(home: Path, capsys: pytest.Capt
     assert any(len(own) > 1 for own in found)
     assert main(["check", str(home / "cam.json"), str(pictures), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rms_px"] < 0.05
+
+
+def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(tmp_path: Path) -> None:
+    """The second camera stands on its head."""
+    board = board_of_words("circles:7x5x30")
+    place = Rigid3(exp_so3(np.array([0.2, 0.3, 0.0])), [-90.0, -60.0, 400.0])
+    poses = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.0, np.pi])), [60.0, 0.0, 0.0]))
+    camera, optics = Pinhole((320, 240), np.array([260.0, 260.0, 160.3, 119.1])), Optics(0.6, supersample=2)
+    pictures = [tmp_path / name for name in ("left.png", "right.png")]
+    for path, pose in zip(pictures, poses, strict=True):
+        cv2.imwrite(str(path), render([PlacedBoard(board, place)], camera, pose, optics=optics))
+    cameras = [
+        {"name": path.stem, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for path, pose in zip(pictures, poses, strict=True)
+    ]
+    sure = (np.diag([0.1, 0.1, 0.1, 0.1] * 2 + [1e-4] * 3 + [0.05] * 3) ** 2).tolist()
+    rig = {"schema": "rigkit.rig/1", "sigma_px": 0.05, "cameras": cameras, "covariance": sure}
+    (tmp_path / "rig.json").write_text(json.dumps(rig))
+    done = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,)))
+    # Counted from two ends, the mount would be off by a turn.
+    assert done.check.rms_px < 0.1 and not done.left_out
 
 
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

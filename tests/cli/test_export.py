@@ -18,8 +18,9 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
-from rigkit.io.calibration_file import camera_to_json, load_camera
+from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera
 from rigkit.workflows.camera_files import import_rig
+from rigkit.workflows.export_camera import foreign_files
 
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
 LAB = REPOSITORY / "datasets" / "lab-a"
@@ -44,6 +45,12 @@ def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pyt
     again, seen = theirs.project(rays)
     assert seen.all()
     assert np.abs(again - pixels).max() < REFIT_PX
+
+
+def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO"):
+        files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["kalibr"])
+    assert list(files) == [tmp_path / "fish-kalibr.yaml"] and "fish-kalibr.yaml: " in caplog.text
 
 
 def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,14 +51,19 @@ def test_many_data_sets_are_one_table(captures: Path, tmp_path: Path, capsys: py
     assert found[0]["why"] == "" and "pair" in found[1]["why"] and "none.jpg" in found[2]["why"]
     assert (tmp_path / "a" / "one" / "tables.md").is_file()
     assert "1 of 3 data sets pass" in (tmp_path / "a" / "summary.html").read_text()
-    # By processes it is the same table.
-    assert main([*command, "-j", "2", "-o", str(tmp_path / "b")]) == 2
-    assert rows(tmp_path / "b" / "summary.csv") == found
     twice = [str(captures / "one"), str(captures / "two"), str(captures / "one")]
     assert main(["validate", *twice, *QUICK, "-o", str(tmp_path / "c")]) == 2
     assert "two data sets are called 'one'" in capsys.readouterr().err
     assert main([*command[:2], *QUICK, "--cluster", "tcp://127.0.0.1:1", "-o", str(tmp_path / "d")]) == 2
     assert "several data sets" in capsys.readouterr().err
+
+
+def test_by_processes_it_is_the_same_table(captures: Path, tmp_path: Path) -> None:
+    command = ["validate", *(str(captures / name) for name in ("one", "two", "three")), *QUICK]
+    for jobs in "12":
+        assert main([*command, "-j", jobs, "-o", str(tmp_path / jobs)]) == 2
+    one, two = (rows(tmp_path / jobs / "summary.csv") for jobs in "12")
+    assert one == two and len(one) == 3
 
 
 def test_on_a_dask_cluster_it_is_the_same_table(captures: Path, tmp_path: Path) -> None:

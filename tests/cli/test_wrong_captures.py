@@ -120,6 +120,20 @@ def test_a_right_capture_passes(
     assert json.loads((folder / "out" / "tables.json").read_text())
 
 
+def test_other_methods_alone_agree(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = capture[1]
+    mixed = pair_toml(scenes["mixed"], "mixed", ("regular", "fisheye"))
+    write_manifest(folder, pair_toml(scenes["same"], "same", ("regular", "regular")), mixed)
+    command = ["crosscheck", str(folder), "-p", "same", "-j", "1", "-o"]
+    assert main([*command, str(folder / "words")]) == 0
+    assert "pycolmap" in capsys.readouterr().out
+    assert main([*command, str(folder / "json"), "--json"]) == 0
+    (pair,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert pair["passed"] and pair["checks"]
+
+
 def test_boards_that_lean_fail_their_angle_and_nothing_else(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

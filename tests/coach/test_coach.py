@@ -118,7 +118,10 @@ def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tm
     # Nothing was said to it: it is simply gone.
     again = open_coach(options(tmp_path))
     assert len(again.guide.frames) == 5
-    assert again.guide.lenses[0].calibration is not None
+    (lens,) = again.guide.lenses
+    assert lens.calibration is not None
+    drawn = lens.sigma_map()
+    assert drawn is not None and lens.sigma_map() is drawn, "nothing new was seen"
     again.look([pictures[5]], take=True)
     assert again.keeper.frames[-1] == "frame-0006.png"
     again.undo()

@@ -13,6 +13,7 @@ from rigkit.benchmark.corner_bound import position_bound
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import find_grids
 from rigkit.detection.detect import detect_boards
@@ -179,11 +180,21 @@ def test_chessboards_are_no_grids_of_circles() -> None:
         assert find_grids(grey_image(scene.render(blur_px=blur_px, noise_levels=2.0, rng=rng))) == []
 
 
+def test_the_bound_of_a_sharper_picture_is_lower() -> None:
+    board = Board("s", 4, 3, 25.0, 25.0, pattern=Circles(diameter_mm=15.0))
+    scene = one_board(np.random.default_rng(0), board=board, size_px=(160, 120))
+    sharp, soft = (position_bound(circle_information(scene, blur_px), 2.0) for blur_px in (0.7, 1.4))
+    assert len(sharp) == 12
+    assert (np.linalg.eigvalsh(soft - sharp) > 0.0).all()
+    with pytest.raises(InputError, match="no circles"):
+        circle_information(one_board(np.random.default_rng(0), size_px=(160, 120)), 0.7)
+
+
 @pytest.mark.parametrize("board", [REGULAR, HEXAGONAL], ids=["regular", "hexagonal"])
 @pytest.mark.parametrize("lens", ["regular", "fisheye"])
 def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> None:
     relative = []
-    for seed in (0, 1, 2):
+    for seed in (0, 1):
         rng = np.random.default_rng(seed)
         scene = one_board(rng, lens=lens, board=board)
         truth = scene.truth()[0]

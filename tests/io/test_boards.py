@@ -20,6 +20,7 @@ PATTERNS = [
     Chessboard(),
     Charuco("DICT_4X4_100", 20.0, 3, legacy=True, inverted=True),
     AprilGrid(0.25, "tag25h9", 1, 2, "opencv", corner_squares=False),
+    Circles("asymmetric", "left", 12.0),
 ]
 
 

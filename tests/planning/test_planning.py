@@ -119,6 +119,12 @@ def test_of_views_as_good_the_nearest_is_taken() -> None:
     assert taken == [1]
 
 
+def test_numbers_that_are_none_tell_of_no_view() -> None:
+    views = np.stack([np.diag([8.0, 1.0])] * 2)
+    with pytest.raises(DegenerateError, match="nothing can be said of any view"):
+        choose_views(np.full((2, 2), np.nan), views, Goal(np.eye(2), "px", "one"), 1, effort=lambda _: np.ones(2))
+
+
 def test_planned_views_beat_views_anyhow(rng: np.random.Generator) -> None:
     camera, error = lens("reg"), CornerError(NOISE_PX)
     known, goal = Knowledge.guessed(camera, error), projection_goal(camera)

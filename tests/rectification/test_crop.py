@@ -40,5 +40,9 @@ def test_a_disk_of_any_size_gives_the_square_in_it() -> None:
         assert (bottom - top) * (right - left) == pytest.approx(2.0 * radius**2, rel=0.02)
 
 
+def test_what_the_coarse_cells_leave_is_taken_too() -> None:
+    assert largest_rectangle(np.ones((601, 703), dtype=bool)) == (0, 0, 703, 601)
+
+
 def test_nothing_seen_is_nothing() -> None:
     assert largest_rectangle(np.zeros((40, 50), dtype=bool)) == (0, 0, 0, 0)

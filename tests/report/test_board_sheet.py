@@ -7,9 +7,13 @@ import zlib
 import numpy as np
 import pytest
 
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.circles import Circles
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
+from rigkit.report.plan_page import printed_outlines
 
 POINTS_PER_MM = 72.0 / 25.4
 PDF_ROUNDING_MM = 1e-4
@@ -26,6 +30,19 @@ def test_squares_alternate_and_have_their_size() -> None:
     assert (np.round(index).astype(int).sum(axis=1) % 2 == 0).all()
     assert squares[:, 0].min() >= 0.0
     assert (squares[:, 0] + squares[:, 2]).max() <= sheet.width_mm
+
+
+@pytest.mark.parametrize(
+    ("board", "count"), [(Board("b", 4, 3, 20.0, 20.0), 10), (Board("c", 4, 3, 20.0, 20.0, pattern=Circles()), 12)]
+)
+def test_a_view_to_take_shows_what_is_printed(board: Board, count: int) -> None:
+    camera = Pinhole((640, 480), np.array([500.0, 500.0, 319.5, 239.5]))
+    outlines = printed_outlines(camera, board, Rigid3(np.eye(3), [-30.0, -20.0, 400.0]))
+    assert len(outlines) == count
+    middles = np.array([outline.mean(axis=0) for outline in outlines])
+    # From one to the next of its kind: a square, or two of a chessboard's, of 25 px.
+    apart = np.linalg.norm(middles[:, None] - middles, axis=2)[np.triu_indices(count, 1)]
+    assert apart.min() == pytest.approx(25.0 if board.pattern.type == "circles" else 25.0 * np.sqrt(2.0), rel=1e-6)
 
 
 def test_pdf_is_true_to_scale() -> None:

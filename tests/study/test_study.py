@@ -12,6 +12,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
+from rigkit.report.study_figure import study_figure
 from rigkit.report.study_tables import cell_table, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import CHUNK_TRIALS, Claim, Study, Variant, chunk_count, run_chunk
@@ -183,6 +184,12 @@ def test_variants_have_their_own_support_and_scale() -> None:
     assert table.cell(method="chord").median_deg == table.cell(method="3SDIR").median_deg
     with pytest.raises(InputError, match="known: chord"):
         replace(study, methods=("star",), variants=(Variant("star", "3SDIR", "star", "area"),))
+
+
+def test_one_noise_and_one_estimator_need_no_legend() -> None:
+    table = run(replace(GENERAL, trials=2, sigmas=(1.0,)))
+    assert b"<svg" in study_figure(table, "svg")
+    assert b"<svg" in study_figure(run(replace(GENERAL, trials=2, methods=("F2UDIR", "3SDIR"))), "svg")
 
 
 def test_csv_has_every_cell() -> None:

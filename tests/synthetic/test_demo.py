@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -15,8 +16,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import load_board
 from rigkit.io.manifest import load_dataset
 from rigkit.io.session import load_session
-from rigkit.synthetic.demo import VIEWS, build_demo, demo_camera
+from rigkit.synthetic.demo import OPTICS, build_demo, demo_camera
 
+VIEWS = 3
 CORNER_PX = 0.08
 """cv2.cornerSubPix on images with noise 1.5 and squares seen at a slant, rms; a wrong pose would be tens of pixels."""
 
@@ -24,7 +26,11 @@ CORNER_PX = 0.08
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("demo") / "capture"
-    assert build_demo(root, np.random.default_rng(1)) == root / "dataset.toml"
+    with pytest.MonkeyPatch.context() as patch:
+        # Views for a calibration are all alike; `rigkit demo` makes ten.
+        patch.setattr("rigkit.synthetic.demo.VIEWS", VIEWS)
+        patch.setattr("rigkit.synthetic.demo.OPTICS", replace(OPTICS, supersample=2))
+        assert build_demo(root, np.random.default_rng(1)) == root / "dataset.toml"
     return root
 
 

@@ -106,7 +106,8 @@ def test_forward_moves_towards_the_scene_and_standard_to_the_right(rng: np.rando
         relative_pose(PoseType.GENERAL, 200.0, rng)
 
 
-def test_a_pair_that_cannot_be_seen_is_refused(rng: np.random.Generator) -> None:
+def test_a_pair_that_cannot_be_seen_is_refused(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rigkit.synthetic.pairs.RANDOM_PAIR_TRIES", 50)
     with pytest.raises(DegenerateError, match="shorter baseline"):
         trihedral_pair(BOARDS, CAMERA, PoseType.STANDARD, rng, baseline_mm=5000.0)
 

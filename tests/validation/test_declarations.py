@@ -19,7 +19,7 @@ from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.validation.checks import validate, validate_each
-from rigkit.validation.declarations import contradicted_boards
+from rigkit.validation.declarations import contradicted_boards, declaration_checks
 
 TRUTH = PairTruth(None, (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),))
 
@@ -69,6 +69,16 @@ def test_a_level_that_was_off_fails_with_its_angle(rng: np.random.Generator) -> 
     assert not row.passed
     assert row.ours > 5.0
     assert row.k > row.limit_k
+
+
+def test_a_type_whose_pose_sees_nothing_in_front_is_not_checked(rng: np.random.Generator) -> None:
+    found = declared(PoseType.FORWARD, PoseType.FORWARD, rng)
+    assert found.geometry is not None and found.geometry.decision.evidence is not None
+    evidence = replace(found.geometry.decision.evidence, types=())
+    geometry = replace(found.geometry, decision=replace(found.geometry.decision, evidence=evidence))
+    checks, unchecked = declaration_checks(replace(found, geometry=geometry))
+    assert not checks
+    assert [words.split(":")[0] for words in unchecked] == ["pose type forward", "level"]
 
 
 def test_nothing_declared_is_nothing_to_check(rng: np.random.Generator) -> None:

@@ -35,6 +35,14 @@ def test_plane_of_exact_points_is_the_board_and_faces_the_camera() -> None:
     assert plane.rms_mm < 1e-9
 
 
+def test_distances_are_positive_on_the_camera_s_side() -> None:
+    points, _ = board_points()
+    plane = fit_plane(points)
+    moved = points + 2.0 * plane.normal
+    assert plane.distances(moved) == pytest.approx(2.0)
+    assert float(plane.distances(np.zeros(3))) > 0.0
+
+
 def test_equal_weights_are_the_pca_of_open3d(rng: np.random.Generator) -> None:
     points, _ = board_points()
     points = points + rng.normal(size=points.shape) * 0.5

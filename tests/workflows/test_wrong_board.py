@@ -12,31 +12,54 @@ from rigkit.benchmark.scenes import one_board
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.detect import detect_boards
+from rigkit.io.images import read_image
+from rigkit.workflows.identify_board import explained
 
 BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_1000", 22.5))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("boards")
     for seed in range(4):
         rng = np.random.default_rng(seed)
         picture = one_board(rng, board=BOARD).render(blur_px=0.7, noise_levels=1.0, rng=rng)
-        cv2.imwrite(str(tmp_path / f"{seed}.png"), np.asarray(picture))
-    return tmp_path
+        cv2.imwrite(str(root / f"{seed}.png"), np.asarray(picture))
+    return root
 
 
-def test_corners_in_wrong_places_of_a_board_have_their_cause(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def calibrate(folder: Path, board: str, tmp_path: Path, *more: str) -> int:
+    words = f"charuco:{board}x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
+    return main(["calibrate", str(folder), "--board", words, "-o", str(tmp_path / "out.json"), *more])
+
+
+def test_corners_in_wrong_places_of_a_board_have_their_cause(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its first rows have their markers where a board of one column more has them: some corners are found."""
-    words = "charuco:8x8x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
-    assert main(["calibrate", str(folder), "--board", words, "-o", str(folder / "out.json")]) != 0
+    calibrate(folder, "8x8", tmp_path)
     said = "".join(capsys.readouterr())
     assert "7 x 7 inner corners are seen, 8 x 8 are declared" in said
 
 
-def test_mirrored_images_are_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for path in folder.glob("*.png"):
-        cv2.imwrite(str(path), np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[:, ::-1])
-    words = "charuco:7x7x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
-    assert main(["calibrate", str(folder), "--board", words, "-o", str(folder / "out.json")]) != 0
+def test_few_corners_that_markers_place_make_no_board(folder: Path) -> None:
+    declared = Board("c", 8, 8, 30.0, 30.0, pattern=BOARD.pattern)
+    seen = [detect_boards(read_image(path), [declared]) for path in sorted(folder.glob("*.png"))]
+    assert [sum(found.board_id == "c" for found in image) for image in seen].count(0) == 3
+
+
+def test_mirrored_images_are_named(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mirrored = tmp_path / "mirrored"
+    mirrored.mkdir()
+    for path in sorted(folder.glob("*.png"))[:2]:
+        cv2.imwrite(str(mirrored / path.name), np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[:, ::-1])
+    assert calibrate(mirrored, "7x7", tmp_path, "--model", "pinhole") != 0
     said = "".join(capsys.readouterr())
     assert "the images are mirrored: '0.png' shows its board only when it is flipped" in said
+
+
+def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder: Path) -> None:
+    assert explained([folder / "0.png"], [BOARD]) is None
+    said = explained([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)])
+    assert said is not None and 'set type = "charuco"' in said
