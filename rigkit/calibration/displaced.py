@@ -25,7 +25,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-from rigkit.kernels.departures import DISPLACEMENTS, displacements
+from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
 
 MODES_GRID = (24, 18)
 """Columns and rows of pixels at which modes are weighed against the whole uncertainty."""
@@ -80,7 +80,7 @@ class DisplacedCamera(Camera):
     def _displacement(self, u: FloatArray, v: FloatArray) -> FloatArray:
         if not self._amounts.any():
             return np.zeros((2, len(u)))
-        return np.asarray(np.einsum("ijn,j->in", self._basis(u, v), self._amounts))
+        return displacement(u, v, self._amounts, self.size_px)
 
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         u, v, valid = self._own._project(x, y, z)

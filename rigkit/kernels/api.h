@@ -206,6 +206,9 @@ typedef struct {
 EXPORT void displace_pixels(
     ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
     ARRAY(double, out, 2, DISPLACEMENTS, count));
+EXPORT void displace_by(
+    ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
+    ARRAY(const double, amounts, DISPLACEMENTS), ARRAY(double, out, 2, count));
 EXPORT int64_t lens_memory(int64_t parameters);
 EXPORT void lens_products(
     const lens_corners_t *corners, ARRAY(double, memory, lens_memory(corners.parameters)),

@@ -38,6 +38,24 @@ EXPORT FOR_EACH_PROCESSOR void displace_pixels(
     }
 }
 
+EXPORT FOR_EACH_PROCESSOR void displace_by(
+    const double *u, const double *v, int64_t count, int64_t width, int64_t height, const double *amounts, double *out)
+{
+    const double scale = 2.0 / sqrt((double)(width * width + height * height));
+    for (int64_t n = 0; n < count; n++) {
+        double x = scale * (u[n] - 0.5 * (double)(width - 1)), y = scale * (v[n] - 0.5 * (double)(height - 1));
+        const double square = x * x + y * y, inside = square > 1.0 ? 1.0 / sqrt(square) : 1.0;
+        double row_u[DISPLACEMENTS], row_v[DISPLACEMENTS], du = 0.0, dv = 0.0;
+        displace(inside * x, inside * y, row_u, row_v);
+        for (int64_t j = 0; j < DISPLACEMENTS; j++) {
+            du += amounts[j] * row_u[j];
+            dv += amounts[j] * row_v[j];
+        }
+        out[n] = du;
+        out[count + n] = dv;
+    }
+}
+
 /* Write both rows of a corner: derivatives by the pose (turn, shift) and the parameters, displacements, residual. */
 INLINE void write_rows(const lens_corners_t *c, double scale, int64_t n, int64_t across, double *row)
 {

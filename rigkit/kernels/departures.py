@@ -98,3 +98,12 @@ def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
     u, v = (np.ascontiguousarray(pixels[:, k], np.float64) for k in range(2))
     kernels().displace_pixels(u, v, len(pixels), *size_px, out)
     return out
+
+
+def displacement(u: FloatArray, v: FloatArray, amounts: FloatArray, size_px: tuple[int, int]) -> FloatArray:
+    """Return how far amounts (J,) of the displacements move pixels u, v (M,), (2, M) px; beyond the corners of the
+    image as on the circle through them."""
+    u, v, amounts = (np.ascontiguousarray(a, np.float64) for a in (u, v, amounts))
+    out = np.empty((2, len(u)))
+    kernels().displace_by(u, v, len(u), *size_px, amounts, out)
+    return out

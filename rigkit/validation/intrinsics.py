@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -18,20 +19,20 @@ from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray, Normals
+from rigkit.core.arrays import BoolArray, FloatArray, Normals, RayJacobians, Rays
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import moved_cameras, moved_sights
+from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class CalibrationShifts:
     """A reconstruction estimated again with the calibrations as they are, and moved along each principal axis.
 
@@ -42,6 +43,14 @@ class CalibrationShifts:
     base: Reconstruction
     moved: tuple[Reconstruction, ...]
     known: BoolArray
+
+    @cached_property
+    def rays(self) -> list[list[tuple[Rays, RayJacobians]]]:
+        """Rays (N, 3) of the pixels of image 1 and of image 2, and their derivatives by the pixel (N, 3, 2), by the
+        cameras as they are and as each move has them."""
+        pixels = self.base.pixels1, self.base.pixels2
+        each = [(shift.camera1, shift.camera2) for shift in (self.base, *self.moved)]
+        return [[(c.unproject(p)[0], c.ray_jacobian(p)) for c, p in zip(both, pixels, strict=True)] for both in each]
 
     def points(self) -> FloatArray:
         """Return how the points move along each axis (K, N, 3), mm; NaN where that is not known."""
@@ -143,7 +152,22 @@ def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts)
     cloud, known = reconstruction.cloud, shifts.known
     moves = shifts.points()[:, known]
     covariance = geometry.points.covariance[kept][known] + np.einsum("kni,knj->nij", moves, moves)
-    base, *turned = (_normals(reconstruction, shift, known) for shift in (shifts.base, *shifts.moved))
+    m = reconstruction.matches.select(known)
+    # The coordinates of the affinities (rectified, or the captured pixels) move with the pixels as they did.
+    by_coordinates = [
+        np.linalg.pinv(camera.ray_jacobian(pixels[known])) @ by_coordinate
+        for camera, pixels, by_coordinate in (
+            (reconstruction.camera1, reconstruction.pixels1, m.jacobians1),
+            (reconstruction.camera2, reconstruction.pixels2, m.jacobians2),
+        )
+    ]
+    normals = []
+    for shift, sights in zip((shifts.base, *shifts.moved), shifts.rays, strict=True):
+        one, two = (
+            (rays[known], by_pixel[known] @ by) for (rays, by_pixel), by in zip(sights, by_coordinates, strict=True)
+        )
+        normals.append(_normals(reconstruction, shift, known, one, two))
+    base, *turned = normals
     tilt = sum((np.sum((normals - base) ** 2, axis=1) for normals in turned), np.zeros(int(known.sum())))
     sigma_mm, normal_sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     sigma_mm[known] = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
@@ -152,13 +176,18 @@ def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts)
     return replace(reconstruction, cloud=whole)
 
 
-def _normals(reconstruction: Reconstruction, moved: Reconstruction, known: BoolArray) -> Normals:
-    """Return the normals (n, 3) of the `known` points as moved cameras have them."""
-    m = reconstruction.matches.select(known)
-    rays1, by1 = moved_sights(moved.camera1, reconstruction.camera1, reconstruction.pixels1[known], m.jacobians1)
-    rays2, by2 = moved_sights(moved.camera2, reconstruction.camera2, reconstruction.pixels2[known], m.jacobians2)
+def _normals(
+    reconstruction: Reconstruction,
+    moved: Reconstruction,
+    known: BoolArray,
+    one: tuple[Rays, RayJacobians],
+    two: tuple[Rays, RayJacobians],
+) -> Normals:
+    """Return the normals (n, 3) of the `known` points as moved cameras have them: their rays in image `one` and `two`,
+    with the derivatives by the coordinates of the affinities."""
+    (rays1, by1), (rays2, by2) = one, two
     J1, J2 = pair_projection_jacobians(moved.cloud.points_mm[known], rays1, by1, rays2, by2, moved.cam2_from_cam1)
-    A21 = m.A21
+    A21 = None if reconstruction.matches.A21 is None else reconstruction.matches.A21[known]
     if needs_epipolar(reconstruction.affine_method):
         assert reconstruction.geometry is not None and reconstruction.kept is not None
         E21 = essential_from_pose(moved.cam2_from_cam1)

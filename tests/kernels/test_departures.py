@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference import departures as reference
 
-from rigkit.kernels.departures import DISPLACEMENTS, LensCorners, averaged_amounts, displacements
+from rigkit.kernels.departures import DISPLACEMENTS, LensCorners, averaged_amounts, displacement, displacements
 
 SIZE = (641, 480)
 ROUNDING = 1e-12
@@ -18,6 +18,19 @@ def test_displacements_are_as_defined(rng: np.random.Generator) -> None:
     ours, theirs = displacements(pixels, SIZE), reference.displacements(pixels, SIZE)
     assert ours.shape == (2, DISPLACEMENTS, 101)
     np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_amounts_displace_as_defined(rng: np.random.Generator) -> None:
+    """Pixels beyond the corners as those on the circle through them."""
+    pixels, amounts = rng.uniform(-400.0, 1000.0, (101, 2)), rng.normal(size=DISPLACEMENTS)
+    centre, reach = 0.5 * (np.array(SIZE) - 1.0), 0.5 * np.hypot(*SIZE)
+    length = np.linalg.norm(pixels - centre, axis=1)
+    assert (length > reach).any() and (length < reach).any()
+    inside = centre + (pixels - centre) * np.minimum(reach / length, 1.0)[:, None]
+    expected = np.einsum("ijn,j->in", reference.displacements(inside, SIZE), amounts)
+    np.testing.assert_allclose(
+        displacement(pixels[:, 0], pixels[:, 1], amounts, SIZE), expected, rtol=1e-10, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("told", [0.0, 1.0, 1e6])
