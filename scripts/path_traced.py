@@ -7,7 +7,7 @@
 A SET is a folder with the pictures (8 bit, sRGB, shot and read noise), board.toml and truth.json: the lens's formula,
 the cameras' and boards' poses, the board's points. `laboratory` is a data set for `rigkit validate`, with its
 dataset.toml; its cameras are those of `narrow` and `fisheye`, which are calibrated first. The same names give the same
-pictures again. A picture of 800 x 600 takes some 20 s of one core.
+pictures again; those that are there already are kept. A picture of 800 x 600 takes some 20 s of one core.
 
 Lenses and boards stand in traced/captures.py, the laboratory in traced/laboratory.py.
 """
@@ -27,14 +27,13 @@ import numpy as np
 from traced import blender, laboratory
 from traced.captures import CAPTURES, Capture, Exposure, held_poses, looking_along, paper_edge_px
 from traced.room import furnish, furnish_corner
+from traced.sensor import JPEG_QUALITY, develop
 
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.board_file import board_text
 
-BRIGHT = 0.8
-"""The 97th percentile of a picture is exposed to so much of the full well."""
 LABORATORY = "laboratory"
 
 
@@ -42,17 +41,9 @@ def written(motion: Rigid3) -> dict[str, list[Any]]:
     return {"rotation": motion.rotation.tolist(), "translation_mm": motion.translation_mm.tolist()}
 
 
-def develop(light: FloatArray, exposure: Exposure, rng: np.random.Generator) -> Any:
-    """Return the 8-bit sRGB picture that a sensor with shot and read noise makes of the light."""
-    part = np.clip(light * (BRIGHT / np.percentile(light, 97.0)), 0.0, 1.5)
-    electrons = rng.poisson(part * exposure.full_well) + rng.normal(0.0, exposure.read_electrons, light.shape)
-    x = np.clip(electrons / exposure.full_well, 0.0, 1.0)
-    return np.round(255.0 * np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)).astype(np.uint8)
-
-
 def save(path: Path, image: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), image):
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]):
         raise OSError(f"{path} cannot be written")
 
 
@@ -76,7 +67,8 @@ def render_capture(name: str, folder: Path) -> None:
     scene = blender.new_scene(exposure)
     furnish(rng)
     depth = capture.depth_mm if capture.bend_mm else None
-    thing = blender.board_object(capture.board, blender.print_materials(exposure), depth)
+    thing = blender.board_object(capture.printed, blender.print_materials(exposure), depth)
+    fingers = blender.hands(thing, rng) if capture.hands else []
     level = looking_along(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, -1.0]))
     views = []
     for k, rig_from_board in enumerate(held_poses(capture, rng)):
@@ -85,6 +77,7 @@ def render_capture(name: str, folder: Path) -> None:
         world_from_rig = Rigid3(turned @ exp_so3(np.array([rng.uniform(-0.25, 0.25), 0.0, 0.0])), at_mm)
         seed, shift_mm = int(rng.integers(100_000)), np.zeros(3)
         thing.animation_data_clear()
+        blender.hold(fingers, capture.printed, rng)
         blender.place(thing, world_from_rig @ rig_from_board)
         bpy.context.view_layer.update()
         if exposure.motion:
@@ -92,11 +85,13 @@ def render_capture(name: str, folder: Path) -> None:
             shift_m = world_from_rig.rotation @ shift_mm * blender.M_PER_MM
             blender.set_moving(scene, thing, shift_m, exposure.motion == "rolling")
         for camera, (lens, cam_from_rig) in capture.mounts.items():
-            edge = paper_edge_px(capture.board, lens, cam_from_rig @ rig_from_board)
+            picture = folder / ("images" if len(capture.lenses) == 1 else camera) / f"{k:02d}{exposure.suffix}"
+            if picture.is_file():
+                continue
+            edge = paper_edge_px(capture.printed, lens, cam_from_rig @ rig_from_board)
             world_from_cam = world_from_rig @ cam_from_rig.inverse()
             light = blender.picture(scene, lens, exposure, world_from_cam, edge, seed, folder / "scratch.exr")
-            into = folder / ("images" if len(capture.lenses) == 1 else camera)
-            save(into / f"{k:02d}.png", develop(light, exposure, np.random.default_rng(seed)))
+            save(picture, develop(light, exposure, np.random.default_rng(seed)))
         views.append({"name": f"{k:02d}", "rig_from_board": written(rig_from_board), "motion_mm": shift_mm.tolist()})
         print(f"{name}: {k + 1} of {capture.count}", file=sys.stderr, flush=True)
     board_file = folder / "board.toml"

@@ -24,6 +24,9 @@ AMBIENT = 0.35
 """Every surface gives so much of its colour as light: what the room would throw back, without rays and their noise."""
 WHITE, BLACK = 0.8, 0.04
 CIRCLE_SIDES = 128
+SKIN = ((0.55, 0.35, 0.26), (0.25, 0.14, 0.09))
+FINGERS, FINGER_MM = 6, (40.0, 9.0, 8.0)
+"""Of both hands, and their half axes."""
 BACKING_MM = 5.0
 MARGIN_PX = 12
 """All samples are taken so far around the boards, too."""
@@ -166,6 +169,32 @@ def board_object(board: Board, paint: list[Any], depth_mm: Any = None, *, backed
     back = box((0.0, 0.0, 0.0), np.array([*size, BACKING_MM]) * M_PER_MM, material((0.3, 0.22, 0.15)))
     back.parent, back.location = thing, np.array([*middle, behind]) * M_PER_MM
     return thing
+
+
+def hands(thing: Any, rng: np.random.Generator) -> list[Any]:
+    """Return fingers, as ellipsoids that go with a board."""
+    skin, out = [material(colour, roughness=0.5, gloss=0.05) for colour in SKIN], []
+    paint = skin[int(rng.integers(len(skin)))]
+    for _ in range(FINGERS):
+        bpy.ops.mesh.primitive_uv_sphere_add(segments=32, ring_count=16, radius=1.0)
+        finger = bpy.context.object
+        finger.data.materials.append(paint)
+        finger.parent, finger.scale = thing, np.array(FINGER_MM) * M_PER_MM
+        out.append(finger)
+    return out
+
+
+def hold(fingers: list[Any], board: Board, rng: np.random.Generator) -> None:
+    """Put the fingers of the left and the right hand before the board, some way in from the edges of its paper."""
+    low, high = board.pattern.outline(*board.size)
+    low, high = (low - PAPER_MARGIN) * board.squares_mm, (high + PAPER_MARGIN) * board.squares_mm
+    hand = rng.uniform(low[1] + 20.0, high[1] - 20.0, 2)
+    for k, finger in enumerate(fingers):
+        side, along = k % 2, 2.2 * FINGER_MM[1] * (k // 2 - 0.25 * FINGERS + 0.5)
+        reach = rng.uniform(0.2, 0.75) * FINGER_MM[0]
+        x = low[0] + reach - FINGER_MM[0] if side == 0 else high[0] - reach + FINGER_MM[0]
+        finger.location = [x * M_PER_MM, (hand[side] + along) * M_PER_MM, -FINGER_MM[2] * M_PER_MM]
+        finger.rotation_euler = (0.0, 0.0, rng.uniform(-0.2, 0.2))
 
 
 def lamp(at_m: Sequence[float], watt: float, side_m: float) -> None:

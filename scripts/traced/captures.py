@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -40,11 +41,17 @@ RIGHT = polynomial_lens(
 RIGHT_FROM_LEFT = Rigid3(
     exp_so3(np.radians([0.0, 2.0, 0.0])) @ exp_so3(np.radians([0.0, 0.0, 0.8])), [-119.8, 1.3, 2.4]
 )
+SMALL = Lens("perspective", (640, 480), 560.0, (5, -3))
+SMALL_WIDE = polynomial_lens((640, 480), lambda t: 340.0 * (t + 0.1 * t**3), 68.0, (-6, 3))
 CHESSBOARD = Board("chessboard", 9, 6, 25.0, 25.0)
 GRID = Board("grid", 10, 8, 30.0, 30.0, pattern=AprilGrid(spacing=0.3))
 CIRCLES_BEFORE_MM = 0.002
 """Circles are drawn so far before the paper (rectangles are cut out of it): shadows of 0.02 mm move them by 0.02 px."""
 CIRCLES = Board("circles", 4, 11, 36.0, 36.0, pattern=Circles(layout="asymmetric", diameter_mm=15.0))
+SYMMETRIC = Board("chessboard", 8, 6, 25.0, 25.0)
+THIN = Board("chessboard", 14, 3, 18.0, 18.0)
+SYMMETRIC_CIRCLES = Board("circles", 8, 6, 26.0, 26.0, pattern=Circles(diameter_mm=14.0))
+LEGACY = Board("charuco", 8, 5, 28.0, 28.0, pattern=Charuco(dictionary="DICT_4X4_100", marker_mm=21.0, legacy=True))
 CHARUCO = Board("charuco", 8, 5, 28.0, 28.0, pattern=Charuco(dictionary="DICT_5X5_100", marker_mm=21.0))
 
 
@@ -62,6 +69,9 @@ class Exposure:
     aperture_mm, focus_mm : diameter of the lens's opening (0: sharp at any distance), distance of what is sharp.
     motion, motion_px : "", "blur" or "rolling", and from how many to how many pixels the board moves while the shutter
         is open, or while the rows of a rolling shutter are read one after another.
+    vignetting, glare : part of the light that is missing in the picture's corners, and what a lamp adds in the middle
+        of its glare, in parts of white.
+    webcam : a Bayer mosaic, demosaiced, sharpened and kept as JPEG.
     """
 
     samples: int = 64
@@ -75,6 +85,13 @@ class Exposure:
     focus_mm: float = 0.0
     motion: str = ""
     motion_px: tuple[float, float] = (0.0, 0.0)
+    vignetting: float = 0.0
+    glare: float = 0.0
+    webcam: bool = False
+
+    @property
+    def suffix(self) -> str:
+        return ".jpg" if self.webcam else ".png"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +105,9 @@ class Capture:
     angles_deg : the angle under which the board's diagonal is seen, from ... to.
     seed : of all that is drawn.
     cam_from_rig : of further cameras.
+    tilts_deg : between the line of sight and the board's normal, from ... to.
+    stretch : the printer made the board so many times as wide.
+    hands : fingers hold the board and cover some of it.
     partial : part of the pictures on which four tenths of the corners may lie outside.
     """
 
@@ -99,7 +119,15 @@ class Capture:
     bend_mm: float = 0.0
     partial: float = 0.15
     count: int = 14
+    tilts_deg: tuple[float, float] = (8.0, 45.0)
+    stretch: float = 1.0
+    hands: bool = False
     exposure: Exposure = field(default_factory=Exposure)
+
+    @property
+    def printed(self) -> Board:
+        """The board as it came out of the printer."""
+        return replace(self.board, square_x_mm=self.stretch * self.board.square_x_mm)
 
     @property
     def mounts(self) -> dict[str, tuple[Lens, Rigid3]]:
@@ -108,7 +136,7 @@ class Capture:
     def printed_mm(self) -> tuple[FloatArray, FloatArray]:
         """Return the lower and upper end of the printed part."""
         low, high = self.board.pattern.outline(*self.board.size)
-        return low * self.board.squares_mm, high * self.board.squares_mm
+        return low * self.printed.squares_mm, high * self.printed.squares_mm
 
     def depth_mm(self, xy_mm: FloatArray) -> FloatArray:
         """Return how far behind its edges' plane the bent board lies at (N, 2)."""
@@ -117,7 +145,7 @@ class Capture:
 
     def points_mm(self) -> FloatArray:
         """Return the board's points as they are, bent, (N, 3)."""
-        points, before = self.board.points(), CIRCLES_BEFORE_MM if len(self.board.ink().circles) else 0.0
+        points, before = self.printed.points(), CIRCLES_BEFORE_MM if len(self.board.ink().circles) else 0.0
         return np.column_stack([points[:, :2], self.depth_mm(points[:, :2]) - before])
 
 
@@ -128,19 +156,29 @@ def _narrow(seed: int, *, lens: Lens = NARROW, bend_mm: float = 0.0, **exposure:
     )
 
 
+def _small(seed: int, board: Board, *, lens: Lens = SMALL, **more: Any) -> Capture:
+    wanted: dict[str, Any] = {"angles_deg": (20, 42), "count": 12, **more}
+    return Capture(lenses={"camera": lens}, board=board, seed=seed, **wanted)
+
+
+def _pair(seed: int, board: Board, count: int = 14) -> Capture:
+    return Capture(
+        lenses={"left": LEFT, "right": RIGHT},
+        board=board,
+        angles_deg=(26, 44),
+        seed=seed,
+        cam_from_rig={"right": RIGHT_FROM_LEFT},
+        partial=0.5 if board.pattern.identified else 0.0,
+        count=count,
+    )
+
+
 CAPTURES: dict[str, Capture] = {
     "narrow": _narrow(1),
     "fisheye": Capture(lenses={"camera": FISHEYE}, board=CHESSBOARD, angles_deg=(40, 85), seed=2),
     "equisolid": Capture(lenses={"camera": EQUISOLID}, board=GRID, angles_deg=(45, 80), seed=3),
     "circles": Capture(lenses={"camera": WIDE}, board=CIRCLES, angles_deg=(35, 60), seed=4),
-    "stereo": Capture(
-        lenses={"left": LEFT, "right": RIGHT},
-        board=CHARUCO,
-        angles_deg=(26, 44),
-        seed=5,
-        cam_from_rig={"right": RIGHT_FROM_LEFT},
-        partial=0.5,
-    ),
+    "stereo": _pair(5, CHARUCO),
     "bent": _narrow(6, bend_mm=1.0),
     "defocus": _narrow(7, aperture_mm=6.0, focus_mm=450.0),
     "moving": _narrow(8, motion="blur", motion_px=(2.0, 9.0)),
@@ -154,12 +192,20 @@ CAPTURES: dict[str, Capture] = {
         seed=12,
         exposure=Exposure(gloss=0.25, roughness=0.12),
     ),
+    "grid-pair": _pair(13, GRID, 8),
+    "circle-pair": _pair(14, SYMMETRIC_CIRCLES, 8),
+    "symmetric-pair": _pair(15, SYMMETRIC, 8),
+    "webcam": _small(16, CHESSBOARD, hands=True, exposure=Exposure(motion="blur", motion_px=(0.0, 3.0), webcam=True)),
+    "slanted": _small(17, LEGACY, tilts_deg=(30.0, 65.0)),
+    "glare": _small(18, CHESSBOARD, lens=SMALL_WIDE, angles_deg=(32, 60), exposure=Exposure(vignetting=0.7, glare=0.5)),
+    "thin": _small(19, THIN),
+    "stretched": _small(20, CHESSBOARD, stretch=1.01),
 }
 
 
 def held_poses(capture: Capture, rng: np.random.Generator) -> list[Rigid3]:
-    """Return rig_from_board of all pictures, as a person holds a board: all over the image, near and far, tilted by 8
-    to 45 degrees, some turned, some only in part in the picture."""
+    """Return rig_from_board of all pictures, as a person holds a board: all over the image, near and far, tilted, some
+    turned, some only in part in the picture."""
     side = int(np.ceil(np.sqrt(capture.count)))
     cells = (np.stack(np.divmod(np.arange(side**2), side)[::-1], axis=-1) + 0.5) / side
     rng.shuffle(cells)
@@ -183,7 +229,7 @@ def _held(capture: Capture, cell: FloatArray, side: int, inwards: float, rng: np
     part = np.clip(cell + rng.uniform(-0.6, 0.6, 2) / side, 0.05, 0.95)
     pixel = lens.centre_px + (part * lens.size_px - lens.centre_px) * (1.0 - inwards)
     angle = np.radians(rng.uniform(*capture.angles_deg))
-    about, tilt = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(8.0, 45.0))
+    about, tilt = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(*capture.tilts_deg))
     roll = rng.uniform(-MAX_ROLL_DEG, MAX_ROLL_DEG) + (90.0 * rng.integers(0, 4) if rng.random() < TURNED else 0.0)
     if lens.angle(np.hypot(*(pixel - lens.centre_px))) > np.radians(lens.field_deg) / 2.0 - 0.1:
         return None
