@@ -53,6 +53,7 @@ def match_affine_features(
     ratio: float = 0.85,
     half_width_px: int = 16,
     min_correlation: float = MIN_CORRELATION,
+    unique: bool = False,
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
 
@@ -64,6 +65,8 @@ def match_affine_features(
     ratio : a match must be nearer than this times its best rival elsewhere in the image.
     half_width_px : of the patches aligned; surfaces are taken as flat within.
     min_correlation : of two aligned patches.
+    unique : features of the same image that look alike are rivals, too. What is repeated (tiles, keys, bricks) is
+        easily matched a period off, and such a match may lie near its epipolar line all the same.
 
     Raises
     ------
@@ -77,7 +80,8 @@ def match_affine_features(
     found: _AlignedMatches | None = None
     for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
         first, second = (_features(grey, views, features_per_view) for grey in greys)
-        found = _aligned(first, second, pyramid1, pyramid2, ratio, half_width_px, min_correlation)
+        matched = _match(first, second, ratio, unique)
+        found = _aligned(first, second, matched, pyramid1, pyramid2, half_width_px, min_correlation)
         if len(found.pairs) >= ENOUGH_PLAIN:
             break
     assert found is not None
@@ -99,14 +103,14 @@ class _AlignedMatches(NamedTuple):
 def _aligned(
     first: _Features,
     second: _Features,
+    matched: tuple[IntArray, IntArray, FloatArray],
     pyramid1: Pyramid,
     pyramid2: Pyramid,
-    ratio: float,
     half_width_px: int,
     min_correlation: float,
 ) -> _AlignedMatches:
     """Return the matches of two images' features whose patches align."""
-    i, j, rank = _match(first, second, ratio)
+    i, j, rank = matched
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
     i, j = i[once], j[once]
     A21 = second.frames[j] @ np.linalg.inv(first.frames[i]) if i.size else np.zeros((0, 2, 2))
@@ -222,28 +226,30 @@ def _simulated(
     return view, cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=0), view_from_image
 
 
-def _match(first: _Features, second: _Features, ratio: float) -> tuple[IntArray, IntArray, FloatArray]:
+def _match(first: _Features, second: _Features, ratio: float, unique: bool) -> tuple[IntArray, IntArray, FloatArray]:
     """Return index pairs of features that choose each other and have no rival elsewhere, with their distances."""
-    forward, distance, clear = _nearest(first, second, ratio)
-    backward, _, _ = _nearest(second, first, ratio)
+    forward, distance, rival = _nearest(first, second)
+    backward, _, _ = _nearest(second, first)
     if not forward.size or not backward.size:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
     returned = first.pixels[backward[forward]]
     mutual = np.linalg.norm(returned - first.pixels, axis=1) < SAME_POINT_PX
-    i = np.flatnonzero(clear & mutual)
+    if unique:
+        for features, which in ((first, slice(None)), (second, forward)):
+            # The nearest is the feature itself: the rival is elsewhere in its own image.
+            own = _nearest(features, features)[2]
+            rival = np.minimum(rival, own[which]) if own.size else rival
+    i = np.flatnonzero(mutual & (distance < ratio * rival))
     return i, forward[i], distance[i]
 
 
-def _nearest(
-    first: _Features, second: _Features, ratio: float, block: int = 1024
-) -> tuple[IntArray, FloatArray, BoolArray]:
-    """Return the nearest feature of `second` for each of `first`, how near, and whether no other point comes near."""
+def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return the nearest feature of `second` for each of `first`, how near, and how near any other point comes."""
     n, m = len(first.pixels), len(second.pixels)
     if m <= RIVALS or n == 0:
-        return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=bool)
-    nearest = np.empty(n)
+        return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0)
+    nearest, rival = np.empty(n), np.empty(n)
     best = np.empty(n, dtype=np.int64)
-    clear = np.empty(n, dtype=bool)
     for start in range(0, n, block):
         rows = slice(start, min(start + block, n))
         similarity = first.descriptors[rows] @ second.descriptors.T
@@ -253,11 +259,11 @@ def _nearest(
         top, values = np.take_along_axis(top, order, axis=1), np.take_along_axis(values, order, axis=1)
         distance = np.sqrt(np.maximum(2.0 - 2.0 * values, 0.0))
         apart = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
-        rival = np.where(apart, distance, np.inf).min(axis=1)
+        other = np.where(apart, distance, np.inf).min(axis=1)
         # No rival among the nearest ones: the furthest of them is a bound.
-        rival = np.where(np.isfinite(rival), rival, distance[:, -1])
-        best[rows], nearest[rows], clear[rows] = top[:, 0], distance[:, 0], distance[:, 0] < ratio * rival
-    return best, nearest, clear
+        rival[rows] = np.where(np.isfinite(other), other, distance[:, -1])
+        best[rows], nearest[rows] = top[:, 0], distance[:, 0]
+    return best, nearest, rival
 
 
 def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray, cell_px: float = 4.0) -> BoolArray:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.affine.features import match_affine_features
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray
@@ -21,7 +20,7 @@ from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import covariance_of, plan_views
-from rigkit.validation.sentinel.epipolar import FEATURES, PairMatches, check_matches, matches_say
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, scene_matches
 from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
 from rigkit.validation.sentinel.judge import SentinelCheck
 from sentinel.tally import SCENE_TURNED_DEG, tell, turned
@@ -68,7 +67,7 @@ def _pair(entry: dict[str, object], data: Path) -> ScenePair:
     direction = unit(np.array(entry["cam2_from_cam1_t_direction"], dtype=np.float64))
     true = Rigid3(np.array(entry["cam2_from_cam1_R"]), BASELINE_MM * direction)
     images = [read_image(data / "scenes" / str(entry[key])) for key in ("image1", "image2")]
-    matches = match_affine_features(images[0], images[1], tilts=(1.0,), features_per_view=FEATURES)
+    matches = scene_matches(images[0], images[1])
     size = sum(camera.parameters.size for camera in cameras) + 6
     rig = Watched(
         names=("left", "right"),

@@ -29,7 +29,7 @@ from rigkit.planning.plan import plan_views
 from rigkit.report.check_page import check_page, check_words, history_page
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshView, Watched
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
@@ -283,6 +283,34 @@ def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.r
     assert check.expected_px < 2.0 * FINE_MATCH_NOISE_PX < 0.5 * check.rms_px
     assert check.chance < 1e-9 and check.change is not None and check.change.cause.kind == "rotation"
     assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_wrong_matches_that_lie_alone_do_not_rename_a_change(axis: int) -> None:
+    # A lens can bend to a few matches where there are no others: off by little, as those of tiles are by a period.
+    turn = np.radians(0.05) * np.eye(3)[axis]
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        whole = _matches(moved, rng, FINE_MATCH_NOISE_PX / 4.0)
+        alone = whole.pixels1[:, 0] < 400.0
+        few = np.flatnonzero(alone)[:12]
+        pixels2 = whole.pixels2 + 0.0
+        pixels2[few, 1] += 0.3
+        kept = np.concatenate([few, np.flatnonzero(~alone)])
+        check = check_matches(_rig(), [PairMatches(0, 1, whole.pixels1[kept], pixels2[kept])])
+        assert not check.holds and check.change is not None and check.change.cause.kind == "rotation"
+
+
+def test_the_size_of_a_change_is_not_that_of_its_uncertainty() -> None:
+    sizes = []
+    for seed in range(8):
+        matches = _matches(MOUNT, np.random.default_rng(seed))
+        check = check_matches(_rig(), [PairMatches(0, 1, matches.pixels1[:60], matches.pixels2[:60])])
+        assert check.change is not None
+        sizes.append(check.change.size_px)
+    # Nothing happened, and sixty matches do not say so well: of the estimates alone the median is 0.09 px.
+    assert np.median(sizes) < ALARM_PX / 2.0
 
 
 def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, tmp_path: Path) -> None:

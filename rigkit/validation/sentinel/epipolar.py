@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.errors import DegenerateError
@@ -37,6 +38,8 @@ WELSCH_SIGMAS = 2.985
 quarter of them is wrong where things repeat, and not by far."""
 FIT_ROUNDS, FIT_RANK = 15, 1e-5
 """Of the fit of everything to the matches; directions that move them by less beside others are none."""
+MIN_FREE = 1e-3
+"""Of the variance of a match, what the fit leaves at least."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
 
@@ -62,11 +65,22 @@ def check_scene(
     for k, images in enumerate(frames):
         progress("matches", k, len(frames))
         for c in range(1, len(images)):
-            matches = match_affine_features(images[0], images[c], tilts=(1.0,), features_per_view=FEATURES)
+            try:
+                matches = scene_matches(images[0], images[c])
+            except DegenerateError:
+                continue  # No texture in this one.
             if len(matches.pixels1) >= MIN_FRAME_MATCHES:
                 found.append(PairMatches(0, c, matches.pixels1, matches.pixels2))
     progress("matches", len(frames), len(frames))
     return check_matches(watched, found, cost)
+
+
+def scene_matches(image1: Any, image2: Any) -> Correspondences:
+    """Return matches of what is not repeated in either image.
+
+    Raises as `match_affine_features`.
+    """
+    return match_affine_features(image1, image2, tilts=(1.0,), features_per_view=FEATURES, unique=True)
 
 
 def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Goal | None = None) -> SentinelCheck:
@@ -90,7 +104,7 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         residual, jacobian, good = _linearised(watched, pair)
         if len(residual) == 0:
             raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
-        left, weight, sigma = _unexplained(residual, jacobian)
+        left, weight, sigma = _unexplained(residual, jacobian, watched.mount(pair.second))
         by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
         np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
@@ -132,24 +146,36 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
     return residual[good], jacobian[good], np.asarray(good)
 
 
-def _unexplained(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tuple[FloatArray, FloatArray, float]:
     """Return what is left of residuals (M,) after the best change of theta of all, the weights of the matches, and
     their standard deviation: wrong matches count little."""
+    left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
+    # A wrong match far from all others bends the fit to itself: what lies out before it counts no more after it, nor
+    # what lies out after the best change of the mount alone, which bends little.
+    weight = _weights(residual, sigma)
+    for part in (mount, slice(None)):
+        left, weight, sigma = _fitted(residual, jacobian[:, part], weight)
+    return left, weight, max(sigma, MIN_SIGMA_PX)
+
+
+def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return what is left of residuals after the best step along all columns, the weights, none higher than `before`,
+    and their standard deviation."""
     size = np.linalg.norm(jacobian, axis=0)
     design = jacobian[:, size > 0.0] / size[size > 0.0]
-    values = np.linalg.svd(design, compute_uv=False)
-    rank = int(np.count_nonzero(values > FIT_RANK * values[0]))
-    freedom = max(len(residual) - rank, 1) / len(residual)
-    left, sigma = residual, float(np.median(np.abs(residual))) * SIGMA_OF_MEDIAN
-    # A wrong match far from all others bends the fit to itself: what lies out before it counts no more after it.
-    weight = before = _weights(residual, sigma)
+    left, weight, sigma = residual, before, 0.0
     for _ in range(FIT_ROUNDS):
         root = np.sqrt(weight)
+        basis, values, _ = np.linalg.svd(design * root[:, None], full_matrices=False)
+        rank = int(np.count_nonzero(values > FIT_RANK * values[0]))
         step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_RANK)[0]
         left = residual - design @ step
+        freedom = max(len(residual) - rank, 1) / len(residual)
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
-        weight = np.minimum(before, _weights(left, sigma))
-    return left, weight, max(sigma, MIN_SIGMA_PX)
+        # Of a match that the fit follows, alone in its part of the image, little is left, right or wrong.
+        free = np.sqrt(np.maximum(1.0 - (basis[:, :rank] ** 2).sum(axis=1), MIN_FREE))
+        weight = np.minimum(before, _weights(left / free, sigma))
+    return left, weight, sigma
 
 
 def _weights(left: FloatArray, sigma_px: float) -> FloatArray:

@@ -17,7 +17,6 @@ import numpy as np
 from scipy.special import fdtrc
 
 from rigkit.calibration.uncertainty import projection_design
-from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.planning.goal import GOAL_GRID, Goal
@@ -149,8 +148,9 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         best = max(known, key=lambda c: _evident(c, penalty))
         amounts, fixed, after = _refined(watched, look, best)
         step = best.cause.directions @ amounts
-        covariance = watched.covariance + best.cause.directions @ best.covariance @ best.cause.directions.T
-        change = replace(best, amounts=amounts, size_px=_size_px(watched, evidence, step))
+        unsure = best.cause.directions @ best.covariance @ best.cause.directions.T
+        covariance = watched.covariance + unsure
+        change = replace(best, amounts=amounts, size_px=_size_px(watched, evidence, step, unsure))
     goals = [cost] if cost is not None else lens_goals(watched)
     return SentinelCheck(
         chance=chance,
@@ -235,17 +235,22 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     return Change(cause, amounts, covariance, chance, 0.0, gain)
 
 
-def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray) -> float:
-    """Return how large a change is: over the image of the camera that suffers most, after the best rotation; how far a
-    camera that turned on its mount sees what is far away move; or what the corners show of it."""
-    shown = float(step @ evidence.information.sum(axis=0) @ step) / evidence.corners
-    turns = [_turned_px2(camera, step[watched.mount(c)][:3]) for c, camera in enumerate(watched.cameras) if c > 0]
-    lenses = [float(step @ goal.weight @ step) for goal in lens_goals(watched)]
-    return float(np.sqrt(max([0.0, shown, *lenses, *turns])))
+def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> float:
+    """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`: over the image of the
+    camera that suffers most, after the best rotation; how far a camera that turned on its mount sees what is far away
+    move; or what the corners show of it. The square of an estimate is too large by its variance, which is taken off."""
+    shown = evidence.information.sum(axis=0) / evidence.corners
+    turns = [_turn_weight(watched, c) for c in range(1, len(watched.cameras))]
+    weights = [shown, *(goal.weight for goal in lens_goals(watched)), *turns]
+    return float(np.sqrt(max(0.0, *(step @ weight @ step - (weight * unsure).sum() for weight in weights))))
 
 
-def _turned_px2(camera: Camera, turn: FloatArray) -> float:
-    """Return the mean square, over the image, of how far a turn (3,), rad, moves what is far away."""
+def _turn_weight(watched: Watched, c: int) -> FloatArray:
+    """Return W (T, T): d^T W d is the mean square over the image, px^2, of how far the turn of camera `c` in a change d
+    moves what is far away."""
+    camera, turn = watched.cameras[c], watched.mount(c).start
     rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
     by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
-    return float((np.einsum("ikm,k->im", by_turn, turn) ** 2).sum(axis=0).mean())
+    out = np.zeros((watched.size, watched.size))
+    out[turn : turn + 3, turn : turn + 3] = np.einsum("ikm,ilm->kl", by_turn, by_turn) / by_turn.shape[2]
+    return out
