@@ -4,7 +4,12 @@ Each trial is a pair of cameras on one mount (or one camera), calibrated from a 
 as a user's would be, certified, and used: lengths, depths, planes and angles at places all over the image, of known
 size, from corners with new noise. Of the errors 95 % should lie within the certificate's 95 % bounds.
 
+With --departs PX the lenses do what no model does: displacements of their images (powers of the radius, decentring,
+thin prisms, shear) of so many pixels at its corners, others each time; with --half boards are in the left of the image
+alone.
+
     python scripts/measure_certificates.py [--trials 100] [--frames 12] [--lens brown | kannala_brandt]
+        [--departs 0] [--half]
 """
 
 from __future__ import annotations
@@ -21,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.measuring import read_off
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.displaced import DisplacedCamera, uncertain_camera
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -32,6 +37,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.synthetic.placing import place_board
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task, instrument_of_rig
@@ -53,20 +59,29 @@ TASKS = {
 }
 ALONE = Task(quantity=Quantity.LENGTH, size_mm=150.0, distance_mm=1500.0, distance_sigma_mm=0.2)
 CELLS = (9, 7)
-PLACED_TRIES = 5000
+HALF = 0.6
+"""Of the image's width: boards that stay left of it."""
+PLACED_TRIES = 20000
 
 
-def seen_by(camera: Camera, pose: Rigid3, frame: str, rng: np.random.Generator) -> BoardView | None:
-    """Return the noisy view of a board at cam_from_board, None where not all of it is seen."""
+def departing(lens: Camera, sigma_px: float, rng: np.random.Generator) -> Camera:
+    """Return a lens that departs from its model."""
+    amounts = np.append(lens.parameters, sigma_px * rng.normal(size=DISPLACEMENTS))
+    return DisplacedCamera(SIZE_PX, amounts, lens, np.eye(DISPLACEMENTS))
+
+
+def seen_by(camera: Camera, pose: Rigid3, frame: str, rng: np.random.Generator, reach: float = 1.0) -> BoardView | None:
+    """Return the noisy view of a board at cam_from_board, None where not all of it is seen, in the left part `reach` of
+    the image."""
     pixels, valid = camera.project(pose.apply(BOARD.points()))
     noisy = pixels + rng.normal(0.0, NOISE_PX, pixels.shape)
-    if not (valid.all() and camera.on_image(noisy).all()):
+    if not (valid.all() and camera.on_image(noisy).all() and (noisy[:, 0] < reach * SIZE_PX[0]).all()):
         return None
     return BoardView(frame, BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX))
 
 
 def frames_of(
-    cameras: Sequence[Camera], poses: Sequence[Rigid3], count: int, rng: np.random.Generator
+    cameras: Sequence[Camera], poses: Sequence[Rigid3], count: int, rng: np.random.Generator, reach: float
 ) -> list[list[BoardView]]:
     """Return what each camera sees of `count` placings of the board that all of them see whole."""
     out: list[list[BoardView]] = [[] for _ in cameras]
@@ -77,7 +92,7 @@ def frames_of(
         if placed is None:
             continue
         name = f"{len(out[0]):03d}.png"
-        both = [seen_by(c, p @ placed.world_from_board, name, rng) for c, p in zip(cameras, poses, strict=True)]
+        both = [seen_by(c, p @ placed.world_from_board, name, rng, reach) for c, p in zip(cameras, poses, strict=True)]
         if all(view is not None for view in both):
             for own, view in zip(out, both, strict=True):
                 own += [view] if view is not None else []
@@ -91,18 +106,20 @@ def lengths_off(quantity: Quantity, points: np.ndarray, exact: np.ndarray) -> np
     return np.abs(read_off(quantity, points) - read_off(quantity, exact))
 
 
-def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[tuple[str, np.ndarray]]:
+def rig_trial(
+    lenses: Sequence[Camera], model: str, frames: int, rng: np.random.Generator, reach: float
+) -> Iterator[tuple[str, np.ndarray]]:
     """Yield (quantity, share of errors within the bound for each way to hold the thing) of a rig."""
     poses = (Rigid3.identity(), MOUNT)
-    views = dict(zip(("left", "right"), frames_of((lens, lens), poses, frames, rng), strict=True))
+    views = dict(zip(("left", "right"), frames_of(lenses, poses, frames, rng, reach), strict=True))
     sizes = dict.fromkeys(views, SIZE_PX)
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
-    rig = calibrate_rig(named, sizes, model=lens.model, degree=5 if lens.model == "brown" else None, folds=0)
+    rig = calibrate_rig(named, sizes, model=model, degree=5 if model == "brown" else None, folds=0)
     names = ("left", "right")
-    lenses, covariance = rig.with_departures()
+    known, covariance = rig.with_departures()
     found = instrument_of_rig(
         names,
-        lenses,
+        known,
         [c.cam_from_rig for c in rig.cameras],
         covariance,
         names,
@@ -113,9 +130,9 @@ def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[t
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
         use = certificate.in_view & ~certificate.coarse
-        rays, _ = lens.unproject(certificate.pixels[use])
+        rays, _ = lenses[0].unproject(certificate.pixels[use])
         exact, _ = measured_points(rays, task, True)
-        seen = [lens.project(pose.apply(exact)) for pose in poses]
+        seen = [lens.project(pose.apply(exact)) for lens, pose in zip(lenses, poses, strict=True)]
         noisy = [pixels + rng.normal(0.0, NOISE_PX, pixels.shape) for pixels, _ in seen]
         sights = [c.unproject(q)[0] for c, q in zip(found.cameras, noisy, strict=True)]
         slopes = [c.ray_jacobian(q) for c, q in zip(found.cameras, noisy, strict=True)]
@@ -126,12 +143,13 @@ def rig_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[t
         yield str(quantity), (off <= certificate.bound[use][good][:, None]).mean(axis=0)
 
 
-def alone_trial(lens: Camera, frames: int, rng: np.random.Generator) -> Iterator[tuple[str, np.ndarray]]:
+def alone_trial(
+    lenses: Sequence[Camera], model: str, frames: int, rng: np.random.Generator, reach: float
+) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the same of one camera that measures a length at a known distance."""
-    (views,) = frames_of((lens,), (Rigid3.identity(),), frames, rng)
-    found = calibrate(
-        views, SIZE_PX, model=lens.model, degree=5 if lens.model == "brown" else None, folds=0, board="flat"
-    )
+    lens = lenses[0]
+    (views,) = frames_of((lens,), (Rigid3.identity(),), frames, rng, reach)
+    found = calibrate(views, SIZE_PX, model=model, degree=5 if model == "brown" else None, folds=0, board="flat")
     uncertain = uncertain_camera(found)
     known = Instrument(
         names=("camera",),
@@ -159,14 +177,19 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--lens", choices=tuple(LENSES), action="append")
+    parser.add_argument("--departs", type=float, default=0.0, help="px at the corners of the image")
+    parser.add_argument("--half", action="store_true")
     args = parser.parse_args()
+    reach = HALF if args.half else 1.0
     print("| lens | quantity | trials | errors within the 95 % bound |\n|:--|:--|--:|--:|")
     for name in args.lens or LENSES:
         shares: dict[str, list[np.ndarray]] = {}
         for trial in range(args.trials):
             rng = np.random.default_rng([trial, len(name)])
+            lens = LENSES[name]
+            lenses = [departing(lens, args.departs, rng) for _ in range(2)] if args.departs else [lens, lens]
             for run in (rig_trial, alone_trial):
-                for quantity, share in run(LENSES[name], args.frames, rng):
+                for quantity, share in run(lenses, lens.model, args.frames, rng, reach):
                     shares.setdefault(quantity, []).append(share)
         for quantity, found in shares.items():
             print(f"| {name} | {quantity} | {len(found)} | {100 * np.mean(found, axis=0).min():.1f} % |", flush=True)
