@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.departures import SMALLEST_PX
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
@@ -17,6 +18,9 @@ MARGIN = 0.02
 SURELY = 1.0
 """or, a model, by this many standard errors of the difference, as images have it: a lens that is not quite right hides
 in the poses, and 0.3 % of held-out error may be three times the error of the lens."""
+MORE_NUMBERS = 1
+"""Models of other kinds come with a number more or less for the same freedom; large ones of a kind swing where no board
+was."""
 BOOTSTRAP_DRAWS = 2000
 """Draws that tell how likely an option is the best one: to 0.01."""
 CLEARLY = 2.0
@@ -75,11 +79,12 @@ def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
 class HeldOut:
     """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
     numbers (most of the cameras') and squared held-out residuals (M, N), of each camera in units of its smallest mean:
-    cameras differ in how sharp they are."""
+    cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by rounding."""
 
     names: list[str]
     counts: list[int]
     heldout: FloatArray
+    alike: float = 0.0
 
     @classmethod
     def of(cls, cameras: Sequence[Sequence[Option]]) -> HeldOut:
@@ -88,8 +93,13 @@ class HeldOut:
         names = [name for name in known[0] if all(name in own for own in known)]
         counts = [max(own[name].count for own in known) for name in names]
         parts = [np.array([own[name].heldout for name in names]) for own in known]
-        scaled = [part / max(float(part.mean(axis=1).min()), np.finfo(float).tiny) for part in parts if len(names)]
-        return cls(names, counts, np.concatenate(scaled, axis=1) if names else np.empty((0, 0)))
+        if not names:
+            return cls(names, counts, np.empty((0, 0)))
+        unit = [max(float(part.mean(axis=1).min()), np.finfo(float).tiny) for part in parts]
+        scaled = np.concatenate([part / one for part, one in zip(parts, unit, strict=True)], axis=1)
+        corners = [max(int(o.fit.kept.sum()) for o in own.values()) for own in known]
+        rounding = sum(2.0 * SMALLEST_PX**2 * n / one for n, one in zip(corners, unit, strict=True))
+        return cls(names, counts, scaled, rounding / scaled.shape[1])
 
     def chosen(self) -> str:
         """Return the name that `choose` prefers."""
@@ -104,7 +114,8 @@ class HeldOut:
 
     def likely(self, seed: int = 0) -> dict[str, float]:
         """Return how likely each option is the best one: how often it has the smallest held-out error where images
-        count by chance more or less (the Bayesian bootstrap).
+        count by chance more or less (the Bayesian bootstrap). Where others with about as many numbers err as little but
+        for rounding, images do not decide between them, sure as the order may be: they share.
 
         References: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference",
         Biometrics 53 (1997): weights by how often data like these would choose each model. D. B. Rubin, "The Bayesian
@@ -113,8 +124,12 @@ class HeldOut:
         if not self.names:
             return {}
         drawn = np.random.default_rng(seed).dirichlet(np.ones(self.heldout.shape[1]), BOOTSTRAP_DRAWS)
-        first = np.bincount((drawn @ self.heldout.T).argmin(axis=1), minlength=len(self.names))
-        return dict(zip(self.names, (first / BOOTSTRAP_DRAWS).tolist(), strict=True))
+        error = drawn @ self.heldout.T
+        least = error.min(axis=1, keepdims=True)
+        few = np.array(self.counts) <= self.counts[self.names.index(self.chosen())] + MORE_NUMBERS
+        best = (error == least) | (few & (error <= least + self.alike))
+        share = (best / best.sum(axis=1, keepdims=True)).mean(axis=0)
+        return dict(zip(self.names, share.tolist(), strict=True))
 
 
 def _bic(observations: Observations, option: Option) -> float:

@@ -79,6 +79,17 @@ def test_likely_is_how_often_images_drawn_anew_choose_a_model() -> None:
     assert clear == {"a": 1.0, "b": 0.0}
 
 
+def test_models_that_err_alike_but_for_rounding_share() -> None:
+    """Order that images are sure of says nothing of lenses where it is a thousandth of a pixel; a model of many numbers
+    more is no rival by that."""
+    same = np.random.default_rng(0).uniform(0.9, 1.1, 20)
+    rows = np.stack([same, same + 0.001, same + 0.001, same + 0.03])
+    names = ["kannala_brandt", "brown 5", "scaramuzza 8", "ucm"]
+    assert HeldOut(names, [8, 9, 12, 5], rows).likely()["kannala_brandt"] == 1.0
+    shared = HeldOut(names, [8, 9, 12, 5], rows, alike=0.01).likely()
+    assert [shared[name] for name in names] == pytest.approx([0.5, 0.5, 0.0, 0.0])
+
+
 def test_twins_have_images_of_one_size_and_nearly_one_focal_length() -> None:
     reg, wide = lens("reg"), lens("wide")
     near = reg.with_parameters(reg.parameters * np.array([1.03, 1.03, *[1.0] * 7]))

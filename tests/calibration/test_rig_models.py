@@ -37,7 +37,7 @@ def test_a_rival_widens_the_baseline_by_its_own_difference(
     count = len(rig.covariance)
     length, _ = rig.baseline_mm("reg", "wide")
     apart = abs(other.baseline_mm("reg", "wide")[0] - length)
-    alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0)
+    alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0, departures=())
     assert apart > 0.01
     assert alone.baseline_mm("reg", "wide")[1] == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
     assert not between_rig_models(joint, single, sigmas).any()  # type: ignore[arg-type]
