@@ -133,11 +133,15 @@ class LensModes:
 def uncertain_camera(calibration: Calibration) -> UncertainCamera:
     """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
     with boards all over the image and a model that fits none do, and the camera is the calibration's own."""
+    (camera,), covariance = with_modes((calibration.camera,), calibration.covariance, (lens_modes(calibration),))
+    return UncertainCamera(camera, covariance)
+
+
+def lens_modes(calibration: Calibration) -> LensModes:
+    """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it."""
     far = FarProjection.of(calibration)
     modes = telling_modes(far)
-    known = LensModes(modes, -far.departures.followed @ modes)
-    (camera,), covariance = with_modes((calibration.camera,), calibration.covariance, (known,))
-    return UncertainCamera(camera, covariance)
+    return LensModes(modes, -far.departures.followed @ modes)
 
 
 def with_modes(

@@ -15,6 +15,7 @@ import numpy as np
 
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.clustered import reduced_by_cluster
+from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
@@ -143,6 +144,20 @@ class Knowledge:
         told = reduced_by_cluster(products, p + WARP_UNKNOWNS, np.arange(len(held)))[0]
         out[:, own[:, None], own] = told
         return out
+
+    def departing(self, modes: LensModes) -> Knowledge:
+        """Return the same with the amounts of what the lens may do beyond its model as further parameters: of these new
+        views tell, too."""
+        p, count = self.camera.parameters.size, modes.modes.shape[1]
+        (camera,), _ = with_modes((self.camera,), np.zeros((p, p)), (modes,))
+        # What is known is of parameters x less what goes with the amounts a: n = x - moves a, and a of variance one.
+        back = np.zeros((len(self.information), len(self.information) + count))
+        own, amounts = np.r_[0:p, p + count : back.shape[1]], np.arange(p, p + count)
+        back[:, own] = np.eye(len(self.information))
+        back[:p, amounts] = -modes.moves
+        information = back.T @ self.information @ back
+        information[amounts, amounts] += 1.0
+        return replace(self, camera=camera, information=information)
 
     def with_views(self, held: HeldBoards, board_id: str = "") -> Knowledge:
         """Return what is known once these views are taken."""

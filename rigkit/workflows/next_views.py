@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.calibration.displaced import lens_modes
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -36,9 +37,9 @@ def next_views(
     Raises as `plan_views` and `goal_of`.
     """
     reach = reach or Reach()
-    goal = goal_of(calibration.camera, reach, length)
+    known = Knowledge.of(calibration).departing(lens_modes(calibration))
     last = calibration.views[-1].cam_from_board
-    return plan_views(Knowledge.of(calibration), boards, goal, count, reach=reach, last=last)
+    return plan_views(known, boards, goal_of(known.camera, reach, length), count, reach=reach, last=last)
 
 
 def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:

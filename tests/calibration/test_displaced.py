@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
+from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import DisplacedCamera, uncertain_camera
+from rigkit.calibration.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.base import Camera
@@ -18,6 +18,10 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.kernels.departures import DISPLACEMENTS, displacements
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import Knowledge
+from rigkit.planning.plan import covariance_of, plan_views
+from rigkit.workflows.next_views import next_views
 
 DEPARTS = np.zeros(DISPLACEMENTS)
 DEPARTS[5:7] = 0.3, -0.2
@@ -96,3 +100,19 @@ def test_a_lens_that_is_its_model_stays_as_it_is(rng: np.random.Generator) -> No
     assert known.parameters.size - found.camera.parameters.size <= 5
     rays = known.unproject(views[0].pixels)[0]
     assert rays == pytest.approx(found.camera.unproject(views[0].pixels)[0], abs=1e-12)
+
+
+def test_what_is_known_with_departures_is_their_joint_covariance() -> None:
+    """As a plan has it: information of parameters and amounts, of which a view of a board tells both."""
+    found = departing(0)
+    own, modes = Knowledge.of(found), lens_modes(found)
+    known, p = own.departing(modes), found.camera.parameters.size
+    (camera,), joint = with_modes((found.camera,), covariance_of(own.information)[:p, :p], (modes,))
+    size, sigma = camera.parameters.size, np.sqrt(np.diag(joint))
+    assert covariance_of(known.information)[:size, :size] / np.outer(sigma, sigma) == pytest.approx(
+        joint / np.outer(sigma, sigma), abs=1e-6
+    )
+    one, two = next_views(found, [BOARD], 1), plan_views(own, [BOARD], projection_goal(found.camera), 1)
+    # What the lens does beyond its model is left when its parameters are known.
+    assert one.views[0].error > 1.2 * two.views[0].error
+    assert one.error > two.error
