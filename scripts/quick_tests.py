@@ -155,6 +155,8 @@ class Source:
         tree = ast.parse(Path(path).read_text(encoding="utf-8"))
         functions = [node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))]
         called = [f for f in functions if not any("cache" in ast.unparse(one) for one in f.decorator_list)]
+        # `def name(self) -> float: ...` is run at import, too.
+        called = [f for f in called if f.body[0].lineno > f.lineno]
         self.lines = self.parser.statements & {
             line for f in called for line in range(f.body[0].lineno, (f.end_lineno or f.lineno) + 1)
         }

@@ -133,7 +133,7 @@ class RigGuide:
         shared = self._shared_of(c)
         if shared is None or len(shared.in_a) < SHARED_FRAMES:
             return None
-        return mount_error_px(shared, mount_information(shared).sum(axis=0))
+        return float(mount_error_px(shared, mount_information(shared).sum(axis=0)))
 
     def _shared_worth(self, c: int, glances: Sequence[Glance]) -> float:
         """Return what this frame brings to the mount of camera `c`, as a part of what one more usual frame would."""
@@ -144,7 +144,7 @@ class RigGuide:
             return 1.0
         known = mount_information(shared).sum(axis=0)
         fresh = self._views(self._partner(c), c, *pair)
-        before, after = (mount_error_px(shared, i) for i in (known, known + mount_information(fresh)[0]))
+        before, after = mount_error_px(shared, np.stack([known, known + mount_information(fresh)[0]]))
         usual = 1.0 - np.sqrt(len(shared.in_a) / (len(shared.in_a) + 1.0))
         return float((before - after) / max(before * usual, 1e-12))
 
@@ -172,7 +172,7 @@ class RigGuide:
         in_b = HeldBoards(in_a.points_mm, rotation[both], translation[both], in_a.seen[both])
         told = mount_information(SharedViews(shared.a, shared.b, chosen, in_b, shared.error))
         known = mount_information(shared).sum(axis=0)
-        best = int(np.argmin([mount_error_px(shared, known + more) for more in told]))
+        best = int(np.argmin(mount_error_px(shared, known + told)))
         where = placement(shared.a, board, chosen.pose(best))
         targets[a], targets[c] = where.outline_px, placement(shared.b, board, in_b.pose(best)).outline_px
         return f"{words}: {where} of {self.names[a]}", targets

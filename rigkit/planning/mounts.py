@@ -45,9 +45,9 @@ def mount_information(shared: SharedViews) -> FloatArray:
     return _inverse(covariance)
 
 
-def mount_error_px(shared: SharedViews, information: FloatArray) -> float:
-    """Return how wrong, rms px, the boards' corners appear in b if they are taken over from a: by what `information`
-    (6, 6) leaves open of the mount."""
+def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
+    """Return how wrong (...), rms px, the boards' corners appear in b if they are taken over from a: by what each of
+    `information` (..., 6, 6) leaves open of the mount."""
     turn = shared.in_b.rotation @ np.swapaxes(shared.in_a.rotation, -1, -2)
     lever = np.einsum("cij,cj->ci", turn, shared.in_a.translation_mm)
     # A turn about the origin of b moves the board's origin, too.
@@ -56,7 +56,7 @@ def mount_error_px(shared: SharedViews, information: FloatArray) -> float:
     unit = pose_information(shared.b, shared.in_b, CornerError(1.0))
     weight = np.swapaxes(as_pose, -1, -2) @ unit @ as_pose
     mean = weight.sum(axis=0) / float(shared.in_b.seen.sum())
-    return float(np.sqrt(max(np.trace(mean @ _inverse(information)), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ij,...ji->...", mean, _inverse(information)), 0.0)))
 
 
 def mean_motion(motions: list[Rigid3]) -> Rigid3:

@@ -43,7 +43,7 @@ MODEL = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt", "fi
 def test_start_needs_no_guess(name: str, count: int, rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens(name), count, rng, reach_deg=REACH_DEG[name])
     observations = Observations.from_views(views)
-    best = next(initialise(observations, SIZE, MODELS[MODEL[name]], None))
+    best, *_ = initialise(observations, SIZE, MODELS[MODEL[name]], None)
     norm = evaluate(best, observations).norm(observations)
     assert np.median(norm[observations.present]) < START_PX
 

@@ -85,7 +85,7 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     """The same rig again is the same; one with a camera moved by a millimetre is not, its lenses are."""
     folder = session.parent
     assert main(["calibrate", str(session)]) == 0
-    keep_corners(session, rig_views(rng, 16))
+    keep_corners(session, rig_views(rng, 10))
     assert main(["calibrate", str(session), "-o", str(folder / "again.json")]) == 0
     capsys.readouterr()
     assert main(["diff", str(folder / "rig-wide.json"), str(folder / "again-wide.json"), "--json"]) == 0

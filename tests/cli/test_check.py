@@ -16,6 +16,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -77,7 +78,9 @@ def test_a_patterned_box_in_the_room_is_no_board(home: Path, capsys: pytest.Capt
     assert json.loads(capsys.readouterr().out)["rms_px"] < 0.05
 
 
-def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(tmp_path: Path) -> None:
+def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The second camera stands on its head."""
     board = board_of_words("circles:7x5x30")
     place = Rigid3(exp_so3(np.array([0.2, 0.3, 0.0])), [-90.0, -60.0, 400.0])
@@ -96,6 +99,13 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(tmp_
     done = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,)))
     # Counted from two ends, the mount would be off by a turn.
     assert done.check.rms_px < 0.1 and not done.left_out
+
+    def no_pose(*_: object) -> None:
+        raise DegenerateError("no pose")
+
+    monkeypatch.setattr("rigkit.workflows.check.board_pose", no_pose)
+    with pytest.raises(DegenerateError, match="beside these pictures"):
+        check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,)))
 
 
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,8 +49,9 @@ def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pyt
 
 def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
-        files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["kalibr"])
-    assert list(files) == [tmp_path / "fish-kalibr.yaml"] and "fish-kalibr.yaml: " in caplog.text
+        files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["opencv", "kalibr"])
+    assert [path.name for path in files] == ["fish-opencv.yaml", "fish-kalibr.yaml"]
+    assert "fish-kalibr.yaml: " in caplog.text
 
 
 def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -61,6 +61,7 @@ def test_works_without_network(calibration: Calibration, tmp_path: Path) -> None
     assert told == ["8", "true", str(IMAGES), "true", "true"]
 
 
+@pytest.mark.thorough
 def test_fits_a_phone_a_tablet_and_a_screen(calibration: Calibration, tmp_path: Path) -> None:
     for width, (wide, small) in measured_at_widths(page(calibration), tmp_path).items():
         assert wide <= width

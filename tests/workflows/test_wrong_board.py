@@ -61,5 +61,8 @@ def test_mirrored_images_are_named(folder: Path, tmp_path: Path, capsys: pytest.
 
 def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder: Path) -> None:
     assert explained([folder / "0.png"], [BOARD]) is None
-    said = explained([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)])
+    plain, larger = Board("plain", 7, 7, 30.0, 30.0), Board("c", 8, 8, 30.0, 30.0, pattern=BOARD.pattern)
+    said = explained([folder / "0.png"], [plain, larger])
     assert said is not None and 'set type = "charuco"' in said
+    said = explained([folder / "0.png"], [larger])
+    assert said is not None and "8 x 8 are declared" in said
