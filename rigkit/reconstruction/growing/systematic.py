@@ -27,12 +27,12 @@ from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.residuals import level_terms, point_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-AMPLITUDES_PX = np.geomspace(0.003, 3.0, 9)
+AMPLITUDES_PX = np.geomspace(0.003, 1.0, 9)
 """Of a family of a lens's errors over its image, rms, that are weighed against each other."""
-USUAL_PX = 0.1
-"""Scale of the half-Cauchy distribution of an amplitude before any pair is seen (A. Gelman, "Prior Distributions for
-Variance Parameters in Hierarchical Models", Bayesian Analysis 2006): half of all careful calibrations leave less. What
-looks like another pose leaves no trace in the distances, so that none seen is not none there."""
+USUAL_PX = 0.07
+"""Of these before any pair is seen, as a half-normal distribution: careful calibrations leave a twentieth of a pixel an
+axis. What looks like another pose leaves no trace in the distances, so that none seen is not none there; and amplitudes
+that nothing limited would give the pose to a few chance pairs."""
 LENS_STEPS = 3
 
 
@@ -189,4 +189,4 @@ def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntA
 
 def _log_prior(amplitudes_px: FloatArray) -> FloatArray:
     """Return the logarithm of the density (A,) of the logarithms of amplitudes (A, F)."""
-    return np.asarray(np.sum(np.log(amplitudes_px) - np.log1p((amplitudes_px / USUAL_PX) ** 2), axis=1))
+    return np.asarray(np.sum(np.log(amplitudes_px) - 0.5 * (amplitudes_px / USUAL_PX) ** 2, axis=1))
