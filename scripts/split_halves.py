@@ -179,7 +179,8 @@ def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str,
     information, _ = reduced_by_cluster(products, p, cluster)
     pixels = grid_pixels(size_px, (20, 15))
     pixels = pixels[covered_by_boards(found, pixels)]
-    design = projection_design(found.camera, found.camera.unproject(pixels)[0]).transpose(2, 0, 1).reshape(-1, p + 3)
+    rays, valid = found.camera.unproject(pixels)
+    design = projection_design(found.camera, rays[valid]).transpose(2, 0, 1).reshape(-1, p + 3)
     turn = np.linalg.qr(design[:, p:])[0]
     sigmas = np.maximum(found.parameter_sigmas, np.finfo(float).tiny)
     seen = (design[:, :p] - turn @ (turn.T @ design[:, :p])) * sigmas
