@@ -132,6 +132,17 @@ def test_normals_of_epipolar_lines_from_F_and_from_rays_agree() -> None:
     np.testing.assert_allclose(unit(np.concatenate([e.n1, e.n2], 1)), unit(np.concatenate([c.n1, c.n2], 1)), atol=1e-10)
 
 
+def along_the_edges(c: Corners) -> DirectionPairs:
+    """Return the exact directions along the two edges of each square."""
+    return DirectionPairs(
+        image1=c.exact1[:, :2],
+        image2=c.exact2[:, :2],
+        valid=np.ones((len(c), 2), dtype=bool),
+        scaled=True,
+        kinds=("h", "v"),
+    )
+
+
 class TestDegenerateDirections:
     """Edges parallel to the baseline lie along their epipolar lines, wherever they are seen."""
 
@@ -156,13 +167,7 @@ class TestDegenerateDirections:
 
     def test_two_directions_only_are_flagged(self) -> None:
         c = self.scene(STANDARD, 0.0)
-        two = DirectionPairs(
-            image1=c.exact1[:, :2],
-            image2=c.exact2[:, :2],
-            valid=np.ones((len(c), 2), dtype=bool),
-            scaled=True,
-            kinds=("h", "v"),
-        )
+        two = along_the_edges(c)
         found = affines_from_directions(two, "F2UDIR", epipolar=c.epipolar)
         assert not found.valid[c.plane <= 1].any()
         assert np.isnan(found.A21[c.plane <= 1]).all()
@@ -195,13 +200,7 @@ class TestDegenerateDirections:
 
     def test_conditioning_is_the_smaller_alignment_of_perpendicular_directions(self) -> None:
         c = self.scene(STANDARD, 25.0)
-        two = DirectionPairs(
-            image1=c.exact1[:, :2],
-            image2=c.exact2[:, :2],
-            valid=np.ones((len(c), 2), dtype=bool),
-            scaled=True,
-            kinds=("h", "v"),
-        )
+        two = along_the_edges(c)
         found = affines_from_directions(two, "F2UDIR", epipolar=c.epipolar, min_conditioning=0.0)
         # The board in front: its edges are perpendicular in the image too.
         on = c.plane == 0

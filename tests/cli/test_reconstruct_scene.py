@@ -76,13 +76,19 @@ def test_other_layouts_of_the_file(files: tuple[Path, Rigid3], layout: str, caps
     np.testing.assert_allclose(results[0], results[1], atol=1e-7)
 
 
-def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+def pictures_of_a_corner(folder: Path, rng: np.random.Generator) -> tuple[Corner, list[str]]:
+    """Write a camera and two pictures of the corner of a room; return the corner and the pictures' names."""
     corner = Corner.of_a_room()
-    save_camera(tmp_path / "camera.json", SMALL)
+    save_camera(folder / "camera.json", SMALL)
     names = []
     for name, pose in (("a.png", Rigid3.identity()), ("b.png", CAM2_FROM_CAM1)):
-        cv2.imwrite(str(tmp_path / name), corner.image(SMALL, pose, rng))
-        names.append(str(tmp_path / name))
+        cv2.imwrite(str(folder / name), corner.image(SMALL, pose, rng))
+        names.append(str(folder / name))
+    return corner, names
+
+
+def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
+    corner, names = pictures_of_a_corner(tmp_path, rng)
     assert run(tmp_path, "--images", *names, "--json") == 0
     result = json.loads(capsys.readouterr().out)
     assert max(pose_errors_deg(Rigid3.from_matrix(result["cam2_from_cam1"]), CAM2_FROM_CAM1)) < 0.5
@@ -106,12 +112,7 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
 
 
 def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
-    corner = Corner.of_a_room()
-    save_camera(tmp_path / "camera.json", SMALL)
-    names = []
-    for name, pose in (("a.png", Rigid3.identity()), ("b.png", CAM2_FROM_CAM1)):
-        cv2.imwrite(str(tmp_path / name), corner.image(SMALL, pose, rng))
-        names.append(str(tmp_path / name))
+    _, names = pictures_of_a_corner(tmp_path, rng)
     np.savetxt(tmp_path / "pose.txt", CAM2_FROM_CAM1.matrix())
     said = ("--images", *names, "--json", "--no-pictures", "--pose")
     assert run(tmp_path, *said, str(tmp_path / "pose.txt")) == 0
