@@ -187,13 +187,23 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
 
 def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
     """Say whether cameras that are alike are better off with the model that they were solved with again."""
-    pairs = [
-        [replace(now.chosen, name="found"), replace(then.chosen, name="again")]
-        for now, then in zip(found, again, strict=True)
-    ]
+    pairs = [_on_same_images(now, then) for now, then in zip(found, again, strict=True)]
+    if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
+        return False  # Nothing can be compared.
     if len(pairs) == 1:
         return choose(again[0].observations, pairs[0], SURELY).name == "again"
     return HeldOut.of(pairs).chosen() == "again"
+
+
+def _on_same_images(found: Solved, again: Solved) -> list[Option]:
+    """Return what two solutions of a camera chose, judged on the images that both have: each leaves out those that
+    disagree with its own model."""
+    images = [list(dict.fromkeys(one.observations.images)) for one in (found, again)]
+    out = []
+    for name, one, own, other in zip(("found", "again"), (found, again), images, images[::-1], strict=True):
+        both, heldout = [k for k, image in enumerate(own) if image in set(other)], one.chosen.heldout
+        out.append(replace(one.chosen, name=name, heldout=None if heldout is None else heldout[both]))
+    return out
 
 
 def _result(

@@ -16,6 +16,7 @@ from rigkit.calibration.fit import Fit, fit_model
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, settled, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.one_model import Solved
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.uncertainty import FarProjection, followed, projection_design
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -181,3 +182,21 @@ def test_the_chosen_lens_in_another_size_is_no_rival(fits: dict[str, tuple[Obser
     assert [one.rival.name for one in rival_fits(observations, small, options, likely)] == ["eucm"]
     both = [*options, Option("scaramuzza 4", small)]
     assert [one.rival.name for one in rival_fits(observations, small, both, likely)] == ["scaramuzza 6", "eucm"]
+
+
+def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
+    fits: dict[str, tuple[Observations, Fit]],
+) -> None:
+    observations, fit = fits["ucm"]
+
+    def found(images: np.ndarray, squares: np.ndarray) -> Solved:
+        return Solved(observations.subset(images), (), Option("ucm", fit, squares[images]), [], [], [])
+
+    every, ripple = np.arange(IMAGES), 1.0 + 0.1 * np.sin(np.arange(IMAGES))
+    # The image that one of them left out is bad for the other.
+    ripple[3] = 40.0
+    before, better = found(every, ripple), found(np.delete(every, 3), 0.8 * ripple)
+    worse = found(np.delete(every, 3), 1.2 * ripple)
+    assert module._better([before], [better]) and not module._better([before], [worse])
+    assert module._better([before, before], [better, better]) and not module._better([before] * 2, [worse] * 2)
+    assert not module._better([before], [found(every[:1], ripple)])
