@@ -17,7 +17,7 @@ from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
-from rigkit.detection.tags.unknown_tags import TagSightings, guessed_grids
+from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, TagSightings, guessed_grids
 
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
@@ -103,7 +103,14 @@ def _guess_of(
                 for k, image in enumerate(images):
                     markers.look(k, image, every=every)
         charuco = guessed_charuco(markers)
-    return None if charuco is None else BoardGuess(charuco, tuple(markers.images))
+    if charuco is not None:
+        return BoardGuess(charuco, tuple(markers.images))
+    # Last, as the markers of ChArUco boards stand in rows, too.
+    aruco = TagSightings(ARUCO_TAGS)
+    for k, image in enumerate(images):
+        aruco.look_alone(k, image)
+    grids = guessed_grids(aruco)
+    return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else None
 
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:

@@ -31,6 +31,7 @@ PLACES = (0.01, 0.02)
         ((10, 8), AprilGrid(0.25)),
         ((8, 6), AprilGrid(0.5, "tag25h9", 1, 4, "opencv")),
         ((8, 6), AprilGrid(0.4, corner_squares=False)),
+        ((10, 14), AprilGrid(0.2, "DICT_6X6_50", 1, 3, "opencv", corner_squares=False)),
         ((8, 5), Charuco("DICT_5X5_50", 45.0)),
         ((8, 5), Charuco("DICT_4X4_50", 45.0, legacy=True)),
         ((8, 6), Chessboard()),
@@ -38,7 +39,7 @@ PLACES = (0.01, 0.02)
         ((4, 11), Circles("asymmetric", diameter_mm=24.0)),
         ((8, 7), Circles("hexagonal", diameter_mm=30.0, inverted=True)),
     ],
-    ids=["kalibr", "opencv", "alone", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
+    ids=["kalibr", "opencv", "alone", "aruco", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
 )
 def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
     board = Board("b", *size, 60.0, 60.0, pattern=pattern)

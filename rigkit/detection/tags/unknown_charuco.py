@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
-from rigkit.core.patterns.aruco import marker_count
+from rigkit.core.patterns.aruco import SIZES, marker_count, smallest_dictionary
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies
@@ -23,8 +23,7 @@ DICTIONARIES = (
     "DICT_ARUCO_MIP_36h12",
     *(f"DICT_APRILTAG_{code}" for code in ("36h11", "36h10", "25h9", "16h5")),
 )
-"""The largest of each kind; the smaller ones of OpenCV are their beginnings."""
-SIZES = (50, 100, 250, 1000)
+"""The largest of each kind."""
 
 MIN_MARKER_SIDE = 0.35
 """Of a marker, in squares."""
@@ -166,7 +165,8 @@ def guessed_charuco(seen: MarkerSightings) -> Board | None:
         for rows in sorted({*tall, 2 * (last + 1 - first) // (columns + 1)}):
             if rows < 2:
                 continue
-            pattern = Charuco(_smallest(dictionary, first, (columns + 1) * (rows + 1)), side, first, legacy, inverted)
+            least = smallest_dictionary(dictionary, first + ((columns + 1) * (rows + 1) + 1) // 2)
+            pattern = Charuco(least, side, first, legacy, inverted)
             board = Board("board", columns, rows, 1.0, 1.0, pattern=pattern)
             if first + len(pattern.places(*board.size)) > marker_count(pattern.dictionary):
                 continue
@@ -192,12 +192,3 @@ def _first_marker(own: list[Markers]) -> int:
     most = int(max(numbers.max() for numbers, *_ in own))
     # Where the first rows were never seen, numbers from 0 on are likelier than a board that begins with an odd one.
     return 0 if least < most - least else least
-
-
-def _smallest(dictionary: str, first: int, squares: int) -> str:
-    """Return the smallest dictionary of a kind that has the markers of so many squares."""
-    kind, _, count = dictionary.rpartition("_")
-    if count != str(SIZES[-1]) or not kind:
-        return dictionary
-    needed = first + (squares + 1) // 2
-    return next((f"{kind}_{n}" for n in SIZES if needed <= n), dictionary)

@@ -17,13 +17,14 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import MAX_BORDER, TAG_FAMILIES, AprilGrid
-from rigkit.core.patterns.aruco import marker_count
+from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
 from rigkit.detection.tags.quads import quadrilaterals
+from rigkit.detection.tags.unknown_charuco import DICTIONARIES
 
 WIDEST_RATIO = 8.0
 """A tag's side over the gap, or the other way round, at most."""
@@ -36,6 +37,10 @@ MAX_LONE_STEP = 3.0
 
 OFF_TAG_PLACE = 0.2
 """A tag beside another lies within so many steps of its place, as the other has it."""
+
+APRIL_TAGS = tuple((family, border) for family in TAG_FAMILIES for border in range(1, MAX_BORDER + 1))
+ARUCO_TAGS = tuple((dictionary, 1) for dictionary in DICTIONARIES if dictionary not in TAG_FAMILIES.values())
+"""Families that may be there, with the modules of their borders."""
 
 Kind: TypeAlias = tuple[str, int, bool]
 """Family, modules of the border, whether tags stand alone."""
@@ -84,6 +89,7 @@ class TagSightings:
     """The tags of all images: indices of the `images` that show some, and the tags as `seen`; `kinds` has the sum of
     likenesses of each kind."""
 
+    families: tuple[tuple[str, int], ...] = APRIL_TAGS
     images: list[int] = field(default_factory=list)
     kinds: Counter[Kind] = field(default_factory=Counter)
     seen: list[_SeenTags] = field(default_factory=list)
@@ -94,17 +100,16 @@ class TagSightings:
         corners, _ = find_corners(levels)
         lattices = build_lattices(corners, find_links(corners, levels[0], LENGTH_RATIO * WIDEST_RATIO))
         found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
-        shown = any(found) or self._read_alone(index, image)
-        if shown:
+        if any(found):
             self.images.append(index)
-        return shown
+        return any(found) or self.look_alone(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         corners = lattice.pixels
         quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
         row, column = np.nonzero(np.isfinite(quads).all(axis=(2, 3)) & (lattice.signs()[:-1, :-1] < 0.0))
         quads = quads[row, column]
-        best = _best_read(image, quads)
+        best = _best_read(image, quads, self.families)
         if best is None:
             return False
         total, (family, border), codes = best
@@ -120,9 +125,11 @@ class TagSightings:
         self.seen.append(_SeenTags(index, kind, codes.number[own], places, _steps(upright, places)))
         return True
 
-    def _read_alone(self, index: int, image: GreyImage) -> bool:
+    def look_alone(self, index: int, image: GreyImage) -> bool:
+        """Read the tags of an image that stand alone, without squares between their corners; say whether there are
+        some."""
         quads = quadrilaterals(image)
-        best = _best_read(image, quads)
+        best = _best_read(image, quads, self.families)
         if best is None:
             return False
         total, (family, border), codes = best
@@ -140,20 +147,23 @@ class TagSightings:
                 self.kinds[kind] += total  # type: ignore[assignment]
                 self.seen.append(seen)
                 shown = True
+        if shown:
+            self.images.append(index)
         return shown
 
 
-def _best_read(image: GreyImage, quads: FloatArray) -> tuple[float, tuple[str, int], TagCode] | None:
+def _best_read(
+    image: GreyImage, quads: FloatArray, families: Sequence[tuple[str, int]]
+) -> tuple[float, tuple[str, int], TagCode] | None:
     """Return the sum of likenesses, family and border, and codes of the kind of tags that quadrilaterals are most
     like; None for none."""
     best: tuple[float, tuple[str, int], TagCode] | None = None
-    for family, dictionary in TAG_FAMILIES.items():
-        every = np.arange(marker_count(dictionary))
-        for border in range(1, MAX_BORDER + 1):
-            codes = read_tags(image, quads, Codes.of(AprilGrid(1.0, family, border, numbering="opencv"), every))
-            total = float(codes.likeness[codes.read].sum())
-            if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
-                best = total, (family, border), codes
+    for family, border in families:
+        pattern = AprilGrid(1.0, family, border, numbering="opencv")
+        codes = read_tags(image, quads, Codes.of(pattern, np.arange(marker_count(pattern.dictionary))))
+        total = float(codes.likeness[codes.read].sum())
+        if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
+            best = total, (family, border), codes
     return best
 
 
@@ -264,5 +274,7 @@ def _board_of(cluster: Sequence[Counted], kind: Kind) -> Board | None:
     if spacing <= 0.0:
         return None
     numbering = "opencv" if step > 0 else "kalibr"
+    rows = (most - first) // columns + 1
+    family = smallest_dictionary(family, first + columns * rows)
     pattern = AprilGrid(spacing, family, border, first, numbering, not alone)
-    return Board("board", 2 * columns, 2 * ((most - first) // columns + 1), 1.0, 1.0, pattern=pattern)
+    return Board("board", 2 * columns, 2 * rows, 1.0, 1.0, pattern=pattern)
