@@ -149,6 +149,9 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
     verdicts = judge_session(result, dropped, suggest_ties(views, result))
     if verdicts[0].severity is Severity.BAD:
         shown = _other_board(session)
+        if shown is not None and 2 * len(views) < len(session.images):
+            # What little passes for the board declared lies in wrong places.
+            raise InputError(f"{session.path}: {shown}")
         if shown is not None:
             verdicts = (verdicts[0], Finding(severity=Severity.BAD, message=shown), *verdicts[1:])
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
