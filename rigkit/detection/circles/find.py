@@ -246,7 +246,8 @@ def _again(grey: GreyImage, draft: _Draft) -> _Draft:
     """Return the draft fitted with maps through the circles as they are now."""
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
-    around = with_smooth_bends(around, draft.label, fit.pixels, hexagonal=draft.hexagonal)
+    size_px = (grey.shape[1], grey.shape[0])
+    around = with_smooth_bends(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
     fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px)
     return _judged(replace(draft, fit=fresh, around=around, radius=radius))

@@ -8,7 +8,7 @@ from math import factorial
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.tags.surface import SmoothMap
+from rigkit.detection.tags.surface import SmoothMap, wide_perspective
 
 SQUARE_BASIS = np.eye(2)
 HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
@@ -111,16 +111,20 @@ def local_maps(
     )
 
 
-def with_smooth_bends(around: PlaneMap, label: IntArray, pixels: FloatArray, *, hexagonal: bool) -> PlaneMap:
+def with_smooth_bends(
+    around: PlaneMap, label: IntArray, pixels: FloatArray, size_px: tuple[int, int], *, hexagonal: bool
+) -> PlaneMap:
     """Return the map `around` the circles of a lattice, (N, 2) each, with second derivatives of one map through all.
 
     Neighbours are on one side only at the rim, and leave the curvature there to their scatter; a smooth map of the
-    board knows it better. As it is where there are few circles.
+    board knows it better: a perspective through a lens in the middle of an image of `size_px`, and a polynomial. As it
+    is where there are few circles.
     """
     if len(label) < MIN_SMOOTH:
         return around
     places = label @ plane_basis(hexagonal).T
-    smooth = SmoothMap(places, pixels)
+    centre = 0.5 * (np.array(size_px) - 1.0)
+    smooth = SmoothMap(places, pixels, wide_perspective(places, pixels, centre))
     here, below, above = (smooth.at(places + np.array([0.0, off])) for off in (0.0, MIXED_STEP, -MIXED_STEP))
     mixed = (below.sides[:, 0] - above.sides[:, 0]) / (2.0 * MIXED_STEP)
     second = np.stack([here.bends[:, 0], mixed, here.bends[:, 1]], axis=2)

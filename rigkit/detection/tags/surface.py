@@ -27,6 +27,12 @@ NEAREST_DEPTH = 0.1
 """A perspective in which a point of the board is nearer than this part of the mean distance is no camera's: the lens is
 a wide fisheye."""
 
+BENDS = (0.0, 0.15, 0.3, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
+"""Of half a space, what the outermost point may lie off the axis of a fisheye."""
+
+SMALL_ANGLE, DIFFERENCE = 1e-4, 0.02
+"""Its tangent is the angle, to 1e-8; and half the step of derivatives, in units of the board."""
+
 CHORD = 0.4
 """Derivatives of a camera's projection are chords of this many sides of a tag to either side."""
 
@@ -103,6 +109,50 @@ class SmoothMap:
         leverage = self._polynomial.leverage
         gain = np.sqrt(leverage / (1.0 - leverage))
         return replace(self.at(self._places), pixels=self._pixels - self._polynomial.foretold, gain=gain)
+
+
+def wide_perspective(
+    places: FloatArray, pixels: FloatArray, centre: FloatArray
+) -> Callable[[FloatArray], TagSurface] | None:
+    """Return the perspective that fits the points best through a lens that may be a fisheye; None where none does.
+
+    Rays of a fisheye make angles with its axis, here through `centre` (2,), as pixels have distances from that, r = f
+    theta. Of BENDS for 1 / f, in parts of what would see half a space, the best leaves a smooth rest.
+    """
+    away = pixels - centre
+    radius = np.hypot(away[:, 0], away[:, 1])
+    best: tuple[float, Callable[[FloatArray], TagSurface]] | None = None
+    for part in BENDS:
+        bend = part * 0.5 * np.pi / max(float(radius.max()), 1.0)
+        angle = bend * radius
+        straight = away * np.where(angle > SMALL_ANGLE, np.tan(angle) / np.maximum(angle, SMALL_ANGLE), 1.0)[:, None]
+        matrix, nearest = perspective(places, straight)
+        if not nearest > NEAREST_DEPTH:
+            continue
+        seen = partial(_bent, matrix, bend, centre)
+        off = float(np.mean((seen(places) - pixels) ** 2))
+        if best is None or off < best[0]:
+            best = off, partial(_by_differences, seen)
+    return None if best is None else best[1]
+
+
+def _bent(homography: FloatArray, bend: float, centre: FloatArray, places: FloatArray) -> FloatArray:
+    """Return where a lens of 1 / f `bend` shows what a homography does of places (M, 2)."""
+    straight = _projected(homography, places).pixels
+    length = bend * np.hypot(straight[:, 0], straight[:, 1])
+    shrunk = np.where(length > SMALL_ANGLE, np.arctan(length) / np.maximum(length, SMALL_ANGLE), 1.0)
+    return np.asarray(centre + shrunk[:, None] * straight)
+
+
+def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
+    """Return a map and its derivatives at places (M, 2) by differences."""
+    h = DIFFERENCE
+    here, right, left, below, above = (
+        seen(places + h * np.array(at)) for at in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    )
+    sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
+    bends = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
+    return TagSurface(here, sides, bends, np.zeros(len(places)))
 
 
 def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
