@@ -31,6 +31,7 @@ from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyra
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import refine
+from rigkit.detection.subpixel.whole_board import placed_together
 
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""
@@ -88,7 +89,7 @@ def fitted(
             else [own]
         )
         if len(parts) == 1:
-            out += [own] if large(own.lattice, min_corners) else []
+            out += [placed_together(grey, own)] if large(own.lattice, min_corners) else []
             continue
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]

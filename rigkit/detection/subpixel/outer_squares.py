@@ -83,14 +83,18 @@ def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatAr
     return replace(geometry, gaps=gaps, paper=paper)
 
 
-def outer_squares(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatArray, owner: IntArray) -> FloatArray:
-    """Return how wide the outermost squares beside N corners are, (N, 2, 2), in squares; NaN where none is seen to end.
+def outer_squares(
+    image: GreyImage, geometry: Geometry, pixels: FloatArray, contrast: FloatArray, blur: FloatArray, sign: FloatArray
+) -> FloatArray:
+    """Return how wide the outermost squares beside N corners of a board are, (N, 2, 2), in squares; NaN where none is
+    seen to end.
 
-    Arguments as for `with_paper`.
+    `pixels` (N, 2), `contrast` and `blur` (N,) of the corners; `sign` (N,) as for `edge_fit.fit_edges`.
     """
-    beside = with_paper(image, geometry, fit, sign, owner)
-    seen = np.full(geometry.gaps.shape, np.nan) if beside.paper is None else beside.paper
-    return np.where(np.isfinite(seen), beside.gaps / geometry.gaps, np.nan)
+    owner = np.zeros(len(pixels), np.int64)
+    known = geometry.sides, geometry.gaps, geometry.ends
+    paper, gaps = find_paper(image, pixels, *known, contrast, blur, sign, owner, _rules())
+    return np.where(np.isfinite(paper), gaps / geometry.gaps, np.nan)
 
 
 @functools.cache

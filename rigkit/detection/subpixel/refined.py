@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ class RefinedLattice:
     residual, noise : RMS of what the fit leaves and of the part of it that is noise, grey levels.
     scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
         the noise in the image explains.
+    correlated : the same, because neighbouring pixels share noise (`correlation.sigma_factors`).
     """
 
     lattice: Lattice
@@ -30,6 +31,7 @@ class RefinedLattice:
     residual: FloatArray
     noise: FloatArray
     scatter: float = 1.0
+    correlated: float = 1.0
 
     @property
     def worst_sigma_px(self) -> FloatArray:
@@ -41,22 +43,22 @@ class RefinedLattice:
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
         rest = (np.where(drop, np.nan, values) for values in self._values())
-        return _refined(self.lattice.without(drop), rest, self.scatter)
+        return self._of(self.lattice.without(drop), rest)
 
     def cut(self, rows: slice, columns: slice) -> RefinedLattice:
         """Return the part of `rows` and `columns`."""
         rest = (values[rows, columns] for values in self._values())
-        return _refined(self.lattice.cut(rows, columns), rest, self.scatter)
+        return self._of(self.lattice.cut(rows, columns), rest)
 
     def padded(self, rows: tuple[int, int], columns: tuple[int, int]) -> RefinedLattice:
         """Return this with so many empty rows and columns before and after."""
         rest = (padded(values, rows, columns) for values in self._values())
-        return _refined(self.lattice.padded(rows, columns), rest, self.scatter)
+        return self._of(self.lattice.padded(rows, columns), rest)
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
         """Return this numbered from another corner, as `Lattice.turned`."""
         rest = (turned(values, quarter_turns) for values in self._values())
-        return _refined(self.lattice.turned(quarter_turns), rest, self.scatter)
+        return self._of(self.lattice.turned(quarter_turns), rest)
 
     def filled(self, other: RefinedLattice) -> RefinedLattice:
         """Return this with the corners of `other`, of the same size, where it has none."""
@@ -64,13 +66,12 @@ class RefinedLattice:
         pairs = zip(self._values(), other._values(), strict=True)
         scatter = max(self.scatter, other.scatter)
         rest = (np.where(known, *pair) for pair in pairs)
-        return _refined(self.lattice.filled(other.lattice), rest, scatter)
+        return replace(self._of(self.lattice.filled(other.lattice), rest), scatter=scatter)
 
     def _values(self) -> tuple[FloatArray, ...]:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)
 
-
-def _refined(lattice: Lattice, values: Iterable[FloatArray], scatter: float) -> RefinedLattice:
-    """Return the refined `lattice` of `values` as `RefinedLattice._values`."""
-    sigma_px, blur_px, residual, noise = values
-    return RefinedLattice(lattice, sigma_px, blur_px, residual, noise, scatter)
+    def _of(self, lattice: Lattice, values: Iterable[FloatArray]) -> RefinedLattice:
+        """Return this of another lattice, with `values` as `_values`."""
+        sigma_px, blur_px, residual, noise = values
+        return replace(self, lattice=lattice, sigma_px=sigma_px, blur_px=blur_px, residual=residual, noise=noise)

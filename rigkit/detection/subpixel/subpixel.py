@@ -7,6 +7,7 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,10 +20,9 @@ from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
-from rigkit.detection.subpixel.outer_squares import beside_paper, outer_squares, with_paper
+from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
-from rigkit.detection.subpixel.whole_board import small_squares, with_whole_boards
 
 Part = tuple[slice, slice]
 
@@ -87,12 +87,13 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
     blur = _typical_blur(first, sheet.parts)
-    last, reached = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts)
+    last, reached, factors = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts)
     if reached.any():
         # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
         once = last.without(~reached)
         blur = _typical_blur(once, sheet.parts)
-        again, _ = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts, again=True)
+        again, _, others = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts)
+        factors = np.where([reached[part].any() for part in sheet.parts], others, factors)
         last = last.without(reached).filled(again)
     if holes.any():
         last = _confirmed(last, start, holes)
@@ -101,18 +102,15 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     # paper), the sigmas of the board are raised to what is seen.
     scatter = scatter_factors(checked.lattice.pixels, checked.sigma_px, sheet.parts)
     return [
-        _part_of(checked, part, item.rising, float(raised))
-        for part, item, raised in zip(sheet.parts, lattices, scatter, strict=True)
+        replace(
+            checked.cut(*part),
+            lattice=replace(checked.lattice.cut(*part), rising=item.rising),
+            sigma_px=checked.sigma_px[part] * raised,
+            scatter=raised,
+            correlated=factor,
+        )
+        for part, item, raised, factor in zip(sheet.parts, lattices, scatter.tolist(), factors.tolist(), strict=True)
     ]
-
-
-def _part_of(sheet: RefinedLattice, part: Part, rising: bool, raised: float) -> RefinedLattice:
-    """Return the lattice at `part` of the sheet, its sigmas `raised` by a factor."""
-    lattice = Lattice(sheet.lattice.pixels[part], sheet.lattice.contrast[part], rising)
-    sigma_px = sheet.sigma_px[part] * raised
-    return RefinedLattice(
-        lattice, sigma_px, sheet.blur_px[part], sheet.residual[part], sheet.noise[part], scatter=raised
-    )
 
 
 def _typical_blur(item: RefinedLattice, parts: Sequence[Part]) -> FloatArray:
@@ -153,11 +151,9 @@ def _last_pass(
     blur: FloatArray,
     sigma_px: FloatArray,
     parts: Sequence[Part],
-    *,
-    again: bool = False,
-) -> tuple[RefinedLattice, BoolArray]:
+) -> tuple[RefinedLattice, BoolArray, FloatArray]:
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out. Say (R, C) which
-    are of boards whose neighbouring lines reach into the windows, and so are to be fitted `again`.
+    are of boards whose neighbouring lines reach into the windows, and (P,) how correlated noise raises sigmas.
 
     Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
@@ -196,16 +192,7 @@ def _last_pass(
     factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
     reached = np.zeros(known.shape, np.bool_)
     reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
-    refined = _spread(start, fit, fit.sigma_px * factors[mine])
-    small = small_squares(geometry, fit.blur, mine, len(parts))
-    if not again:
-        small[mine[reached[known]]] = False
-    if small.any():
-        outer = np.full((*known.shape, 4), np.nan)
-        outer[known] = outer_squares(image, geometry, fit, signs[known], mine).reshape(-1, 4)
-        whole = [(part, factor) for part, factor, here in zip(parts, factors.tolist(), small, strict=True) if here]
-        refined = with_whole_boards(image, refined, outer, whole)
-    return refined, reached
+    return _spread(start, fit, fit.sigma_px * factors[mine]), reached, factors
 
 
 def _fitted_beside_paper(

@@ -16,14 +16,15 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, MAX_BLUR_CHANGE, MAX_MOVE_PX, ROUNDING_VARIANCE
-from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry
-from rigkit.detection.subpixel.outer_squares import MAX_PAPER
+from rigkit.detection.subpixel.edge_model import WINDOW_REACH, Geometry, ends_of
+from rigkit.detection.subpixel.outer_squares import MAX_PAPER, outer_squares
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.kernels.boards import (
     Blocks,
     Picture,
@@ -122,47 +123,41 @@ class _State:
     light: FloatArray
 
 
-def small_squares(geometry: Geometry, blur: FloatArray, owner: IntArray, boards: int) -> BoolArray:
-    """Return which boards (P,) of N corners, `owner` (N,), have squares that are small against the `blur` (N,)."""
-    wide = geometry.gaps.reshape(-1, 4).mean(axis=1)
-    small = np.zeros(boards, np.bool_)
-    for k in range(boards):
-        mine = owner == k
-        small[k] = mine.any() and MIN_BLUR_PX < np.median(blur[mine]) > np.median(wide[mine]) / SMALL_SQUARES
-    return small
-
-
-def with_whole_boards(
-    image: GreyImage, item: RefinedLattice, outer: FloatArray, parts: Sequence[tuple[Part, float]]
-) -> RefinedLattice:
-    """Return the sheet `item` with the corners of boards placed together, where their picture is as that of boards.
-
-    `outer` (R, C, 4) as for `Surroundings.read`; `parts` the rows and columns of each board, and its
-    `correlation.sigma_factors`.
-    """
-    pixels, sigma_px = item.lattice.pixels.copy(), item.sigma_px.copy()
-    for part, factor in parts:
-        known = item.lattice.known[part]
-        if min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size:
+def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
+    """Return `item` with its corners placed together where its squares are small against the blur, and the picture is
+    as that of a board; else as it is."""
+    lattice, known = item.lattice, item.lattice.known
+    start, blur = lattice.pixels, float(np.median(item.blur_px[known]))
+    few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
+    if few or blur < MIN_BLUR_PX:
+        return item
+    shape = fit_cells(start, known)
+    if float(np.median(shape.gaps())) > SMALL_SQUARES * blur:
+        return item
+    geometry = Geometry(shape.sides, np.zeros((lattice.count, 2)), shape.gaps(), ends_of(known, known))
+    outer = np.full((*known.shape, 4), np.nan)
+    fitted = start[known], lattice.contrast[known], item.blur_px[known], lattice.signs()[known]
+    outer[known] = outer_squares(image, geometry, *fitted).reshape(-1, 4)
+    if not known.all():
+        start = start.copy()
+        start[~known] = fit_cells(start, ~known, degree=2, ridge=(1e-3, 1.0)).pixels
+    around = Surroundings.read(outer, start, blur, ~known)
+    alone, noise = (float(np.sqrt(np.mean(part[known] ** 2))) for part in (item.residual, item.noise))
+    pixels, sigma_px = lattice.pixels.copy(), item.sigma_px / item.scatter
+    for rows, columns, kept in _tiles(known.shape):
+        board = fit_whole_board(image, start[rows, columns], blur, around.of(rows, columns))
+        if board is None or board.residual > MAX_RESIDUAL * alone:
             continue
-        start = item.lattice.pixels[part]
-        if not known.all():
-            start = start.copy()
-            start[~known] = fit_cells(start, ~known, degree=2, ridge=(1e-3, 1.0)).pixels
-        blur = float(np.median(item.blur_px[part][known]))
-        around = Surroundings.read(outer[part], start, blur, ~known)
-        alone = float(np.sqrt(np.mean(item.residual[part][known] ** 2)))
-        noise = float(np.sqrt(np.mean(item.noise[part][known] ** 2)))
-        for rows, columns, kept in _tiles(known.shape):
-            board = fit_whole_board(image, start[rows, columns], blur, around.of(rows, columns))
-            if board is None or board.residual > MAX_RESIDUAL * alone:
-                continue
-            of_tile = np.zeros(known.shape, np.bool_)
-            of_tile[kept] = known[kept]
-            mine = of_tile[rows, columns]
-            pixels[part][of_tile] = board.pixels[mine]
-            sigma_px[part][of_tile] = board.spread_px[mine] * noise * factor
-    return replace(item, lattice=replace(item.lattice, pixels=pixels), sigma_px=sigma_px)
+        own = np.zeros(known.shape, np.bool_)
+        own[kept] = known[kept]
+        mine = own[rows, columns]
+        pixels[own], sigma_px[own] = board.pixels[mine], board.spread_px[mine] * noise * item.correlated
+    if np.array_equal(pixels, lattice.pixels, equal_nan=True):
+        return item
+    every = (slice(0, known.shape[0]), slice(0, known.shape[1]))
+    scatter = float(scatter_factors(pixels, sigma_px, [every])[0])
+    placed = replace(lattice, pixels=pixels)
+    return replace(item, lattice=placed, sigma_px=sigma_px * scatter, scatter=scatter)
 
 
 def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: Surroundings) -> WholeBoard | None:
