@@ -44,7 +44,7 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
 
 def quadrilaterals(image: GreyImage) -> FloatArray:
     """Return quadrilaterals (N, 4, 2) of an image that may be tags, corners in order of growing angle from u to v."""
-    grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    grey = image if image.dtype == np.uint8 else np.clip(np.rint(image), 0, 255).astype(np.uint8)
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = MIN_PERIMETER
     # Which markers OpenCV takes them for does not matter: it cannot read wide borders.
