@@ -60,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
         print_json({image: [_summary(item) for item in items] for image, items in done.found.items()})
     else:
         for image, items in done.found.items():
-            nothing = " (".join(["no board", *([f"{done.doubtful[image]})"] if image in done.doubtful else [])])
-            print(f"{printable(image)}: " + (", ".join(_words(item) for item in items) or nothing))
+            beside = f" ({done.doubtful[image]})" if image in done.doubtful else ""
+            print(f"{printable(image)}: {', '.join(_words(item) for item in items) or 'no board'}{beside}")
         missing = sum(not items for items in done.found.values())
         shown = len(done.found) - missing
         total = len(done.found) + len(done.failures)

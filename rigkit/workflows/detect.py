@@ -23,6 +23,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
+from rigkit.detection.twins import alike_boards
 from rigkit.io.board_words import board_of_words
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
@@ -57,7 +58,7 @@ class DetectOptions:
 @dataclass(frozen=True, eq=False, slots=True)
 class DetectionResult:
     """What was found, by image, in the order given; by image why others could not be looked at; and what is seen, but
-    not trusted, in those that show no board."""
+    not trusted, in those that show no board, or twice, of boards alike."""
 
     found: Mapping[str, tuple[BoardDetection, ...]]
     failures: Mapping[str, InputError]
@@ -215,12 +216,12 @@ def _over_images(
 
 def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
     """Detect the boards of one image and write its overlay; return the error where the image is of no use. The second
-    result is what is seen, but not trusted, where there is no board."""
+    result is what is seen, but not trusted, where there is no board, and else what is seen twice."""
     cv2.setNumThreads(1)
     try:
         image = _read(job)
         found = _boards_in(image, job)
-        seen = None if found else doubtful_grid(image)
+        seen = alike_boards(image, job.boards) if found else doubtful_grid(image)
     except InputError as error:
         return error, None
     except MemoryError as error:

@@ -12,10 +12,12 @@ from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.targets.charuco import _between_markers, _marked_corners
+from rigkit.detection.twins import alike_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
@@ -177,3 +179,14 @@ def test_a_board_whose_markers_blur_into_its_edges_is_found_whole(seed: int) -> 
     truth = scene.truth()[0]
     assert found.complete
     assert np.abs(errors(found, truth)).max() < BLURRED_PX
+
+
+def test_boards_alike_in_one_image_are_told() -> None:
+    grid = Board("g", 6, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
+    for board in (BOARD, grid):
+        picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render()
+        assert alike_boards(picture, [board]) is None
+        words = alike_boards(np.hstack([picture, picture]), [board])
+        assert words is not None
+        assert f"'{board.board_id}' are seen twice" in words
+    assert alike_boards(picture, [Board("plain", 9, 6, 30.0, 30.0)]) is None

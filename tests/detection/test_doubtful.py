@@ -61,7 +61,7 @@ def test_a_blurred_board_of_a_declared_size_is_kept_with_sigmas_that_hold(seed: 
     assert len(found.grid) >= 0.9 * len(truth.grid)
     nearest = np.linalg.norm(found.pixels[:, None] - truth.pixels, axis=2).argmin(axis=1)
     off = (found.pixels - truth.pixels[nearest]) / found.sigma_px[:, None]
-    assert np.median(found.sigma_px) > 0.05
+    assert np.median(found.sigma_px) > 0.02
     assert 0.6 < np.sqrt((off**2).mean()) < HONEST_RATIO
     other = Board("b", truth.columns, truth.rows + 1, 30.0, 30.0)
     assert not detect_boards(image, [other])

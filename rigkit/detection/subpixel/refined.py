@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,7 @@ class RefinedLattice:
     blur_px: FloatArray
     residual: FloatArray
     noise: FloatArray
+    _: KW_ONLY
     scatter: float = 1.0
     correlated: float = 1.0
 

@@ -1,0 +1,61 @@
+"""Boards alike in one image: nothing tells whose marks are whose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.boards import Board
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.saddles.mosaic import without_mosaic
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.tags.codes import Codes, read_tags
+from rigkit.detection.tags.quads import quadrilaterals
+
+MIN_TWINS = 3
+"""Marks that are seen twice: one may be misread."""
+
+APART_SIDES = 1.5
+"""The same mark is not seen in two places so far apart, in sides of it: at its outer and inner border it is."""
+
+
+def alike_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | None:
+    """Return what is said of the first of `boards` whose marks are seen twice in an image, of which one is taken; None
+    without one."""
+    grey = without_mosaic(grey_image(image))
+    for board in boards:
+        if board.identified and _twins(*_marks(grey, board)) >= MIN_TWINS:
+            return f"the marks of '{board.board_id}' are seen twice: of boards alike in one image only one is found"
+    return None
+
+
+def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
+    """Return the corners (N, 4, 2) of the marks of a board that are seen, and their numbers (N,)."""
+    pattern = board.pattern
+    if isinstance(pattern, AprilGrid):
+        quads = quadrilaterals(grey)
+        tags = read_tags(grey, quads, Codes.of(pattern, pattern.numbers(*board.size).ravel()))
+        return quads[tags.read], tags.number[tags.read]
+    assert isinstance(pattern, Charuco)
+    eight_bit = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, pattern.dictionary))
+    seen, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(
+        255 - eight_bit if pattern.inverted else eight_bit
+    )
+    if numbers is None:
+        return np.zeros((0, 4, 2)), np.zeros(0, np.int64)
+    number = np.asarray(numbers, np.int64).ravel() - pattern.first_marker
+    own = (number >= 0) & (number < len(pattern.places(*board.size)))
+    return np.array(seen, np.float64).reshape(-1, 4, 2)[own], number[own]
+
+
+def _twins(quads: FloatArray, numbers: IntArray) -> int:
+    """Return how many marks are seen in two places."""
+    middle, side = quads.mean(axis=1), np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1)
+    away = np.linalg.norm(middle[:, None] - middle, axis=2) > APART_SIDES * np.maximum(side[:, None], side)
+    return len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))
