@@ -76,17 +76,21 @@ class _VerbParser(argparse.ArgumentParser):
 
 
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
-    """Return the parser; only the module of `verb` is imported, all others show their one-line help."""
+    """Return the parser; only the module of `verb` is imported."""
+    listed = "\n".join(f"  {name:<12} {summary}" for name, summary in VERBS.items())
     parser = argparse.ArgumentParser(
         prog="rigkit",
+        usage="rigkit [-h] [--version] VERB ...",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Calibrate lab cameras, reconstruct oriented point clouds, validate them against measured truth.",
-        epilog=FIRST_STEPS,
+        epilog=f"verbs:\n{listed}\n\n{FIRST_STEPS}",
     )
     parser.add_argument("--version", action=_Version, help="show version, compiled kernels and platform, and exit")
-    verbs = parser.add_subparsers(title="verbs", dest="verb", metavar="VERB", required=True, parser_class=_VerbParser)
+    verbs = parser.add_subparsers(
+        dest="verb", metavar="VERB", prog="rigkit", required=True, parser_class=_VerbParser, help=argparse.SUPPRESS
+    )
     for name, summary in VERBS.items():
-        sub = verbs.add_parser(name, help=summary, description=summary)
+        sub = verbs.add_parser(name)
         if name == verb:
             module = importlib.import_module(f"rigkit.cli.{name}")
             sub.description = (module.__doc__ or summary).partition(": ")[2]
