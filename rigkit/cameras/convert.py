@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
@@ -77,7 +78,7 @@ def convert_camera(
     InputError
         `model` or a name in `fixed` is unknown, or the model cannot follow the lens at all.
     """
-    pixels = _grid(camera)
+    pixels = grid_pixels(camera.size_px, CONVERT_GRID).reshape(-1, 2)
     rays, valid = camera.unproject(pixels)
     pixels, rays = pixels[valid], rays[valid]
     if len(pixels) < MIN_COVERED_SAMPLES:
@@ -170,11 +171,6 @@ def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:
     to = pixels[..., None, :] - outline
     turn = side[:, 0] * to[..., 1] - side[:, 1] * to[..., 0]
     return np.asarray((turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1))
-
-
-def _grid(camera: Camera) -> Pixels:
-    u, v = (np.linspace(0.0, size - 1.0, count) for size, count in zip(camera.size_px, CONVERT_GRID, strict=True))
-    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def _free(camera: Camera, fixed: Sequence[str]) -> FloatArray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.cameras.base import MAX_SIDE_PX, Camera
+from rigkit.cameras.compare import grid_pixels
 
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e7
 """A pixel that sees a radian, and one that sees a fiftieth of an arc second."""
@@ -41,8 +42,7 @@ def fault_of_lens(camera: Camera) -> str | None:
                 f"its focal length is {shortest:g} to {longest:g} px, no lens's: a lens has {MIN_FOCAL_PX:g} to "
                 f"{MAX_FOCAL_PX:g} px, along x and y nearly the same"
             )
-        u, v = (np.linspace(0.0, side - 1.0, count) for side, count in zip(camera.size_px, ASKED_PIXELS, strict=True))
-        asked = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        asked = grid_pixels(camera.size_px, ASKED_PIXELS).reshape(-1, 2)
         rays, _ = camera.unproject(asked)
         again, seen = camera.project(rays)
         if np.count_nonzero(seen & (np.abs(again - asked).max(axis=-1) < 1.0)) < MIN_ANSWERS:

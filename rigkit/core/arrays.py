@@ -71,6 +71,25 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
     return array
 
 
+def keep_arrays(
+    result: object, *, finite: bool = True, optional: bool = False, **shapes: tuple[int | None, ...]
+) -> None:
+    """Put read-only copies of the fields named in `shapes` into a frozen `result`, checked as by `as_array`.
+
+    `optional`: these fields may also be None.
+    """
+    for name, shape in shapes.items():
+        value = getattr(result, name)
+        if not (optional and value is None):
+            object.__setattr__(result, name, as_array(value, shape, name, finite=finite))
+
+
+def keep_indices(result: object, **shapes: tuple[int | None, ...]) -> None:
+    """Do the same with fields of whole numbers, checked as by `as_indices`."""
+    for name, shape in shapes.items():
+        object.__setattr__(result, name, as_indices(getattr(result, name), shape, name))
+
+
 def as_floats(value: ArrayLike, tail: tuple[int, ...], name: str) -> FloatArray:
     """Return `value` as float64, not copied, which has the axes `tail` behind any others; else raises InputError."""
     try:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points, as_array, as_indices
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points, keep_arrays, keep_indices
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 
@@ -46,13 +46,9 @@ class OrientedCloud:
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.points_mm))
-        object.__setattr__(self, "points_mm", as_array(self.points_mm, (n, 3), "points_mm"))
-        object.__setattr__(self, "normals", as_array(self.normals, (n, 3), "normals"))
-        object.__setattr__(self, "board_index", as_indices(self.board_index, (n,), "board_index"))
-        object.__setattr__(self, "grid", as_indices(self.grid, (n, 2), "grid"))
-        object.__setattr__(self, "sigma_mm", as_array(self.sigma_mm, (n,), "sigma_mm", finite=False))
-        sigma = as_array(self.normal_sigma_rad, (n,), "normal_sigma_rad", finite=False)
-        object.__setattr__(self, "normal_sigma_rad", sigma)
+        keep_arrays(self, points_mm=(n, 3), normals=(n, 3))
+        keep_indices(self, board_index=(n,), grid=(n, 2))
+        keep_arrays(self, sigma_mm=(n,), normal_sigma_rad=(n,), finite=False)
         for name in ("calibration_in_sigmas", "from_origin"):
             if not isinstance(value := getattr(self, name), bool | np.bool_):
                 raise InputError(f"{name}: True or False is needed, got {value!r}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.core.arrays import FloatArray, IntArray, Pixels, Points, keep_arrays, keep_indices
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
@@ -31,10 +31,9 @@ def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> In
 
 def _check_corners(seen: BoardDetection | BoardView) -> None:
     """Make grid, pixels and sigmas arrays of one length; raises InputError where they are not."""
-    object.__setattr__(seen, "grid", as_indices(seen.grid, (None, 2), "grid"))
+    keep_indices(seen, grid=(None, 2))
     n = len(seen.grid)
-    object.__setattr__(seen, "pixels", as_array(seen.pixels, (n, 2), "pixels"))
-    object.__setattr__(seen, "sigma_px", as_array(seen.sigma_px, (n,), "sigma_px"))
+    keep_arrays(seen, pixels=(n, 2), sigma_px=(n,))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -18,7 +18,8 @@ from rigkit.core.arrays import (
     RayJacobians,
     Rays,
     as_array,
-    as_indices,
+    keep_arrays,
+    keep_indices,
 )
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
@@ -114,29 +115,11 @@ class Matches:
 
     def __post_init__(self) -> None:
         n = len(np.asarray(self.pixels1))
-        shapes: dict[str, tuple[int | None, ...]] = {
-            "pixels1": (n, 2),
-            "pixels2": (n, 2),
-            "rays1": (n, 3),
-            "rays2": (n, 3),
-            "jacobians1": (n, 3, 2),
-            "jacobians2": (n, 3, 2),
-            "sigma1_px": (n,),
-            "sigma2_px": (n,),
-        }
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, as_array(getattr(self, name), shape, name))
-        object.__setattr__(self, "board_index", as_indices(self.board_index, (n,), "board_index"))
-        object.__setattr__(self, "grid", as_indices(self.grid, (n, 2), "grid"))
-        optional: dict[str, tuple[int | None, ...]] = {
-            "K1": (3, 3),
-            "K2": (3, 3),
-            "A21": (n, 2, 2),
-            "sigma_A": (n,),
-        }
-        for name, shape in optional.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, as_array(getattr(self, name), shape, name, finite=name.startswith("K")))
+        keep_arrays(self, pixels1=(n, 2), pixels2=(n, 2), rays1=(n, 3), rays2=(n, 3))
+        keep_arrays(self, jacobians1=(n, 3, 2), jacobians2=(n, 3, 2), sigma1_px=(n,), sigma2_px=(n,))
+        keep_indices(self, board_index=(n,), grid=(n, 2))
+        keep_arrays(self, optional=True, K1=(3, 3), K2=(3, 3))
+        keep_arrays(self, optional=True, finite=False, A21=(n, 2, 2), sigma_A=(n,))
 
     def __len__(self) -> int:
         return len(self.pixels1)

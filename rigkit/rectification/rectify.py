@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Pixels, as_array
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import nearest_rotation
@@ -25,6 +26,8 @@ MAX_KEPT_SAMPLES = 8_000_000
 """Of a map that is used for several images: 24 bytes each."""
 _Band = tuple[NDArray[np.int64], list[tuple[Pixels, BoolArray]]]
 """Rows of the target, and for each sample of its pixels where the seen ones come from, and which are seen."""
+SCALE_SAMPLES = 41
+"""Along each side of a target: there it is asked how much smaller the target shows the source."""
 MAX_SUPERSAMPLING = 8
 """Samples a pixel and axis at the most, where a target shows the source much smaller."""
 
@@ -168,9 +171,7 @@ class RectifyMap:
 
     def _supersampling(self) -> int:
         """Samples a pixel and axis: source pixels per target pixel, where it is large (90 % quantile)."""
-        columns, rows = self.target.size_px
-        u, v = np.linspace(0.0, columns - 1.0, 41), np.linspace(0.0, rows - 1.0, 41)
-        source, valid = self.source_pixels(np.stack(np.meshgrid(u, v), axis=-1))
+        source, valid = self.source_pixels(grid_pixels(self.target.size_px, (SCALE_SAMPLES, SCALE_SAMPLES)))
         source = source[valid & self.camera.on_image(source)]
         scale = self.scale(source) if source.size else np.ones(1)
         scale = scale[np.isfinite(scale) & (scale > 0.0)]

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
@@ -138,11 +139,7 @@ def _extent(maps: list[RectifyMap], reach: FloatArray) -> tuple[FloatArray, Floa
     """Return low and high corner of the target in units of its focal length, and target per source scale (median)."""
     lows, highs, scales = [], [], []
     for remap in maps:
-        width, height = remap.camera.size_px
-        grid = np.stack(
-            np.meshgrid(np.linspace(0.0, width - 1.0, EXTENT_SAMPLES), np.linspace(0.0, height - 1.0, EXTENT_SAMPLES)),
-            axis=-1,
-        )
+        grid = grid_pixels(remap.camera.size_px, (EXTENT_SAMPLES, EXTENT_SAMPLES))
         there, valid = remap.pixels(grid)
         valid &= (np.abs(np.where(valid[..., None], there, np.inf)) <= reach).all(axis=-1)
         if not valid.any():

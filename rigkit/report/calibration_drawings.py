@@ -12,6 +12,7 @@ import numpy as np
 from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.report import svg
 from rigkit.report.svg import dots, round_down, strokes
@@ -208,9 +209,7 @@ def _colour_bar(y: float, low: float, high: float) -> str:
 
 def _numbers(calibration: Calibration) -> list[str]:
     """Return the uncertainty in figures at the centre, the corners and the middles of the sides."""
-    width, height = calibration.camera.size_px
-    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, 3), np.linspace(0.0, height - 1.0, 3))
-    at = np.stack([u, v], axis=-1)
+    at = grid_pixels(calibration.camera.size_px, (3, 3))
     worst = projection_uncertainty(calibration, at).worst_px
     zoom = _zoom(calibration)
     out = []

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, Mat3, Normals, Points, as_array, as_indices
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Normals, Points, keep_arrays, keep_indices
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.posetype import PoseType
@@ -56,11 +56,8 @@ class PairBatch:
 
     def __post_init__(self) -> None:
         t, n = np.asarray(self.points_mm).shape[:2]
-        object.__setattr__(self, "points_mm", as_array(self.points_mm, (t, n, 3), "points_mm"))
-        object.__setattr__(self, "normals", as_array(self.normals, (t, None, 3), "normals"))
-        object.__setattr__(self, "rotation21", as_array(self.rotation21, (t, 3, 3), "rotation21"))
-        object.__setattr__(self, "translation21_mm", as_array(self.translation21_mm, (t, 3), "translation21_mm"))
-        object.__setattr__(self, "board_index", as_indices(self.board_index, (n,), "board_index"))
+        keep_arrays(self, points_mm=(t, n, 3), normals=(t, None, 3), rotation21=(t, 3, 3), translation21_mm=(t, 3))
+        keep_indices(self, board_index=(n,))
 
     def __len__(self) -> int:
         return len(self.points_mm)

@@ -9,6 +9,7 @@ import numpy as np
 from rigkit.calibration.displaced import lens_modes
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -59,9 +60,7 @@ def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
         covariance=np.zeros((p, p)),
         sigma_px=1.0,
     )
-    width, height = camera.size_px
-    u, v = np.meshgrid(*(np.linspace(0.0, side - 1.0, n) for side, n in zip((width, height), TASK_CELLS, strict=True)))
-    rays, valid = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+    rays, valid = camera.unproject(grid_pixels(camera.size_px, TASK_CELLS).reshape(-1, 2))
     _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=False))
     if not seen.any():
         raise DegenerateError(

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
@@ -52,9 +53,8 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
             f"certificate: one camera measures no {task.quantity}; give a rig, or a length at a known distance"
         )
     first = instrument.cameras[0]
-    width, height = first.size_px
-    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, cells[0]), np.linspace(0.0, height - 1.0, cells[1]))
-    pixels = np.stack([u, v], axis=-1)
+    pixels = grid_pixels(first.size_px, cells)
+    shape = pixels.shape[:2]
     rays, valid = first.unproject(pixels.reshape(-1, 2))
     points, weights = measured_points(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]), task, instrument.is_rig)
     by_corner, by_calibration, farthest, seen = gradients(instrument, points, weights)
@@ -71,14 +71,14 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     # Radians become degrees only here.
     factor = np.rad2deg(1.0) if task.quantity is Quantity.ANGLE else 1.0
     sigma = {
-        cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(u.shape)
+        cause: np.where(seen, factor * np.sqrt(value[chosen, worst]), np.nan).reshape(shape)
         for cause, value in variance.items()
     }
     quantile = _quantile(sigma, instrument.freedom, task.confidence)
     bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
-    uncertain = quantile * instrument.sigma_px * farthest.reshape(u.shape) > MAX_SHARE * task.size_mm
-    in_view = seen.reshape(u.shape)
+    uncertain = quantile * instrument.sigma_px * farthest.reshape(shape) > MAX_SHARE * task.size_mm
+    in_view = seen.reshape(shape)
     certificate = Certificate(
         task=task,
         instrument=instrument,
