@@ -110,16 +110,12 @@ class RectifyMap:
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the columns and rows (h, w) of the camera's image that the target's pixels come from, as cv2.remap
         takes them; -1 where the camera does not see."""
-        source, seen = self._sources()
-        source = np.where(seen[..., None], source, -1.0).astype(np.float32)
-        return np.ascontiguousarray(source[..., 0]), np.ascontiguousarray(source[..., 1])
-
-    def _sources(self) -> tuple[Pixels, BoolArray]:
-        """Return where each pixel (h, w) of the target comes from, and whether the camera sees it."""
         columns, rows = self.target.size_px
-        grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
-        source, valid = self.source_pixels(grid)
-        return source, valid & self.camera.on_image(source)
+        u, v = np.full((2, rows, columns), -1.0, dtype=np.float32)
+        for band, ((source, seen),) in self._sampled_bands(1):
+            part = slice(band[0], band[-1] + 1)
+            u[part][seen], v[part][seen] = source.T
+        return u, v
 
     def _sampled_bands(self, samples: int) -> Iterator[_Band]:
         """Yield the rows of each band of the target, and for each of its samples where they come from."""

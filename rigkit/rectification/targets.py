@@ -12,7 +12,11 @@ from rigkit.core.errors import InputError
 from rigkit.rectification.panorama import Cylindrical, Equirectangular
 
 Projection = Literal["perspective", "cylindrical", "equirectangular"]
-PROJECTIONS: tuple[Projection, ...] = ("perspective", "cylindrical", "equirectangular")
+PROJECTIONS: dict[Projection, type[Camera]] = {
+    "perspective": Pinhole,
+    "cylindrical": Cylindrical,
+    "equirectangular": Equirectangular,
+}
 
 WIDEST_RAD = {"perspective": np.radians(170.0), "cylindrical": 2.0 * np.pi, "equirectangular": 2.0 * np.pi}
 DEFAULT_RAD = {"perspective": np.radians(100.0), "cylindrical": np.pi, "equirectangular": 2.0 * np.pi}
@@ -60,10 +64,7 @@ def target_camera(
     if width < 1 or height < 1:
         raise InputError(f"image size {width} x {height}: width and height must be positive")
     size = (width, height)
-    parameters = np.array([focal, focal, *image_center(size)])
-    if perspective:
-        return Pinhole(size, parameters)
-    return Cylindrical(size, parameters) if projection == "cylindrical" else Equirectangular(size, parameters)
+    return PROJECTIONS[projection](size, np.array([focal, focal, *image_center(size)]))
 
 
 def field_across(camera: Camera) -> float:

@@ -37,6 +37,11 @@ OTHER_CHAIN = "other chain"
 CROSS_COVERAGE = 4.0
 """A data set of eight pairs makes a hundred and fifty comparisons: at four sigmas one such data set in a hundred has a
 false alarm, at three every third, at two each."""
+TOLD = (
+    *("name", "rotation_difference_deg", "direction_difference_deg", "baseline_mm"),
+    *("rms_px", "variance_factor", "used", "excluded"),
+)
+"""What `crosscheck.json` has of a method, beside its angles."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -108,32 +113,27 @@ class CrossCheckReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers, strings and lists; NaN becomes None."""
-        return {
+        out: dict[str, Any] = {
             "schema": "rigkit.crosscheck/1",
             "pair": self.pair_id,
             "affine_method": self.affine_method,
             "passed": self.passed,
             "methods": [
-                {
-                    "name": method.name,
-                    "rotation_difference_deg": method.rotation_difference_deg,
-                    "direction_difference_deg": method.direction_difference_deg,
-                    "baseline_mm": method.baseline_mm,
+                {name: getattr(method, name) for name in TOLD}
+                | {
                     "angles_deg": [
-                        {"a": a, "b": b, "angle": angle, "sigma": sigma if np.isfinite(sigma) else None}
+                        {"a": a, "b": b, "angle": angle, "sigma": sigma}
                         for (a, b), (angle, sigma) in method.angles_deg.items()
-                    ],
-                    "rms_px": method.rms_px if np.isfinite(method.rms_px) else None,
-                    "variance_factor": method.variance_factor if np.isfinite(method.variance_factor) else None,
-                    "used": method.used,
-                    "excluded": method.excluded,
+                    ]
                 }
                 for method in self.methods
             ],
-            "checks": [without_nan(asdict(check)) for check in self.checks],
-            "skipped": list(self.skipped),
-            "diagnosis": list(self.diagnosis),
+            "checks": [asdict(check) for check in self.checks],
+            "skipped": self.skipped,
+            "diagnosis": self.diagnosis,
         }
+        cleaned: dict[str, Any] = without_nan(out)
+        return cleaned
 
     def to_json(self) -> str:
         """Return `to_dict()` as JSON text."""
