@@ -74,8 +74,8 @@ def corners_figure(reconstruction: Reconstruction, image1: NDArray[Any], image2:
     figure, axes = pair_axes(image1, image2)
     for axis, pixels in zip(axes, (reconstruction.pixels1, reconstruction.pixels2), strict=True):
         _draw_boards(axis, reconstruction, pixels)
-    axes[0].set_title(f"{reconstruction.pair_id}: corners, view 1", fontsize=9)
-    axes[1].set_title("view 2 (ring: first corner)", fontsize=9)
+    axes[0].set_title(f"{reconstruction.pair_id}: corners, view 1", fontsize=9, y=1.0)
+    axes[1].set_title("view 2 (ring: first corner)", fontsize=9, y=1.0)
     return figure
 
 
@@ -114,8 +114,8 @@ def epipolar_figure(
         axis.set_xlim(-0.5, camera.size_px[0] - 0.5)
         axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
     rms = reconstruction.sampson_rms_px
-    axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9)
-    axes[1].set_title("view 2 (each curve passes through its corner)", fontsize=9)
+    axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9, y=1.0)
+    axes[1].set_title("view 2 (each curve passes through its corner)", fontsize=9, y=1.0)
     return figure
 
 
