@@ -6,7 +6,6 @@ import base64
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.report.render import render
@@ -22,6 +21,8 @@ GAP = 2.0
 
 def build_cloud_page(title: str, cloud: OrientedCloud, provenance: Mapping[str, str], *, unit: str) -> str:
     """Return the page of a cloud of at least two points as text; lengths are in `unit`."""
+    from scipy.spatial import cKDTree
+
     shown = cloud.select(np.arange(len(cloud)) % (1 + (len(cloud) - 1) // MAX_DRAWN) == 0)
     middle = np.median(shown.points_mm, axis=0)
     reach = float(np.quantile(np.linalg.norm(shown.points_mm - middle, axis=1), REACH_QUANTILE)) or 1.0

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
@@ -125,6 +124,8 @@ class _Reduction:
     """From sub-samples to pixels: one matrix along each axis, shared by all tiles of an image."""
 
     def __init__(self, optics: Optics) -> None:
+        from scipy.sparse import csr_array
+
         self.step = 1.0 / optics.supersample
         self.count = optics.supersample
         self.reach = optics.reach_px

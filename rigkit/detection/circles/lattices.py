@@ -10,9 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs
@@ -61,6 +58,9 @@ class _Links:
 
 def blob_lattices(blobs: Blobs) -> list[LabelledBlobs]:
     """Return the lattices of `blobs`, in no particular order; a blob is in one at most."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     if len(blobs) < MIN_LABELLED:
         return []
     links = _links(blobs)
@@ -79,6 +79,9 @@ def blob_lattices(blobs: Blobs) -> list[LabelledBlobs]:
 
 
 def _links(blobs: Blobs) -> _Links:
+    from scipy.sparse import coo_array
+    from scipy.spatial import cKDTree
+
     near = min(NEAREST_BLOBS + 1, len(blobs))
     _, index = cKDTree(blobs.pixels).query(blobs.pixels, k=near)
     source, target = np.repeat(np.arange(len(blobs)), near - 1), index[:, 1:].ravel()
@@ -141,6 +144,8 @@ def _labelled(blobs: Blobs, links: _Links) -> LabelledBlobs | None:
 
 def _triangular(source: IntArray, target: IntArray, count: int) -> bool:
     """Return whether most links are sides of triangles, as in a hexagonal lattice; in a square one none is."""
+    from scipy.sparse import coo_array
+
     linked = coo_array((np.ones(len(source)), (source, target)), shape=(count, count)).tocsr()
     sides = (linked @ linked).multiply(linked)
     return bool(2 * sides.nnz > linked.nnz)

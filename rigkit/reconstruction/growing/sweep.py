@@ -15,8 +15,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rigkit.affine.refine_patches import MIN_CONTRAST
 from rigkit.affine.surface import linear_gauge
@@ -232,6 +230,9 @@ def _believed(level: FloatArray, good: BoolArray, grown: FloatArray) -> BoolArra
 
     A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     number = np.arange(level.size).reshape(level.shape)
     links = []
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
