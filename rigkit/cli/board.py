@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("board: a measured print belongs to a board file; give BOARD.toml instead of a size")
         board = Board("board", int(size[1]), int(size[2]), args.square_mm, args.square_mm, pattern=_pattern(args))
     elif args.charuco or args.marker_mm is not None or args.first_marker or args.legacy:
-        raise InputError("board: a board file says itself what markers it has; give a size such as 9x6 with --charuco")
+        raise InputError("board: --charuco needs a size such as 9x6; a board file states its markers already")
     elif measured:
         return _store_measured(args)
     if args.output is None:

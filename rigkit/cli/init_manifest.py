@@ -29,7 +29,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     from rigkit.workflows.new_manifest import NewManifest, find_pairs, write_manifest
 
     if args.model:
-        raise InputError("init: --model is of --session")
+        raise InputError("init: --model goes with --session only; leave it out")
     if args.board and args.square_mm is not None:
         raise InputError("init: --board says how large squares are; leave --square-mm out")
     told = told_boards(args.board)

@@ -61,7 +61,7 @@ def calibrate_sources(
                 f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file"
             )
         raise InputError(
-            f"calibrate: '{first}' says itself what board and model it has; leave out --board, --square-mm and --model"
+            f"calibrate: '{first}' states its board and model already; leave out --board, --square-mm and --model"
         )
     return calibrate_session_file(first, options, progress=progress)
 

@@ -68,13 +68,13 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
         first = next(iter(rig.cameras))
         if first not in names:
             raise InputError(
-                f"'{session.known_rig}': its first camera, '{first}', is none of {', '.join(names)}; give the one "
-                "that it is that id"
+                f"'{session.known_rig}': its first camera, '{first}', is none of {', '.join(names)}; give that camera "
+                "this id"
             )
         if len(mounted) == len(names):
             raise InputError(
-                f"'{session.known_rig}' has all cameras already ({', '.join(names)}); there is none to add; "
-                "name a new one"
+                f"'{session.known_rig}' has all cameras already ({', '.join(names)}), so there is none to add; "
+                "give the images of a new one, too"
             )
     cameras: dict[str, tuple[Camera, Rigid3 | None]] = {name: rig.cameras[name] for name in mounted}
     alone: dict[str, FloatArray | None] = {}

@@ -144,7 +144,7 @@ def _download(url: str, path: Path, expected: str | None) -> None:
         pooch.retrieve(url, expected and f"sha256:{expected}", fname=path.name, path=path.parent)
     except (requests.RequestException, OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{url} cannot be fetched: {reason}; look whether the address still holds") from error
+        raise InputError(f"{url} cannot be fetched: {reason}; check whether the address is still right") from error
 
 
 def _write(data: bytes, source: str, path: Path, expected: str | None) -> None:
