@@ -53,7 +53,8 @@ def is_scene(args: argparse.Namespace) -> bool:
         raise InputError("reconstruct: give either a DATASET, or --images A B or --correspondences FILE with --camera")
     if scene and not (args.camera or args.rig):
         raise InputError(
-            "reconstruct: a scene needs --camera CALIB, a calibration file such as `rigkit calibrate` writes, or --rig"
+            "reconstruct: a scene needs --camera CALIB, a calibration file such as `rigkit calibrate` writes from "
+            "pictures of a board with the same zoom and focus, or --rig"
         )
     return scene
 

@@ -115,7 +115,8 @@ def epipolar_figure(
         axis.set_ylim(camera.size_px[1] - 0.5, -0.5)
     rms = reconstruction.sampson_rms_px
     axes[0].set_title(f"{reconstruction.pair_id}: epipolar curves, Sampson rms {rms:.3f} px", fontsize=9, y=1.0)
-    axes[1].set_title("view 2 (each curve passes through its corner)", fontsize=9, y=1.0)
+    passed = "corner" if reconstruction.boards else "point"
+    axes[1].set_title(f"view 2 (each curve passes through its {passed})", fontsize=9, y=1.0)
     return figure
 
 

@@ -11,21 +11,34 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.reconstruction.scene import SceneReconstruction
 from rigkit.report.figures import as_png, pair_axes
 
+POINTS_PER_INCH = 72.0
+DENSE_SIDE = 4.0
+"""Of the square of a page, in its points, that a correspondence has to itself; ringed dots would cover smaller ones."""
+
 
 def normals_png(
     scene: SceneReconstruction, found: Correspondences, image1: NDArray[Any], image2: NDArray[Any]
 ) -> bytes:
-    """Draw the points over both images, coloured by their normals; grey crosses: correspondences that do not fit.
+    """Draw the points over both images, coloured by their normals; grey: correspondences that do not fit.
 
-    Red, green and blue stand for the parts of the normal to the right, upwards and towards camera 1.
+    Red, green and blue stand for the parts of the normal to the right, upwards and towards camera 1. Few points are
+    ringed dots; a dense cloud is a picture of normals, whose points touch each other.
     """
     figure, axes = pair_axes(image1, image2)
+    on_page = POINTS_PER_INCH * figure.get_figwidth() * axes[0].get_position().width / image1.shape[1]
+    area = float(np.prod(np.ptp(found.pixels1, axis=0))) / max(1, len(found))
+    side = on_page * np.sqrt(area)
+    dense = side < DENSE_SIDE
     colours = np.clip(0.5 + 0.5 * scene.reconstruction.cloud.normals * [1.0, -1.0, -1.0], 0.0, 1.0)
     for axis, pixels in zip(axes, (found.pixels1, found.pixels2), strict=True):
         out = pixels[~scene.inliers]
-        axis.scatter(out[:, 0], out[:, 1], s=14, marker="x", color="0.6", linewidths=0.8)
         at = pixels[scene.kept]
-        axis.scatter(at[:, 0], at[:, 1], s=26, c=colours, edgecolors="white", linewidths=0.5)
+        if dense:
+            axis.scatter(*out.T, s=side**2 / 4.0, marker="s", color="0.6", linewidths=0.0)
+            axis.scatter(*at.T, s=side**2, marker="s", c=colours, linewidths=0.0)
+        else:
+            axis.scatter(*out.T, s=14, marker="x", color="0.6", linewidths=0.8)
+            axis.scatter(*at.T, s=26, c=colours, edgecolors="white", linewidths=0.5)
     agree = f"{int(scene.inliers.sum())} of {len(found)} correspondences agree"
     axes[0].set_title(f"{scene.reconstruction.pair_id}: {agree}", fontsize=9)
     axes[1].set_title("colour: normal (red right, green up, blue towards camera 1)", fontsize=9)
