@@ -15,7 +15,7 @@ from rigkit.benchmark.corner_bound import corner_information, position_bound
 from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, three_boards
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.subpixel.board_window import Surroundings, extended
-from rigkit.detection.subpixel.whole_board import fit_whole_board
+from rigkit.detection.subpixel.whole_board import MAX_TILE, fit_whole_board
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 
@@ -116,3 +116,16 @@ def test_steps_beyond_the_corners_go_on_in_proportion() -> None:
     assert longer.shape == (7, 8, 2)
     assert longer[3, :, 0] == pytest.approx(100.0 * 0.8 ** np.arange(-2, 6))
     assert longer[:, 3, 1] == pytest.approx(30.0 + 10.0 * np.arange(7))
+
+
+def test_a_long_board_is_placed_in_tiles(rng: np.random.Generator) -> None:
+    truth = even((6, 2 * MAX_TILE - 5), 16.0)
+    light = picture(truth, 2.5)
+    image = np.clip(np.rint(light + rng.normal(0.0, 2.0, light.shape)), 0, 255).astype(np.uint8)
+    (found,) = detect_boards(image)
+    assert len(found.grid) == truth[..., 0].size
+    off = np.linalg.norm(found.pixels[:, None] - truth.reshape(-1, 2), axis=2).min(axis=1)
+    ratio = off / (np.sqrt(2.0) * found.sigma_px)
+    assert HONEST[0] < np.sqrt(np.mean(ratio**2)) < HONEST[1]
+    # Corners by themselves have 0.033 px here, all together 0.020.
+    assert np.sqrt(np.mean(off**2)) < 0.026
