@@ -170,3 +170,13 @@ def test_a_wall_too_dull_for_patches_is_not_as_near_as_the_card_before_it(monkey
     assert before > 500
     assert (near & (outside > BESIDE_PX)).sum() < 0.05 * before
     assert (outside < -BESIDE_PX).sum() > 0.95 * (all_outside < -BESIDE_PX).sum()
+
+
+def test_no_light_falls_around_the_circle_of_a_fisheye_but_does_on_its_dark_spots() -> None:
+    v, u = np.indices((240, 320))
+    around = np.hypot(u - 160.0, v - 120.0) > 110.0
+    spot = np.hypot(u - 180.0, v - 100.0) < 12.0
+    rng = np.random.default_rng(3)
+    image = np.where(around | spot, 0.0, 120.0) + rng.uniform(0.0, 5.0, around.shape)
+    lit = sweep_module._lit(GrowingView.of(image.astype(np.uint8), LENSES["fisheye"]))
+    np.testing.assert_array_equal(lit == 0.0, around)

@@ -47,6 +47,8 @@ SMALLEST_UNSEEN = 120
 """The same where no patch agrees, as beside many edges of depth."""
 MAX_MISFIT_LEVELS = 1.0
 """By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
+UNLIT_LEVELS = 8.0
+"""Grey levels where no light falls: noise and compression."""
 RIVAL_RADIUS = 5.0
 """Samples: the reach of a patch."""
 ALIKE_LEVELS = 10.0
@@ -131,7 +133,7 @@ def filled(
         sweep.costs, len(sweep.inverse), sweep.samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
     )
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
-    good &= _at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST
+    good &= (_at(_contrast(view1), sweep.pixels1) > MIN_CONTRAST) & (_at(_lit(view1), sweep.pixels1) == 1.0)
     spacing = sweep.inverse[1] - sweep.inverse[0]
     of_grown = np.full(level.shape, np.nan)
     of_grown[::SAMPLES_A_NODE, ::SAMPLES_A_NODE] = (measured.z[..., 0] - sweep.inverse[0]) / spacing
@@ -199,6 +201,14 @@ def _contrast(view: GrowingView) -> NDArray[np.float32]:
     image, side = np.asarray(view.grey, np.float32), (2 * HALF_WIDTH + 1,) * 2
     variance = cv2.blur(image * image, side) - cv2.blur(image, side) ** 2
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)), np.float32)
+
+
+def _lit(view: GrowingView) -> NDArray[np.float32]:
+    """Return 1 at the pixels that the lens reaches and 0 at those as dark as the sensor's border around its circle."""
+    dark = np.asarray(view.grey) <= UNLIT_LEVELS
+    _, label = cv2.connectedComponents(dark.astype(np.uint8))
+    border = np.unique(np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]]))
+    return np.asarray(~np.isin(label, border[border > 0]), np.float32)
 
 
 def _winners(
