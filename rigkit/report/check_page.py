@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import without_nan
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import HistoryEntry
 from rigkit.report import svg
@@ -145,10 +145,7 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
         "units": [] if change is None else list(change.cause.units),
         "size_px": None if change is None else change.size_px,
         **{name: getattr(check, name) for name in ("cost", "cost_unit", "rms_px", "rms_fixed_px", "expected_px")},
-        "powers": [
-            asdict(power) | {"found_from": power.found_from if math.isfinite(power.found_from) else None}
-            for power in check.powers
-        ],
+        "powers": [without_nan(asdict(power)) for power in check.powers],
         "page": check_facts(check).to_dict(),
     }
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import Pixels
+from rigkit.core.arrays import Pixels, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.tables import Column, Table, cells
 from rigkit.geometry.rigid3 import Rigid3
@@ -44,7 +44,7 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     return {
         "goal": plan.goal.what,
         "unit": plan.goal.unit,
-        "error_now": plan.error if np.isfinite(plan.error) else None,
+        "error_now": without_nan(plan.error),
         "views": [
             {
                 "board": view.board.board_id,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.arrays import without_nan
 from rigkit.core.claims import Comparison, Verdict, judge_claim
 from rigkit.core.errors import InputError
 from rigkit.study.study import STUDY_PLANES, Claim, Study
@@ -67,13 +68,8 @@ class StudyTable:
     def to_dict(self) -> dict[str, Any]:
         verdicts = [asdict(v) | {"verdict": v.words} for v in self.verdicts]
         study = self.study.to_dict() | {"unit": self.study.unit}
-        cells = [{key: _number(value) for key, value in asdict(c).items()} for c in self.cells]
+        cells = without_nan([asdict(c) for c in self.cells])
         return {"schema": "rigkit.study_result/1", "study": study, "cells": cells, "claims": verdicts}
-
-
-def _number(value: Any) -> Any:
-    """Return the value as JSON can hold it: no number where there is none."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def tabulate(study: Study, chunks: Sequence[NDArray[np.float32]]) -> StudyTable:

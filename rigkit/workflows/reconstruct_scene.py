@@ -17,6 +17,7 @@ from rigkit.affine.from_points import are_rough, with_affinities
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import without_nan
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
@@ -131,7 +132,7 @@ class SceneResult:
             "cam2_from_cam1": r.cam2_from_cam1.matrix().tolist(),
             "pose_covariance": None if r.pose_covariance is None else r.pose_covariance.tolist(),
             "sigma_px": self.scene.sigma_px,
-            "sigma_A": self.scene.sigma_A if np.isfinite(self.scene.sigma_A) else None,
+            "sigma_A": without_nan(self.scene.sigma_A),
             "sampson_rms_px": r.sampson_rms_px,
             "notes": list(r.notes),
         }

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Pixels
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
@@ -163,11 +163,7 @@ class Certificate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what a program needs to know; angles in degrees, places out of view as None."""
-        task, unit = self.task, self.task.unit
-
-        def listed(values: FloatArray) -> list[list[float | None]]:
-            return [[float(x) if np.isfinite(x) else None for x in row] for row in values]
-
+        task = self.task
         return {
             "schema": "rigkit.certificate/1",
             "quantity": str(task.quantity),
@@ -175,7 +171,7 @@ class Certificate:
             "distance_mm": task.distance_mm,
             "confidence": task.confidence,
             "cameras": list(self.instrument.names),
-            "unit": unit,
+            "unit": task.unit,
             "worst": self.worst,
             "median": self.median,
             "in_view": float(self.in_view.mean()),
@@ -183,8 +179,8 @@ class Certificate:
             "findings": [str(finding) for finding in self.findings],
             "u_px": self.pixels[0, :, 0].tolist(),
             "v_px": self.pixels[:, 0, 1].tolist(),
-            "bound": listed(self.bound),
-            "sigma": {cause: listed(sigma) for cause, sigma in self.sigma.items()},
+            "bound": without_nan(self.bound.tolist()),
+            "sigma": {cause: without_nan(sigma.tolist()) for cause, sigma in self.sigma.items()},
         }
 
     def __repr__(self) -> str:
