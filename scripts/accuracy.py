@@ -182,6 +182,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--chain", choices=("raw", "rectified"), default="raw")
     args = parser.parse_args()
+    if not any(args.folder.glob("captures/*/truth.json")):
+        parser.error(f"no captures/PAIR/truth.json in '{args.folder}'; give the folder that holds lab-a's truth")
     result = measure(args.folder, chain=args.chain)
     print(
         "| pair | corners | corner rms, px | actual / predicted sigma | orthogonality, deg | normals, deg | baseline |"

@@ -56,15 +56,17 @@ def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFix
     assert "beyond the limit" in capsys.readouterr().out
 
 
-def test_the_result_for_programs(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["certify", str(rig), "--depth", "50", "--distance", "900", "--json"]) == 0
+@pytest.mark.parametrize("quantity", ["depth", "plane", "angle"])
+def test_the_result_for_programs(quantity: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["certify", str(rig), f"--{quantity}", "50", "--distance", "900", "--json"]
+    assert main(command) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["quantity"] == "depth"
+    assert told["quantity"] == quantity
     assert told["cameras"] == ["left", "right"]
     assert told["passed"] is None
     bounds = [value for row in told["bound"] for value in row if value is not None]
     assert max(bounds) == told["worst"]
-    assert main(["certify", str(rig), "--depth", "50", "--distance", "900", "--json", "--sigma-px", "0.5"]) == 0
+    assert main([*command, "--sigma-px", "0.5"]) == 0
     assert json.loads(capsys.readouterr().out)["median"] > told["median"]
 
 

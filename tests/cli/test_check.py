@@ -78,6 +78,7 @@ def test_a_patterned_box_in_the_room_is_no_board(home: Path, capsys: pytest.Capt
     assert json.loads(capsys.readouterr().out)["rms_px"] < 0.05
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
 def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -107,6 +107,12 @@ def test_markers_far_into_a_dictionary_are_told() -> None:
     assert guess.board.pattern.first_marker == 600 and guess.board.size == (8, 5)
 
 
+def test_circles_are_told_where_there_are_no_squares() -> None:
+    board = Board("b", 5, 4, 60.0, 60.0, pattern=Circles(diameter_mm=30.0))
+    guess = guess_board([shown(board)])
+    assert guess is not None and guess.board.pattern.type == "circles" and sorted(guess.board.size) == [4, 5]
+
+
 def shown(board: Board) -> GreyImage:
     rng = np.random.default_rng(0)
     scene = one_board(rng, board=board, max_tilt_deg=35.0)
