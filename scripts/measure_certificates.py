@@ -116,7 +116,7 @@ def rig_trial(
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=model, degree=5 if model == "brown" else None, folds=0)
     names = ("left", "right")
-    known, covariance = rig.with_departures()
+    known, covariance = rig.with_departures
     found = instrument_of_rig(
         names,
         known,

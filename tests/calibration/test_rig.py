@@ -227,7 +227,7 @@ def test_transfer_follows_the_covariance(rng: np.random.Generator) -> None:
     assert seen.all()
     pixel = rig.cameras[1].camera.project(first)[0]
     length = np.linalg.norm(first, axis=1, keepdims=True)
-    lenses, known = rig.with_departures()
+    lenses, known = rig.with_departures
     assert len(known) > len(rig.covariance)
     ends = np.cumsum([0, *(camera.parameters.size for camera in lenses)])
 
@@ -408,7 +408,7 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
     saved = load_saved_rig(path)
     for own, back in zip(rig.departures, saved.departures, strict=True):
         assert (own.modes == back.modes).all() and (own.moves == back.moves).all()
-    lenses, _ = rig.with_departures()
+    lenses, _ = rig.with_departures
     instrument = load_instrument(path, ("reg", "fish"))
     assert [c.parameters.size for c in instrument.cameras] == [lenses[k].parameters.size for k in (0, 2)]
     assert instrument.intrinsic_count > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))

@@ -20,6 +20,7 @@ from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import pose_jacobians
 from rigkit.calibration.rig.state import Layout, RigObservations
+from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -32,8 +33,9 @@ def assemble_rig(
     joint: JointRig,
     places: Places,
     heldout: tuple[float | None, tuple[float | None, ...]],
-) -> RigCalibration:
-    """Return the rig; `heldout` is the error of frames that took no part, over all cameras and of each.
+) -> tuple[RigCalibration, list[FarProjection]]:
+    """Return the rig, and how sure the projection of each of its cameras is; `heldout` is the error of frames that took
+    no part, over all cameras and of each.
 
     Raises DegenerateError where there are fewer corners than unknowns.
     """
@@ -66,7 +68,8 @@ def assemble_rig(
     last = layout.mounts[-1] or layout.cameras[-1]
     # One ruler has measured all boards: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
-    return RigCalibration(
+    far = [FarProjection.of(camera.calibration) for camera in cameras]
+    rig = RigCalibration(
         cameras=tuple(cameras),
         rms_px=float(np.sqrt(everything.mean())),
         heldout_rms_px=heldout[0],
@@ -80,12 +83,10 @@ def assemble_rig(
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
-        departures=tuple(
-            lens_modes(observations, joint.solution, c, camera.calibration, last.stop)
-            for c, camera in enumerate(cameras)
-        ),
+        departures=lens_modes(observations, joint.solution, far, last.stop),
         board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale),
     )
+    return rig, far
 
 
 def _of_camera(

@@ -89,8 +89,8 @@ def calibrate_rig(
         seen = named
     joint = solve_jointly(list(views), seen, single, places, progress, known)
     heldout = heldout_rms(joint, folds)
-    rig = assemble_rig(list(views), single, joint, places, heldout)
-    return replace(rig, verdicts=judge_rig(rig, (*notes, *joint.notes), in_force=options.in_force))
+    rig, far = assemble_rig(list(views), single, joint, places, heldout)
+    return replace(rig, verdicts=judge_rig(rig, far, (*notes, *joint.notes), in_force=options.in_force))
 
 
 def _require_entries(views: Views, **given: object) -> None:

@@ -6,15 +6,16 @@ mounts move along with a lens's displacements: globals follow by the rig's norma
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rigkit.calibration.displaced import LensModes, telling_modes
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.solver import RigSolution, pose_jacobians
-from rigkit.calibration.rig.state import RigObservations
+from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
@@ -23,14 +24,24 @@ from rigkit.kernels.departures import displacements
 
 
 def lens_modes(
-    observations: RigObservations, solution: RigSolution, c: int, calibration: Calibration, count: int
+    observations: RigObservations, solution: RigSolution, far: Sequence[FarProjection], count: int
+) -> tuple[LensModes, ...]:
+    """Return what each lens may do beyond its model, and how the first `count` globals, intrinsics and mounts, are off;
+    `far` are the cameras' projections as the rig has them."""
+    n, normal = solution.state.layout(observations).shape.start, solution.normal
+    if n < len(normal.g):
+        normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
+    each = (telling_modes(one) for one in far)
+    return tuple(_of_camera(observations, solution.state, normal, c, modes, count) for c, modes in enumerate(each))
+
+
+def _of_camera(
+    observations: RigObservations, state: RigState, normal: NormalEquations, c: int, modes: FloatArray, count: int
 ) -> LensModes:
-    """Return what the lens of camera `c`, with its calibration as the rig has it, may do beyond its model, and how the
-    first `count` globals, intrinsics and mounts, are off."""
-    modes = telling_modes(FarProjection.of(calibration))
+    """Return how the first `count` globals are off with the modes (J, M) of the lens of camera `c`; `normal` are the
+    rig's equations without the boards' shape."""
     if not modes.size:
         return LensModes(modes, np.zeros((count, 0)))
-    state, normal = solution.state, solution.normal
     layout = state.layout(observations)
     alone, own, f = state.of_camera(c, observations), observations.cameras[c], observations.frame[c]
     n = layout.shape.start
@@ -45,7 +56,7 @@ def lens_modes(
             by_globals[run] += (np.swapaxes(how[views], -1, -2) @ by_own[views]).sum(axis=0)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
     np.add.at(by_pose, f, np.swapaxes(by.target, -1, -2) @ by_own)
-    inverse, back, _ = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None).covariance
+    inverse, back, _ = normal.covariance
     moves = -inverse @ (by_globals - np.tensordot(back, by_pose, axes=((0, 1), (0, 1))))
     return LensModes(modes, moves[:count])
 
@@ -62,5 +73,6 @@ def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatA
     )
     by_point, by_parameters = (np.where(used[..., None, None], by, 0.0) for by in (by_point, by_parameters))
     by_view = np.concatenate([-by_point @ skew(lever), by_point], axis=-1)
-    of_views = np.einsum("vcik,vcim->vkm", by_view, moved)
-    return np.einsum("vcip,vcim->pm", by_parameters, moved), of_views
+    views, count = len(weight), modes.shape[1]
+    of_views = np.swapaxes(by_view.reshape(views, -1, 6), 1, 2) @ moved.reshape(views, -1, count)
+    return by_parameters.reshape(-1, by_parameters.shape[-1]).T @ moved.reshape(-1, count), of_views

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class RigCamera:
         return self.calibration.rms_px
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RigCalibration:
     """A calibrated rig.
 
@@ -132,9 +133,10 @@ class RigCalibration:
         variance += sum(float(((row @ own.moves) ** 2).sum()) for own in self.departures)
         return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
 
+    @cached_property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray]:
-        """Return the cameras, with what their lenses may do beyond their models as further parameters, and the
-        covariance of these, camera by camera, and of the mounts."""
+        """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
+        these, camera by camera, and of the mounts."""
         cameras = tuple(c.camera for c in self.cameras)
         return with_modes(cameras, self.covariance, self.departures) if self.departures else (cameras, self.covariance)
 

@@ -23,9 +23,10 @@ MANY_LEFT_OUT = 0.2
 
 
 def judge_rig(
-    rig: RigCalibration, notes: Sequence[Finding] = (), *, in_force: Collection[str] = ()
+    rig: RigCalibration, far: Sequence[FarProjection], notes: Sequence[Finding] = (), *, in_force: Collection[str] = ()
 ) -> tuple[Finding, ...]:
-    """Return the verdicts, the headline first; `notes` are verdicts found elsewhere, `in_force` as for `judge`."""
+    """Return the verdicts, the headline first; `far` are the cameras' projections, `notes` verdicts found elsewhere,
+    `in_force` as for `judge`."""
     causes = [
         *_not_converged(rig),
         *notes,
@@ -34,7 +35,7 @@ def judge_rig(
         *_overdispersed(rig, in_force),
         *_few_shared(rig),
     ]
-    return tuple(with_headline(rig, causes, _unsure(rig)))
+    return tuple(with_headline(rig, causes, _unsure(rig, far)))
 
 
 def _look(message: str, remedy: str | None = None) -> Finding:
@@ -75,10 +76,10 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
     ]
 
 
-def _unsure(rig: RigCalibration) -> list[Finding]:
+def _unsure(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
     out = []
-    for camera in rig.cameras:
-        worst = FarProjection.of(camera.calibration).worst_px
+    for camera, projection in zip(rig.cameras, far, strict=True):
+        worst = projection.worst_px
         if worst > UNSURE_PX:
             out.append(
                 _bad(
