@@ -91,7 +91,7 @@ MAX_TILE, OVERLAP = 14, 2
 """Larger boards are fitted in tiles of so many rows and columns, which share some: the time grows with the cube."""
 
 MAX_RESIDUAL = 1.25
-"""The picture of the board may leave so much more than the corners by themselves do, which have ten times as many
+"""The picture of the board may leave so much more than the corners by themselves do, which have four times as many
 unknowns. It leaves more where there are marks in the squares, or a hand on them."""
 
 
