@@ -47,7 +47,8 @@ def test_a_check(capsys: pytest.CaptureFixture[str]) -> None:
         codes.append(main([*CHECK, *images, "--json"]))
         said = capsys.readouterr()
         words.append(json.loads(said.out))
-    assert codes == [1, 1] and words[0]["chance"] == words[1]["chance"]
+    # Nothing contradicts it, but not all could be looked at.
+    assert codes == [0, 2] and words[0]["chance"] == words[1]["chance"]
     assert "pairs/bad.png" in said.err and len(words[1]["unreadable"]) == 1
     assert main([*CHECK, "pairs/bad.png"]) == 2 and "bad.png" in capsys.readouterr().err
 
