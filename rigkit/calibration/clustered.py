@@ -113,7 +113,7 @@ def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
     # Frobenius' norm bounds the eigenvalues of M. Where it is well below one, powers of M take less than all of those.
     small = (size < MAX_FOR_SERIES) & (pull.shape[1] > MAX_FOR_EIGENVALUES)
     if small.any():
-        bound = float(size[small].max())
+        bound = max(float(size[small].max()), RANK)
         fall = (1.0 - np.sqrt(1.0 - bound)) / (1.0 + np.sqrt(1.0 - bound))
         count = max(1, int(np.log(SERIES_LEFT_OUT) / np.log(fall)))
         # Interpolated at the zeros of the first polynomial left out.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 
+from rigkit.calibration import clustered
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import clustered_covariance, with_block
@@ -113,3 +114,21 @@ def test_what_follows_the_block(rng: np.random.Generator) -> None:
     assert with_block(covariance, covariance[:4, :4], 1.0) == pytest.approx(covariance, rel=1e-6)
     # Twice the block and twice the rest is twice the whole.
     assert with_block(covariance, 2.0 * covariance[:4, :4], 2.0) == pytest.approx(2.0 * covariance, rel=1e-6)
+
+
+def test_many_unknowns_have_the_covariance_of_all_eigenvalues(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Clusters of little leverage take a series; one has so much that it does not."""
+    count = 40
+    rows = rng.normal(size=(30, 60, count)) * np.where(np.arange(30) == 7, 4.0, 1.0)[:, None, None]
+    information = np.swapaxes(rows, 1, 2) @ rows
+    score = np.einsum("vrn,vr->vn", rows, rng.normal(size=(30, 60)))
+    prior = np.eye(count)
+    unit = np.linalg.inv(information.sum(axis=0) + prior)
+    by_series = clustered_covariance(unit, information, score, prior, 1.0)
+    monkeypatch.setattr(clustered, "MAX_FOR_EIGENVALUES", count)
+    by_eigenvalues = clustered_covariance(unit, information, score, prior, 1.0)
+    assert by_series.overdispersion == pytest.approx(by_eigenvalues.overdispersion, rel=1e-10)
+    scale = np.abs(by_eigenvalues.covariance).max()
+    assert by_series.covariance == pytest.approx(by_eigenvalues.covariance, abs=1e-10 * scale)
