@@ -65,6 +65,11 @@ def check_words(check: SentinelCheck) -> CheckWords:
             f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
             "are left."
         )
+    if not check.holds and len(check.watched.cameras) > 1:
+        sentences.append(
+            "Moved since, or never held? Pictures of the time of the calibration tell: where they alarm alike, the "
+            "file never fitted these cameras so well; calibrate anew."
+        )
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
         sentences.append(_could_have_found(worst))
