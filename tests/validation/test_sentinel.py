@@ -272,6 +272,9 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
     few = _matches(MOUNT, np.random.default_rng(0))
     near = (few.pixels1 < [800.0, 600.0]).all(axis=1) & (few.pixels1 > [406.0, 310.0]).all(axis=1)
     assert check_matches(_rig(), [PairMatches(0, 1, few.pixels1[near], few.pixels2[near])]).corners == near.sum() > 20
+    # A mount that is said to be exact.
+    exact = replace(_rig(), covariance=np.diag([*np.array(LENS_SIGMAS) ** 2, *np.array(LENS_SIGMAS) ** 2, *[0.0] * 6]))
+    assert check_matches(exact, [few]).holds
     with pytest.raises(DegenerateError, match="none of the matches"):
         check_matches(_rig(), [PairMatches(0, 1, np.full((50, 2), np.nan), np.full((50, 2), np.nan))])
 

@@ -154,7 +154,8 @@ def _unexplained(residual: FloatArray, jacobian: FloatArray, mount: slice) -> tu
     # what lies out after the best change of the mount alone, which bends little.
     weight = _weights(residual, sigma)
     for part in (mount, slice(None)):
-        left, weight, sigma = _fitted(residual, jacobian[:, part], weight)
+        if jacobian[:, part].any():
+            left, weight, sigma = _fitted(residual, jacobian[:, part], weight)
     return left, weight, max(sigma, MIN_SIGMA_PX)
 
 
