@@ -221,7 +221,7 @@ def test_a_spoiled_paper_table_is_refused(tmp_path: Path) -> None:
     for name in ("planes.csv", "baselines.csv"):
         shutil.copy(PAPER / name, tmp_path / name)
     for text, words in (
-        ("a,b\nx,1,2\n", "line 2 has 3 cells"),
+        ("a,b\nx,1,2\n", "line 2: 3 cells"),
         ("a,b\nx,one\n", "'one' is not a number"),
         ("a,b\n", "no rows"),
     ):
