@@ -279,6 +279,19 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
         check_matches(_rig(), [PairMatches(0, 1, np.full((50, 2), np.nan), np.full((50, 2), np.nan))])
 
 
+def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
+    """A mount known to 0.06 degrees only: matches are off by many times their scatter, as the calibration says."""
+    sigmas = np.array([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-3] * 3, *[0.01] * 3])
+    unsure = replace(_rig(), covariance=np.diag(sigmas**2))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        turn = 1e-3 * rng.standard_normal(3)
+        moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+        check = check_matches(unsure, [_matches(moved, rng)])
+        assert check.holds and not check.unexplained
+        assert check.rms_px < 3.0 * check.expected_px
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.random.Generator) -> None:
     # Good matches, and a turn that moves them by many times their noise.

@@ -35,7 +35,7 @@ ALARM_PX = 0.07
 FIX_ROUNDS = 3
 """Times that a change is linearised anew where it was found."""
 WILD = 3.0
-"""Corners that scatter so many times as much as the calibration's after every explanation are explained by none."""
+"""Corners that scatter so many times as much as expected after every explanation are explained by none."""
 MAX_SIGMA = 100.0
 """Percent, pixels, degrees, millimetres: what is known no better is not seen at all."""
 RARE = {"lens": 6.0, "moved": 6.0}
@@ -90,7 +90,7 @@ class SentinelCheck:
     watched, fixed : as calibrated, and after `change`.
     step, covariance : change of theta (T,), and its covariance (T, T).
     rms_px, rms_fixed_px : of the fresh corners before and after.
-    expected_px : rms that corners should have.
+    expected_px : rms that corners of unchanged cameras show, with what the calibration leaves open.
     frames, corners : how many there were.
     tried : every cause by itself, the simplest first.
     powers : how well changes of lenses and turns of mounts would have been seen; what is missing was not seen at all.
@@ -161,7 +161,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         covariance=covariance,
         rms_px=evidence.rms_px,
         rms_fixed_px=after.rms_px,
-        expected_px=evidence.expected_px,
+        expected_px=_expected_px(watched, evidence),
         frames=len(evidence.score),
         corners=evidence.corners,
         tried=tuple(known),
@@ -169,6 +169,12 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
+
+
+def _expected_px(watched: Watched, evidence: FreshEvidence) -> float:
+    """Return the rms that corners of unchanged cameras show: their scatter, and what the calibration leaves open."""
+    shown = evidence.information.sum(axis=0) / evidence.corners
+    return float(np.sqrt(evidence.expected_px**2 + max(0.0, float((shown * watched.covariance).sum()))))
 
 
 def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
