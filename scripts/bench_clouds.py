@@ -274,8 +274,8 @@ def main() -> None:
                 print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
             shares = [mesh_share(c, case.cameras[0], truth[0]) for c in (cloud, with_lines_of_sight(cloud))]
             print(
-                f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * shares[0]:.0f} % of true pixels, "
-                f"{100 * shares[1]:.0f} % with lines of sight, as `rigkit mesh` makes it"
+                f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * shares[0]:.1f} % of true pixels, "
+                f"{100 * shares[1]:.1f} % with lines of sight, as `rigkit mesh` makes it"
             )
     areas = [f"{100 * np.mean(np.maximum(1.0 - np.array(errors) / limit, 0.0)):.1f}" for limit in AUC_DEG]
     # A pose that is exact has no sigmas.

@@ -19,6 +19,7 @@ from scipy.special import fdtrc
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import GOAL_GRID, Goal
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
@@ -138,8 +139,14 @@ def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None 
 def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
     evidence = look(watched)
-    whitened = Whitened.of(watched, evidence)
-    known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
+    expected_px, known = _expected_px(watched, evidence), list[Change]()
+    try:
+        whitened = Whitened.of(watched, evidence)
+        known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
+    except DegenerateError:
+        # Pictures of something else are far from all that can be linearised: that is the verdict.
+        if not evidence.rms_px > max(WILD * expected_px, ALARM_PX):
+            raise
     step, covariance, change, chance = np.zeros(watched.size), watched.covariance, None, 1.0
     fixed, after = watched, evidence
     if known:
@@ -161,7 +168,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         covariance=covariance,
         rms_px=evidence.rms_px,
         rms_fixed_px=after.rms_px,
-        expected_px=_expected_px(watched, evidence),
+        expected_px=expected_px,
         frames=len(evidence.score),
         corners=evidence.corners,
         tried=tuple(known),
@@ -212,7 +219,10 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     fixed = watched.changed(change.cause.directions @ amounts)
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
-        again = _fitted(Whitened.of(fixed, after), change.cause)
+        try:
+            again = _fitted(Whitened.of(fixed, after), change.cause)
+        except DegenerateError:
+            again = None
         if again is None:
             break
         closer = watched.changed(change.cause.directions @ (amounts + again.amounts))

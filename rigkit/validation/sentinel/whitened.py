@@ -39,13 +39,14 @@ class Whitened:
     def of(cls, watched: Watched, evidence: FreshEvidence) -> Whitened:
         information = evidence.information.sum(axis=0) / evidence.variance_px2
         score = evidence.score.sum(axis=0) / evidence.variance_px2
-        if not np.isfinite(information).all():
+        # Scaled to a unit diagonal: parameters differ by many powers of ten.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        scaled = information * scale[:, None] * scale
+        if not np.isfinite(scaled).all():
             raise DegenerateError(
                 "check: the pictures and the lens do not go together; check the calibration's numbers"
             )
-        # Scaled to a unit diagonal: parameters differ by many powers of ten.
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+        values, vectors = np.linalg.eigh(scaled)
         seen = values > NULL_RANK * values[-1]
         root = np.sqrt(values[seen])
         left = vectors[:, seen] * root / scale[:, None]
