@@ -75,7 +75,7 @@ class HistoryEntry:
             source=source.name,
             holds=check.holds,
             chance=check.chance,
-            verdict="holds" if check.holds else str(check.change),
+            verdict="holds" if check.holds else str(check.change or "nothing that moved explains it"),
             frames=check.frames,
             rms_px=check.rms_px,
             temperature_c=temperature_c,

@@ -28,8 +28,8 @@ from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.report.check_page import check_page, check_words, history_page
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
-from rigkit.validation.sentinel.evidence import FreshView, Watched
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views, judge_evidence
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
@@ -279,11 +279,33 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
         check_matches(_rig(), [PairMatches(0, 1, np.full((50, 2), np.nan), np.full((50, 2), np.nan))])
 
 
+def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Path) -> None:
+    rig = _rig()
+    far = FreshEvidence(
+        information=np.full((1, rig.size, rig.size), np.inf),
+        score=np.full((1, rig.size), np.inf),
+        variance_px2=0.01,
+        rms_px=50.0,
+        expected_px=0.1,
+        corners=100,
+        left_out=0,
+        overdispersion=1.0,
+        freedom=10.0,
+    )
+    check = judge_evidence(rig, lambda _: far)
+    assert check.unexplained and not check.holds and check.change is None
+    assert "nothing that moved explains it" in check_words(check).headline
+    assert HistoryEntry.of_check(check, tmp_path).verdict == "nothing that moved explains it"
+    # Where nothing is off, it is the calibration's numbers that are.
+    with pytest.raises(DegenerateError, match="calibration's numbers"):
+        judge_evidence(rig, lambda _: replace(far, rms_px=0.1))
+
+
 def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
     """A mount known to 0.06 degrees only: matches are off by many times their scatter, as the calibration says."""
     sigmas = np.array([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-3] * 3, *[0.01] * 3])
     unsure = replace(_rig(), covariance=np.diag(sigmas**2))
-    for seed in range(4):
+    for seed in range(9):
         rng = np.random.default_rng(seed)
         turn = 1e-3 * rng.standard_normal(3)
         moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)

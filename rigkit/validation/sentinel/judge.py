@@ -117,7 +117,7 @@ class SentinelCheck:
     @property
     def unexplained(self) -> bool:
         """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
-        return self.rms_fixed_px > max(WILD * self.expected_px, ALARM_PX)
+        return _wild(self.rms_fixed_px, self.expected_px)
 
     @property
     def holds(self) -> bool:
@@ -125,6 +125,11 @@ class SentinelCheck:
         if self.unexplained:
             return False
         return self.change is None or self.chance >= ALARM_CHANCE or self.change.size_px < ALARM_PX
+
+
+def _wild(rms_px: float, expected_px: float) -> bool:
+    """Say whether residuals are beyond all that is expected; those that are no numbers are."""
+    return not rms_px <= max(WILD * expected_px, ALARM_PX)
 
 
 def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None = None) -> SentinelCheck:
@@ -139,15 +144,16 @@ def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None 
 def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
     evidence = look(watched)
-    expected_px, known = _expected_px(watched, evidence), list[Change]()
+    expected_px, known, chance = _expected_px(watched, evidence), list[Change](), 1.0
     try:
         whitened = Whitened.of(watched, evidence)
         known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
     except DegenerateError:
         # Pictures of something else are far from all that can be linearised: that is the verdict.
-        if not evidence.rms_px > max(WILD * expected_px, ALARM_PX):
+        if not _wild(evidence.rms_px, expected_px):
             raise
-    step, covariance, change, chance = np.zeros(watched.size), watched.covariance, None, 1.0
+        chance = 0.0
+    step, covariance, change = np.zeros(watched.size), watched.covariance, None
     fixed, after = watched, evidence
     if known:
         chance = _chance_of_any(whitened, known)
@@ -172,7 +178,9 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         frames=len(evidence.score),
         corners=evidence.corners,
         tried=tuple(known),
-        powers=powers_of(watched, evidence, [c.cause for c in known], ALARM_CHANCE),
+        powers=()
+        if _wild(after.rms_px, expected_px)
+        else powers_of(watched, evidence, [c.cause for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
@@ -181,7 +189,10 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
 def _expected_px(watched: Watched, evidence: FreshEvidence) -> float:
     """Return the rms that corners of unchanged cameras show: their scatter, and what the calibration leaves open."""
     shown = evidence.information.sum(axis=0) / evidence.corners
-    return float(np.sqrt(evidence.expected_px**2 + max(0.0, float((shown * watched.covariance).sum()))))
+    # Pictures of something else may be too far off for any derivative: they say nothing of that.
+    with np.errstate(over="ignore", invalid="ignore"):
+        left_open = float((shown * watched.covariance).sum())
+    return float(np.sqrt(evidence.expected_px**2 + (max(left_open, 0.0) if np.isfinite(left_open) else 0.0)))
 
 
 def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:

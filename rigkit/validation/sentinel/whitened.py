@@ -41,7 +41,8 @@ class Whitened:
         score = evidence.score.sum(axis=0) / evidence.variance_px2
         # Scaled to a unit diagonal: parameters differ by many powers of ten.
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        scaled = information * scale[:, None] * scale
+        with np.errstate(over="ignore", invalid="ignore"):
+            scaled = information * scale[:, None] * scale
         if not np.isfinite(scaled).all():
             raise DegenerateError(
                 "check: the pictures and the lens do not go together; check the calibration's numbers"
