@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -148,12 +148,14 @@ def require_size(given_px: tuple[int, int], what: str, size_px: tuple[int, int],
 @contextmanager
 def quiet_opencv() -> Iterator[None]:
     """Keep OpenCV's own lines off stderr: what is wrong is said once, in one line, by the error that follows."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # OpenCV 5 moved the two functions; 0 is silence in both.
+    log: Any = cv2.utils.logging if hasattr(cv2.utils, "logging") else cv2
+    level = log.getLogLevel()
+    log.setLogLevel(0)
     try:
         yield
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        log.setLogLevel(level)
 
 
 def _fault(data: bytes) -> str | None:

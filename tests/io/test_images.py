@@ -10,7 +10,7 @@ import PIL.Image
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.images import quiet_opencv, read_image, to_grey
 
 
 @pytest.fixture
@@ -174,3 +174,16 @@ def test_damaged_directories_of_a_tiff_end_in_words(
     end = start + 2 + 12 * entries
     (tmp_path / "b.tif").write_bytes(data[:end] + start.to_bytes(4, "little") + data[end + 4 :])
     np.testing.assert_array_equal(read_image(tmp_path / "b.tif"), colour)
+
+
+def test_opencv_is_quiet_in_either_of_its_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV 4 has the two functions at its top, OpenCV 5 in a module of their own."""
+    levels = [3]
+    for name in ("getLogLevel", "setLogLevel"):
+        monkeypatch.setattr(
+            cv2, name, {"getLogLevel": lambda: levels[-1], "setLogLevel": levels.append}[name], raising=False
+        )
+    monkeypatch.delattr(cv2.utils, "logging", raising=False)
+    with quiet_opencv():
+        assert levels[-1] == 0
+    assert levels[-1] == 3

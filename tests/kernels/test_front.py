@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.detection_scenes import corner_scene, fisheye, regular
+from helpers.opencv import exact_interpolation
 from helpers.real_images import real_images
 from kernels.reference import front as reference
 
@@ -136,6 +137,7 @@ def test_peaks_beyond_float32_are_the_strongest(
         assert np.array_equal(infinite[0], infinite[1])
 
 
+@exact_interpolation
 @pytest.mark.parametrize("name", NAMES)
 def test_corners(name: str, in_numpy: Callable[..., tuple[Corners, saddle.Saddles]]) -> None:
     levels = pyramid(grey_image(_images()[name]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from helpers.opencv import exact_interpolation
 from kernels.reference import paper as reference
 
 from rigkit.core.arrays import FloatArray
@@ -33,6 +34,7 @@ def board(rng: np.random.Generator, blur_px: float, margin: float) -> tuple[Floa
     return np.clip(image, 0.0, 255.0), corners
 
 
+@exact_interpolation
 @pytest.mark.parametrize("blur_px", [1.0, 2.5, 4.0])
 @pytest.mark.parametrize("margin", [190.0, 110.0, 20.0])
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])

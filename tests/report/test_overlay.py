@@ -8,6 +8,9 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.report.overlay import OVERLAY_COLOURS, draw_boards
 
+INK_LEVELS = 60
+"""From the colour of a label: OpenCV 4 draws hairlines whose ink is nowhere full."""
+
 
 def test_rows_are_drawn_through_the_corners() -> None:
     board = Board("a", 4, 3, 30.0, 30.0)
@@ -31,6 +34,6 @@ def test_the_label_stays_inside_the_image() -> None:
         pixels = 10.0 * board.grid() + [column, 100.0]
         found = BoardDetection("a", 4, 3, board.grid(), pixels, np.full(12, 0.01))
         label = draw_boards(np.full((150, 300), 60, np.uint8), [found])[70:93]
-        ink.append(int((label == OVERLAY_COLOURS[0]).all(axis=-1).sum()))
+        ink.append(int((np.abs(label - np.asarray(OVERLAY_COLOURS[0], float)).max(axis=-1) < INK_LEVELS).sum()))
     assert ink[0] > 20
     assert ink[1] == ink[0]
