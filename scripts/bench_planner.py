@@ -4,7 +4,8 @@ Simulated: five lenses, every board held where the planner asks within a human's
 2 % of it sideways), beside boards held anyhow and beside a fixed pattern of twelve. Counted are the frames until the
 true error of the projection, over the image and after the best rotation, is that of the free session's median at its
 end. Real: of the images of a capture the planner chooses some, beside as many at random; error is the distance to the
-calibration from all images.
+calibration from all images. Beside it stands plain greedy choice by the book, and what these figures would be if the
+covariance were exactly true.
 
     python scripts/bench_planner.py [--seeds 20] [--lens NAME ...] [--real [--data DIR] [--cache DIR] [--draws 40]]
 """
@@ -19,10 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from split_halves import load
+from planner.real import GRID, REAL, Row, real, together
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -31,18 +31,14 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
-from rigkit.planning.plan import choose_views, covariance_of, exchanged_views, plan_views
+from rigkit.planning.plan import plan_views
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.scene import PlacedBoard
-
-Options = tuple[str, int | None, str]
-"""A camera model, its size, and what is assumed of the board."""
 
 SIZE = (1280, 960)
 BOARD = Board("b", 9, 6, 25.0, 25.0)
@@ -51,12 +47,6 @@ FREE_FRAMES = 20
 FIRST_FRAMES = 3
 """Before so many there is no calibration: the planner goes by a guess of the lens that is 10 % wrong."""
 HELD_DEG, HELD_DISTANCE, HELD_SIDEWAYS = 5.0, 0.05, 0.02
-GRID = (40, 30)
-FEW_IMAGES = 12
-"""Of so few half are chosen."""
-REAL = ("caliper", "camodocal", "ov-plane", "charuco-stereo-left", "charuco-stereo-right")
-EXCHANGES = 2
-"""Rounds, each with the lens as the images taken so far show it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +102,13 @@ def by_hand(pose: Rigid3, board: Board, rng: np.random.Generator) -> PlacedBoard
     return PlacedBoard(board, Rigid3(rotation, moved - rotation @ middle))
 
 
-def free_poses(lens: Lens, rng: np.random.Generator) -> Iterator[PlacedBoard]:
+def free_poses(lens: Lens, rng: np.random.Generator, board: Board = BOARD) -> Iterator[PlacedBoard]:
     """Yield boards as people hold them: mostly around the middle, near and far, moderately tilted."""
     width, height = lens.camera.size_px
     while True:
         spot = np.array([0.5 * width, 0.5 * height]) + np.array([0.22 * width, 0.22 * height]) * rng.standard_normal(2)
-        square_px = height * rng.uniform(0.35, 0.9) / np.hypot(BOARD.columns + 1, BOARD.rows + 1)
-        placed = place_board(BOARD, lens.camera, spot, square_px, 40.0, rng)
+        square_px = height * rng.uniform(0.35, 0.9) / np.hypot(board.columns + 1, board.rows + 1)
+        placed = place_board(board, lens.camera, spot, square_px, 40.0, rng)
         if placed is not None and sees_paper(placed, lens.camera, (0.0, 0.0), lens.camera.size_px):
             yield placed
 
@@ -244,99 +234,6 @@ def simulate(name: str, seeds: int) -> None:
         print(f"    {kind:8s} median error after 4, 6, 8, 10, 12, 20: {np.round(e[[3, 5, 7, 9, 11, 19]], 3).tolist()}")
 
 
-def choose_images(
-    views: list[BoardView], size: tuple[int, int], how: Options, start: list[int], count: int, covered: np.ndarray
-) -> list[int]:
-    """Return which images to take: `start`, then what the planner chooses of those at hand, one by one, for the pixels
-    `covered` by any of them; last those taken before the lens was known are exchanged where others help more."""
-    taken = list(start)
-    while len(taken) < count:
-        calibration = of_images(views, taken, size, how)
-        left = [i for i in range(len(views)) if i not in taken]
-        if calibration is None:
-            taken.append(left[0])
-            continue
-        knowledge = Knowledge.of(calibration)
-        information = np.array([of_image(view, knowledge) for view in (views[i] for i in left)])
-        goal = projection_goal(calibration.camera, pixels=covered)
-        taken.append(left[choose_views(knowledge.information, information, goal, 1)[0][0]])
-    for _ in range(EXCHANGES):
-        calibration = of_images(views, taken, size, how)
-        if calibration is not None:
-            known = Knowledge.unseen(calibration)
-            information = np.array([of_image(view, known) for view in views])
-            goal = projection_goal(calibration.camera, pixels=covered)
-            taken = exchanged_views(known.information, information, goal, taken)
-    return taken
-
-
-def of_image(view: BoardView, knowledge: Knowledge) -> np.ndarray:
-    """Return what an image would tell, as far as the lens is known: nothing where the lens does not see its corners."""
-    rays, valid = knowledge.camera.unproject(view.pixels)
-    points = view.points()
-    try:
-        pose = board_pose(rays[valid], points[valid]).cam_from_board
-    except RigkitError:
-        return np.zeros_like(knowledge.information)
-    held = HeldBoards(points, pose.rotation[None], pose.translation_mm[None], valid[None])
-    return knowledge.of_views(held, view.board.board_id)[0]
-
-
-def of_images(views: list[BoardView], chosen: list[int], size: tuple[int, int], how: Options) -> Calibration | None:
-    model, degree, board = how
-    try:
-        return calibrate([views[i] for i in chosen], size, model=model, degree=degree, board=board, folds=0)
-    except RigkitError:
-        return None
-
-
-def real(name: str, data: Path, cache: Path, draws: int) -> None:
-    """Choose among the images of a real capture, and calibrate as anybody would: boards as they are found to be."""
-    found, size = load(name, data, cache)
-    views = [view for own in found.values() for view in own[:1]]
-    full = calibrate(views, size)
-    camera = full.camera
-    how = (camera.model, camera.parameters.size - 4 if type(camera).orders else None, "auto")
-    mask = covered_by_boards(full, grid_pixels(size, GRID))
-    covered = grid_pixels(size, GRID)[mask]
-
-    def errors(chosen: list[int]) -> list[float]:
-        """Where boards were, over the whole image, and what the covariance promises."""
-        part = of_images(views, chosen, size, how)
-        found = [np.inf] * 2
-        if part is not None:
-            found = [compare_cameras(camera, part.camera, grid=GRID, mask=m).rms_px for m in (mask, None)]
-        return [*found, promised(chosen)]
-
-    known = Knowledge.unseen(full)
-    information, goal = np.array([of_image(view, known) for view in views]), projection_goal(camera, pixels=covered)
-    whole = float(goal.error(covariance_of(known.information + information.sum(axis=0))))
-
-    def promised(chosen: list[int]) -> float:
-        """Of the distance to the calibration from all, which has the covariance C_chosen - C_all."""
-        own = float(goal.error(covariance_of(known.information + information[chosen].sum(axis=0))))
-        return float(np.sqrt(max(own**2 - whole**2, 0.0)))
-
-    for count in (8, 10) if len(views) > FEW_IMAGES else (len(views) // 2,):
-        rng = np.random.default_rng(count)
-        anyhow = [rng.choice(len(views), count, replace=False).tolist() for _ in range(draws)]
-        free, free_whole, free_promised = np.array([errors(c) for c in anyhow]).T
-        starts = [rng.choice(len(views), 2, replace=False).tolist() for _ in range(max(draws // 4, 4))]
-        chosen = [choose_images(views, size, how, start, count, covered) for start in starts]
-        own, own_whole, own_promised = np.array([errors(c) for c in chosen]).T
-        better, better_whole = (
-            100.0 * np.mean([np.mean(f > e) for e in o]) for f, o in ((free, own), (free_whole, own_whole))
-        )
-        print(
-            f"{name:20s} {camera.model}, board {full.boards[0].kind}, {count:2d} of {len(views)}: planner "
-            f"{np.median(own):.3f} px, random {np.median(free):.3f}, ratio {np.median(own) / np.median(free):.2f} "
-            f"(promised {np.median(own_promised) / np.median(free_promised):.2f}); better than {better:.0f} % of "
-            f"random choices; over the whole image {np.median(own_whole) / np.median(free_whole):.2f}, "
-            f"{better_whole:.0f} %",
-            flush=True,
-        )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
@@ -348,8 +245,10 @@ def main() -> None:
     args = parser.parse_args()
     if args.real is not None:
         args.cache.mkdir(parents=True, exist_ok=True)
+        rows: dict[str, list[Row]] = {}
         for name in args.real or REAL:
-            real(name, args.data, args.cache, args.draws)
+            real(name, args.data, args.cache, args.draws, rows)
+        together(rows)
         return
     for name in args.lens:
         simulate(name, args.seeds)

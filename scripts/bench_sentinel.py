@@ -1,9 +1,9 @@
 """Does the sentinel alarm when something moved, name what, and keep quiet otherwise?
 
-lens, rig: simulated corners. Cameras calibrated from planned views, checked with three fresh ones held by hand where
-`rigkit plan --check` asks (rigs: where the planner asks for a lens of which nothing is known). Changes leave 0.15 px
+lens, rig: simulated corners. Cameras calibrated from planned views, checked with three fresh ones: held by hand where
+`rigkit plan --check` asks ("advised"), and lenses also with three as people take them ("free"). Changes leave 0.15 px
 rms over the image after the best rotation; mounts turn by 0.02 degrees. Beside what was found stands what no test could
-find more often: the change in its own direction, known before.
+find more often: the change in its own direction, known before. `--board` takes another board for all of it.
 rendered: pictures of all five lenses, detected; three or half of them are checked against the rest, and three pictures
 after a change.
 scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
@@ -11,6 +11,7 @@ pairs: real pairs of textured scenes whose cameras and pose are known; the pose 
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
     python scripts/bench_sentinel.py [lens] [rig] [rendered] [scene] [pairs] [real] [--seeds 20] [--lens NAME ...]
+        [--board 9x6x25]
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import bench_planner
 import numpy as np
-from bench_planner import BOARD, LENSES, Lens, by_hand, free_poses, see
+from bench_planner import LENSES, Lens, by_hand, free_poses, see
 from scipy.special import ndtr, ndtri
 from sentinel.captures import SAID, left_out, real
 from sentinel.scenes import pairs
 from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
+from split_halves import identified
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -54,6 +57,8 @@ from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.validation.sentinel.whitened import Whitened
 
+BOARD = bench_planner.BOARD
+"""Another by `--board`."""
 TURNED_DEG, STRETCHED = 0.02, 1.003
 VIEWS = 16
 RENDERED_PLANNED, RENDERED_FREE = 16, 12
@@ -72,6 +77,16 @@ def fresh_poses(lens: Lens, known: Calibration, rng: np.random.Generator) -> lis
     """Return where boards are held for a check: where they tell changes best, as well as hands do."""
     plan, _ = views_that_tell(watched_camera(known, "camera"), [BOARD], FRESH, Reach(field_deg=lens.field_deg))
     return [by_hand(view.cam_from_board, BOARD, rng).world_from_board for view in plan.views]
+
+
+def fresh_rig_poses(lens: Lens, watched: Watched, rng: np.random.Generator) -> list[Rigid3]:
+    """Return where boards are held for a check of a rig, in its frame."""
+    plan, _ = views_that_tell(watched, [BOARD], FRESH, Reach(field_deg=lens.field_deg))
+    return [
+        watched.cam_from_rig[watched.names.index(view.seen_by[0])].inverse()
+        @ by_hand(view.cam_from_board, BOARD, rng).world_from_board
+        for view in plan.views
+    ]
 
 
 def seen(camera: Camera, pose: Rigid3, name: str, noise_px: float, rng: np.random.Generator) -> BoardView | None:
@@ -114,22 +129,29 @@ def known_of(lens: Lens, views: Sequence[BoardView]) -> Calibration:
 
 def one_camera(name: str, seeds: int, noise_px: float) -> None:
     lens = LENSES[name]
-    found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", *KINDS)}
-    most: dict[str, list[float]] = {what: [] for what in KINDS}
-    for seed in range(seeds):
-        rng = np.random.default_rng([seed, 11])
-        known = known_of(lens, views_of(lens.camera, held(lens, VIEWS, rng), noise_px, rng))
+    for how in ("advised", "free"):
+        found: dict[str, list[SentinelCheck]] = {what: [] for what in ("nothing", *KINDS)}
+        most: dict[str, list[float]] = {what: [] for what in KINDS}
+        for seed in range(seeds):
+            rng = np.random.default_rng([seed, 11])
+            known = known_of(lens, views_of(lens.camera, held(lens, VIEWS, rng), noise_px, rng))
+            anyhow = free_poses(lens, rng, BOARD)
+            for what, checks in found.items():
+                camera = changed(lens, what, rng)
+                poses = (
+                    fresh_poses(lens, known, rng)
+                    if how == "advised"
+                    else [next(anyhow).world_from_board for _ in range(FRESH)]
+                )
+                views = views_of(camera, poses, noise_px, rng)
+                checks.append(checked(known, views))
+                if what in most:
+                    most[what].append(best_chance(known, views, camera.parameters - lens.camera.parameters))
         for what, checks in found.items():
-            camera, poses = changed(lens, what, rng), fresh_poses(lens, known, rng)
-            views = views_of(camera, poses, noise_px, rng)
-            checks.append(checked(known, views))
+            tell(f"{name}, {how}: {what}", checks, what, how)
             if what in most:
-                most[what].append(best_chance(known, views, camera.parameters - lens.camera.parameters))
-    for what, checks in found.items():
-        tell(f"{name}: {what}", checks, what)
-        if what in most:
-            print(f"   no test finds it more often than {np.mean(most[what]):.2f}")
-            BEST.extend(most[what])
+                print(f"   no test finds it more often than {np.mean(most[what]):.2f}")
+                BEST.setdefault(how, []).extend(most[what])
 
 
 def best_chance(known: Calibration, views: Sequence[BoardView], change: FloatArray) -> float:
@@ -142,8 +164,8 @@ def best_chance(known: Calibration, views: Sequence[BoardView], change: FloatArr
     return float(ndtr(size - limit) + ndtr(-size - limit))
 
 
-BEST: list[float] = []
-"""Of changes of simulated lenses, the chance with which the best test finds them."""
+BEST: dict[str, list[float]] = {}
+"""Of changes of simulated lenses, the chance with which the best test finds them, advised and free."""
 
 
 def stereo(seeds: int, noise_px: float, name: str) -> None:
@@ -154,16 +176,17 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 13])
 
-        def frames(count: int, second: Camera, pose: Rigid3, rng: np.random.Generator = rng) -> list[FreshView]:
-            poses = held(lens, count, rng)
+        def frames(
+            poses: Sequence[Rigid3], second: Camera, mount: Rigid3, rng: np.random.Generator = rng
+        ) -> list[FreshView]:
             both = [
-                (f"{k:02d}", c, seen(own, mount @ board, f"{k:02d}", noise_px, rng))
+                (f"{k:02d}", c, seen(own, pose @ board, f"{k:02d}", noise_px, rng))
                 for k, board in enumerate(poses)
-                for c, (own, mount) in enumerate(((camera, Rigid3.identity()), (second, pose)))
+                for c, (own, pose) in enumerate(((camera, Rigid3.identity()), (second, mount)))
             ]
             return [FreshView(frame, c, view) for frame, c, view in both if view is not None]
 
-        watched = watched_rig(frames(VIEWS, camera, MOUNT), camera)
+        watched = watched_rig(frames(held(lens, VIEWS, rng), camera, MOUNT), camera)
         turn = exp_so3(np.radians(TURNED_DEG) * unit(rng.standard_normal(3)))
         poses = {
             "rotation": Rigid3(turn @ MOUNT.rotation, turn @ MOUNT.translation_mm),
@@ -171,7 +194,8 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
         }
         for what, checks in found.items():
             second = changed(lens, what, rng)
-            checks.append(check_views(watched, frames(FRESH, second, poses.get(what, MOUNT))))
+            fresh = fresh_rig_poses(lens, watched, rng)
+            checks.append(check_views(watched, frames(fresh, second, poses.get(what, MOUNT))))
     for what, checks in found.items():
         tell(f"rig {name}: {what}", checks, what)
 
@@ -273,7 +297,9 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.03, help="of a simulated corner per coordinate, px")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
+    parser.add_argument("--board", type=identified, default=BOARD, metavar="CxRxMM", help="default 9x6x25")
     args = parser.parse_args()
+    globals()["BOARD"] = args.board
     args.cache.mkdir(parents=True, exist_ok=True)
     work: dict[str, list[Callable[[], None]]] = {
         "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
@@ -290,7 +316,8 @@ def main() -> None:
         for what, (alarms, count, right) in TALLY.items():
             print(f"== {kind}: {what}: {alarms} of {count} alarm, {right} named rightly", flush=True)
         if kind == "lens":
-            print(f"== lens: the best test of all would find {np.mean(BEST):.3f} of the changes")
+            for how, best in BEST.items():
+                print(f"== lens: the best test of all would find {np.mean(best):.3f} of the changes ({how} pictures)")
         if kind == "real":
             print(f"== real: changes were said to be found with chance {np.mean(SAID):.2f}")
             left_out()

@@ -22,7 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
     parser.add_argument(
-        "--check", action="store_true", help="pictures to check it with: those that would tell changes of the lens"
+        "--check",
+        action="store_true",
+        help="pictures to check it (or a rig.json) with: those that would tell changes best",
     )
     parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")
@@ -71,7 +73,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
     if args.check and (args.lens is not None or args.length is not None):
-        raise InputError("plan: --check is about the lens of a calibration; leave --lens and --length away")
+        raise InputError("plan: --check is about a calibration or a rig; leave --lens and --length away")
     if args.lens is None:
         told = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
         if told:

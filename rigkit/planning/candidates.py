@@ -90,6 +90,12 @@ def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | 
     return HeldBoards(points, rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
 
 
+def sees_held(camera: Camera, board: Board, rotation: FloatArray, translation_mm: Points, reach: Reach) -> BoolArray:
+    """Say in which of C poses cam_from_board a camera sees all of a board, and plainly."""
+    paper = _in_cam(outline_mm(board), rotation, translation_mm)
+    return _inside(camera, paper, reach.field_deg) & _plain(camera, board, rotation, translation_mm)
+
+
 def _even(count: int, dimensions: int) -> FloatArray:
     """Return `count` places that fill the unit cube evenly: multiples of the powers of the generalised golden ratio.
 

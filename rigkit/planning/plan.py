@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
@@ -26,11 +27,14 @@ WORTH = 1e-3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
-    """A view to take: where to hold the board, and the error of the goal once it is taken."""
+    """A view to take: where to hold the board before `camera`, and the error of the goal once it is taken. Of a rig,
+    `seen_by` are the cameras that see it, the one that it is told of first."""
 
     board: Board
     cam_from_board: Rigid3
     error: float
+    camera: Camera
+    seen_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -80,22 +84,24 @@ def choose_views(
     effort : returns how far all views (C,) are from view j, or (-1) from the last one taken before: of views nearly as
         good the nearest is taken. None: the best is.
     nearly : so good are those whose gain and whose error are within this part of the best one's.
+
+    Raises DegenerateError where numbers are no real ones.
     """
     left, taken, errors = np.arange(len(views)), [], []
     last = -1
     for _ in range(min(count, len(views))):
         before = float(goal.error(covariance_of(information)))
         after = goal.error(covariance_of(information + views[left]))
+        best = float(after.min())
+        if not np.isfinite(best):
+            raise DegenerateError(
+                "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
+                "calibrate again"
+            )
         if effort is None:
             pick = int(np.argmin(after))
         else:
-            best = float(after.min())
             good = np.flatnonzero(after <= best + nearly * min(before - best, best))
-            if not good.size:
-                raise DegenerateError(
-                    "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
-                    "calibrate again"
-                )
             pick = int(good[np.argmin(effort(last)[left[good]])])
         last = int(left[pick])
         information = information + views[last]
@@ -163,7 +169,7 @@ def plan_views(
     owner = np.repeat(np.arange(len(boards)), [len(h) for h in held])
     translation = np.concatenate([h.translation_mm for h in held])
     proposals = [
-        Proposal(boards[owner[i]], Rigid3(rotation[i], translation[i]), error)
+        Proposal(boards[owner[i]], Rigid3(rotation[i], translation[i]), error, knowledge.camera)
         for i, error in zip(taken, errors, strict=True)
     ]
     return Plan(knowledge, goal, float(goal.error(covariance_of(knowledge.information))), tuple(proposals))

@@ -29,12 +29,15 @@ MAX_DOTS = 1500
 
 def plan_words(plan: Plan) -> list[str]:
     """Return one line a view, the error after it last."""
-    camera, unit = plan.knowledge.camera, plan.goal.unit
-    several = len({v.board.board_id for v in plan.views}) > 1
+    unit, several = plan.goal.unit, len({v.board.board_id for v in plan.views}) > 1
     lines = []
     for number, view in enumerate(plan.views, start=1):
         which = f" (board '{view.board.board_id}')" if several else ""
-        where = str(placement(camera, view.board, view.cam_from_board))
+        where = str(placement(view.camera, view.board, view.cam_from_board))
+        if view.seen_by:
+            own, *others = (f"'{name}'" for name in view.seen_by)
+            also = f"; {' and '.join(others)} {'sees' if len(others) == 1 else 'see'} it, too" if others else ""
+            where = f"before camera {own}: {where}{also}"
         lines.append(f"{number}. {where}{which}: {view.error:.3g} {unit} then")
     return lines
 
@@ -58,7 +61,8 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
                 "words": str(where),
                 "error_then": view.error,
             }
-            for view, where in ((v, placement(plan.knowledge.camera, v.board, v.cam_from_board)) for v in plan.views)
+            | ({"camera": view.seen_by[0], "seen_by": list(view.seen_by)} if view.seen_by else {})
+            for view, where in ((v, placement(v.camera, v.board, v.cam_from_board)) for v in plan.views)
         ],
     }
 
@@ -78,7 +82,8 @@ def plan_table(plan: Plan) -> Table:
 
 def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
     """Draw the board as it should be seen, over the corners (N, 2) that were taken so far."""
-    view, camera = plan.views[index], plan.knowledge.camera
+    view = plan.views[index]
+    camera = view.camera
     zoom = VIEW_WIDTH / camera.size_px[0]
     height = zoom * camera.size_px[1]
     where = placement(camera, view.board, view.cam_from_board)

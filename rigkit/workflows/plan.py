@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -25,9 +26,11 @@ from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.check_page import power_table
 from rigkit.report.plan_page import plan_page
 from rigkit.validation.certificate.contracts import Task
+from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
+from rigkit.workflows.check import load_watched
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
 from rigkit.workflows.provenance import digest_line, software_facts
@@ -84,24 +87,34 @@ class PlannedSession:
 def plan_session(
     path: str | Path, options: PlanOptions | None = None, *, progress: Progress = silent
 ) -> PlannedSession:
-    """Return the views that would improve a calibration most, given its file or the session that it comes from.
+    """Return the views that would improve a calibration most, given its file or the session that it comes from; or
+    those to check it with, of a rig, too.
 
     Raises
     ------
     InputError
-        A rig (its cameras are planned one by one), a file that is neither, or a page that cannot be written.
+        A rig that is to be improved (its cameras are planned one by one), a file that is neither, or a page that cannot
+        be written.
     DegenerateError
         The views so far do not determine the camera, or no board can be held in view.
     """
     options, source = options or PlanOptions(), Path(path)
     rig = is_rig_session(source) if source.suffix == ".toml" else is_rig_file(source)
-    if rig:
+    if rig and source.suffix == ".toml" and options.check:
+        raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
+    if rig and not options.check:
         raise InputError(
-            f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, rig-CAMERA.json"
+            f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, "
+            "rig-CAMERA.json, or ask for pictures to check the rig with: --check"
         )
     inputs: list[Path] = [source]
     if options.report is not None:
         ensure_writable([options.report], force=options.force, inputs=inputs)
+    if rig:
+        watched, boards = load_watched(source)
+        if not boards:
+            raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
+        return _checked(watched, boards, options, source, inputs, np.zeros((0, 2)))
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
@@ -114,17 +127,23 @@ def plan_session(
         calibration = load_calibration(source)
         with about(source):
             boards = tuple(shape.board for shape in calibration.boards)
-    found: tuple[Table, ...] = ()
-    with about(source):
-        if options.check:
-            watched = watched_camera(calibration, source.stem)
-            plan, powers = views_that_tell(watched, boards, options.count, options.reach)
-            found = (power_table(powers, "What these pictures would find"),)
-        else:
-            plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
-    title = f"Pictures to check {source.name} with" if options.check else f"Next pictures for {source.name}"
-    written = _written(plan, options, title, source, inputs, taken, found)
+    if options.check:
+        return _checked(watched_camera(calibration, source.stem), boards, options, source, inputs, taken)
+    with about(source):
+        plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
+    written = _written(plan, options, f"Next pictures for {source.name}", source, inputs, taken)
+    return PlannedSession(plan=plan, found=(), taken=taken, written=written)
+
+
+def _checked(
+    watched: Watched, boards: Sequence[Board], options: PlanOptions, source: Path, inputs: list[Path], taken: Pixels
+) -> PlannedSession:
+    """Return the pictures to check a camera or a rig with."""
+    with about(source):
+        plan, powers = views_that_tell(watched, boards, options.count, options.reach)
+    found = (power_table(powers, "What these pictures would find"),)
+    written = _written(plan, options, f"Pictures to check {source.name} with", source, inputs, taken, found)
     return PlannedSession(plan=plan, found=found, taken=taken, written=written)
 
 

@@ -23,15 +23,17 @@ KINDS = ("focus", "principal point", "distortion")
 TALLY: dict[str, list[int]] = {}
 
 
-def tell(title: str, checks: Sequence[SentinelCheck], what: str) -> None:
-    """Print how many of the checks alarm, and how many of these name `what` happened; keep the sums."""
+def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") -> None:
+    """Print how many of the checks alarm, and how many of these name `what` happened; keep the sums, by `how` pictures
+    were taken."""
     alarms = [c for c in checks if not c.holds]
     kinds = Counter("none" if c.change is None else c.change.cause.kind for c in alarms)
     right = kinds[what]
     print(
         f"{title:32s} {len(alarms):3d} of {len(checks)} alarm, {right} of them rightly named: {dict(kinds)}", flush=True
     )
-    sums = TALLY.setdefault("unchanged" if what == "nothing" else "changed", [0, 0, 0])
+    kind = "unchanged" if what == "nothing" else "changed"
+    sums = TALLY.setdefault(f"{kind}, {how} pictures" if how else kind, [0, 0, 0])
     for k, more in enumerate((len(alarms), len(checks), right)):
         sums[k] += more
 

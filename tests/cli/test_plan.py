@@ -11,7 +11,10 @@ from helpers.calibration_scenes import REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cli.main import main
-from rigkit.io.calibration_file import save_calibration
+from rigkit.core.boards import Board
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.board_file import board_values
+from rigkit.io.calibration_file import camera_to_json, save_calibration
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +86,37 @@ def test_what_is_refused(command: list[str], words: str, capsys: pytest.CaptureF
 
 
 def test_a_rig_is_planned_camera_by_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "rig.json"
+    path, session = tmp_path / "rig.json", tmp_path / "rig.toml"
     path.write_text('{"schema": "rigkit.rig/1"}')
     assert main(["plan", str(path)]) == 2
     assert "rig-CAMERA.json" in capsys.readouterr().err
+    session.write_text('schema = "rigkit.session/1"\n[[cameras]]\n[[cameras]]\n')
+    assert main(["plan", str(session), "--check"]) == 2
+    assert "rig.json" in capsys.readouterr().err
+
+
+def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera, path = lens("reg"), tmp_path / "rig.json"
+    poses = {"left": Rigid3.identity(), "right": Rigid3(np.eye(3), [-80.0, 0.0, 0.0])}
+    rig = {
+        "schema": "rigkit.rig/1",
+        "sigma_px": 0.05,
+        "cameras": [
+            {"name": n, "camera": camera_to_json(camera), "cam_from_rig": p.matrix()[:3].tolist(), "rms_px": 0.1}
+            for n, p in poses.items()
+        ],
+        "covariance": (
+            np.diag([0.1] * 4 + [1e-4] * 5 + [0.1] * 4 + [1e-4] * 5 + [1e-5] * 3 + [0.05] * 3) ** 2
+        ).tolist(),
+    }
+    path.write_text(json.dumps(rig))
+    assert main(["plan", str(path), "--check"]) == 2
+    assert "does not say what boards" in capsys.readouterr().err
+    board = {"board_id": "b", "target": board_values(Board("b", 9, 6, 30.0, 30.0))}
+    path.write_text(json.dumps(rig | {"boards": [board]}))
+    page = tmp_path / "check.html"
+    assert main(["plan", str(path), "--check", "-n", "2", "-r", str(page), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert all(set(view["seen_by"]) == set(poses) for view in said["views"])
+    text = page.read_text()
+    assert "before camera" in text and "rotation of right" in text and text.count("<svg") == 2

@@ -1,4 +1,4 @@
-"""Pictures to check a lens with: what they promise is what the check then says, and others tell less."""
+"""Pictures to check a lens or a rig with: what they promise is what the check then says, and others tell less."""
 
 from __future__ import annotations
 
@@ -11,14 +11,19 @@ from helpers.calibration_scenes import BOARD, lens
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
+from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.planning.candidates import Reach, sees_held
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
-from rigkit.validation.sentinel.evidence import FreshView
-from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.report.plan_page import plan_words
+from rigkit.validation.sentinel.causes import causes_of
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, told_by
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
+from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 
@@ -71,14 +76,75 @@ def test_each_picture_tells_more(calibration: Calibration) -> None:
     assert all(after < before for before, after in pairwise(errors))
 
 
-def test_a_rig_has_no_pictures_to_check_with(calibration: Calibration) -> None:
-    one = watched_camera(calibration, "left")
-    rig = replace(
-        one,
+MOUNT = Rigid3(exp_so3(np.array([0.01, -0.3, 0.02])), [-180.0, 2.0, 30.0])
+LENS_SIGMAS = [0.05, 0.05, 0.05, 0.05, 2e-5, 2e-5, 2e-5, 2e-5]
+
+
+def _rig(mount: Rigid3) -> Watched:
+    camera = lens("wide")
+    return Watched(
         names=("left", "right"),
-        cameras=one.cameras * 2,
-        cam_from_rig=(Rigid3.identity(), Rigid3(np.eye(3), [100.0, 0.0, 0.0])),
-        covariance=np.eye(24),
+        cameras=(camera, camera),
+        cam_from_rig=(Rigid3.identity(), mount),
+        covariance=np.diag([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-5] * 3, *[0.01] * 3]) ** 2,
+        sigma_px=NOISE_PX,
+        freedom=50.0,
     )
-    with pytest.raises(InputError, match="one camera"):
-        views_that_tell(rig, [BOARD], FRESH)
+
+
+def _turn(powers: tuple[Power, ...]) -> float:
+    return next(power.chance for power in powers if power.kind == "rotation")
+
+
+def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_lens() -> None:
+    rig, rng = _rig(MOUNT), np.random.default_rng(5)
+    plan, promised = views_that_tell(rig, [BOARD], FRESH)
+    assert [p.kind for p in promised] == ["focus"] * 2 + ["principal point"] * 2 + ["distortion"] * 2 + ["rotation"]
+    # What tells of a mount is a board that both see.
+    assert sum(len(view.seen_by) == 2 for view in plan.views) >= 2
+    frames = []
+    for k, view in enumerate(plan.views):
+        rig_from_board = rig.cam_from_rig[rig.names.index(view.seen_by[0])].inverse() @ view.cam_from_board
+        for name in view.seen_by:
+            c = rig.names.index(name)
+            pixels, valid = rig.cameras[c].project((rig.cam_from_rig[c] @ rig_from_board).apply(BOARD.points()))
+            assert valid.all() and rig.cameras[c].on_image(pixels).all()
+            noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
+            own = BoardView(f"{k}", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX))
+            frames.append(FreshView(f"{k}", c, own))
+    said = check_views(rig, frames).powers
+    assert [(p.kind, p.camera) for p in said] == [(p.kind, p.camera) for p in promised]
+    assert [p.chance for p in said] == pytest.approx([p.chance for p in promised], abs=PROMISED_WITHIN)
+    left = replace(rig, names=("left",), cameras=rig.cameras[:1], cam_from_rig=rig.cam_from_rig[:1])
+    for_left, _ = views_that_tell(replace(left, covariance=rig.covariance[:8, :8]), [BOARD], FRESH)
+    poses = [view.cam_from_board for view in for_left.views]
+    rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
+    whole = sees_held(rig.cameras[1], BOARD, MOUNT.rotation @ rotation, MOUNT.apply(shift), Reach())
+    seen = [np.tile(BOARD.exists(), (FRESH, 1)), whole[:, None] & BOARD.exists()]
+    others = _powers(rig, told_by(rig, BOARD, rotation, shift, seen))
+    assert min(p.chance for p in others) < 0.9 * min(p.chance for p in promised)
+
+
+def _powers(rig: Watched, information: FloatArray) -> tuple[Power, ...]:
+    """Return what frames of this information find."""
+    sigma = rig.fresh_sigma_px
+    evidence = FreshEvidence(
+        information=information,
+        score=np.zeros(information.shape[:2]),
+        variance_px2=sigma**2,
+        rms_px=sigma,
+        expected_px=sigma,
+        corners=1,
+        left_out=0,
+        overdispersion=1.0,
+        freedom=rig.freedom,
+    )
+    return powers_of(rig, evidence, causes_of(rig), ALARM_CHANCE)
+
+
+def test_cameras_that_never_see_one_board_are_checked_lens_by_lens() -> None:
+    rig = _rig(Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), [0.0, 0.0, -50.0]))
+    plan, promised = views_that_tell(rig, [BOARD], 2)
+    assert {view.seen_by for view in plan.views} == {("left",), ("right",)}
+    assert all(np.isfinite(view.error) for view in plan.views) and _turn(promised) < 0.05
+    assert plan_words(plan)[0].startswith("1. before camera 'left': ")

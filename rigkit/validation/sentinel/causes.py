@@ -11,7 +11,7 @@ from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
-from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.goal import GOAL_GRID, Goal, projection_goal
 from rigkit.validation.sentinel.evidence import Watched
 
 FIELD_GRID = (24, 18)
@@ -89,6 +89,14 @@ def lens_goals(watched: Watched) -> list[Goal]:
         weight[watched.lens(c), watched.lens(c)] = goal.weight
         out.append(Goal(weight, goal.unit, goal.what))
     return out
+
+
+def turn_weight(camera: Camera) -> FloatArray:
+    """Return W (3, 3): w^T W w is the mean square over the image, px^2, of how far a camera's turn w (rad) moves what
+    is far away."""
+    rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
+    by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
+    return np.asarray(np.einsum("ikm,ilm->kl", by_turn, by_turn) / by_turn.shape[2])
 
 
 def _lens_directions(camera: Camera) -> FloatArray:

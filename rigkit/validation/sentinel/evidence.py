@@ -18,7 +18,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import refine_poses
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -157,6 +157,36 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
         overdispersion=watched.overdispersion,
         freedom=watched.freedom,
     )
+
+
+def told_by(
+    watched: Watched, board: Board, rotation: FloatArray, translation_mm: Points, seen: Sequence[BoolArray]
+) -> FloatArray:
+    """Return what each of C frames would say of theta, (C, T, T) in px^2: information as `FreshEvidence` has it.
+
+    A frame is `board` in the pose rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3); `seen` (C, N) are,
+    for each camera, the corners that it sees.
+    """
+    frames = np.arange(len(rotation))
+    corner = np.broadcast_to(np.arange(board.corner_count), seen[0].shape)
+    observations = tuple(
+        Observations(
+            views=(),
+            pixels=np.zeros((*own.shape, 2)),
+            corner=corner,
+            sigma_px=np.ones(own.shape),
+            weight=own.astype(np.float64),
+            present=own,
+            boards=(board,),
+            first_row=np.array([0, board.corner_count]),
+            board=np.zeros(len(own), dtype=np.int64),
+        )
+        for own in seen
+    )
+    placed = _Placed(
+        rotation, translation_mm, frames, observations, (frames,) * len(seen), tuple(o.weight for o in observations)
+    )
+    return reduced_by_cluster(placed.products(watched), watched.size, frames)[0]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

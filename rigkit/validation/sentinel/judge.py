@@ -16,12 +16,10 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import fdtrc
 
-from rigkit.calibration.uncertainty import projection_design
-from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
-from rigkit.planning.goal import GOAL_GRID, Goal
-from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
+from rigkit.planning.goal import Goal
+from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
 from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.whitened import LARGE_FREEDOM, NULL_RANK, Whitened
@@ -273,11 +271,8 @@ def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure
 
 
 def _turn_weight(watched: Watched, c: int) -> FloatArray:
-    """Return W (T, T): d^T W d is the mean square over the image, px^2, of how far the turn of camera `c` in a change d
-    moves what is far away."""
-    camera, turn = watched.cameras[c], watched.mount(c).start
-    rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
-    by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
+    """Return what a turn of camera `c` in a change of theta moves, (T, T): see `turn_weight`."""
+    turn = watched.mount(c).start
     out = np.zeros((watched.size, watched.size))
-    out[turn : turn + 3, turn : turn + 3] = np.einsum("ikm,ilm->kl", by_turn, by_turn) / by_turn.shape[2]
+    out[turn : turn + 3, turn : turn + 3] = turn_weight(watched.cameras[c])
     return out

@@ -1,7 +1,7 @@
-"""Which pictures to check a camera with: those that would tell changes of its lens best.
+"""Which pictures to check a camera or a rig with: those that would tell changes of its lenses and mounts best.
 
-With P = (C^-1 + A)^-1, C the covariance of the calibration and A what fresh views say, changes a of a cause D scatter
-by N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Views that make this small for every cause are not those
+With P = (C^-1 + A)^-1, C the covariance of the calibration and A what fresh frames say, changes a of a cause D scatter
+by N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Frames that make this small for every cause are not those
 that improve the calibration most: what a lens needs known least may be what changes.
 
 Reference: A. C. Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS" (2007), section 10.3
@@ -11,18 +11,19 @@ Reference: A. C. Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Desi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError
-from rigkit.planning.candidates import Reach
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
-from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
-from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import KEPT, Reach, held_boards, sees_held
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
+from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched, told_by
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 from rigkit.validation.sentinel.power import LENS_KINDS, Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK
@@ -35,68 +36,155 @@ class ChangeAim:
     Attributes
     ----------
     shown : for each cause C^-1 D (T, m), D in px over the image, and D^T C^-1 D (m, m).
+    what : in words.
     """
 
     shown: tuple[tuple[FloatArray, FloatArray], ...]
+    what: str
     unit: str = "px"
-    what: str = "standard error of a change of focus, principal point or distortion, over the image"
 
     @classmethod
-    def of(cls, watched: Watched, causes: Sequence[Cause], inverse: FloatArray) -> ChangeAim:
-        """Return the aim for causes of one camera whose covariance has the `inverse`."""
-        (goal,) = lens_goals(watched)
-        shown = []
-        for cause in causes:
-            size, axes = np.linalg.eigh(cause.directions.T @ goal.weight @ cause.directions)
+    def of(cls, watched: Watched, inverse: FloatArray, most: FloatArray) -> ChangeAim:
+        """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); causes of which even
+        `most` (T, T), what all frames say that could be taken, tells nothing are left out."""
+        several = len(watched.cameras) > 1
+        by_all, shown = covariance_of(inverse + most), []
+        for cause in causes_of(watched):
+            metric = _metric(watched, cause)
+            if metric is None:
+                continue
+            size, axes = np.linalg.eigh(metric)
             seen = size > NULL_RANK * size[-1]
             by_px = cause.directions @ (axes[:, seen] / np.sqrt(size[seen]))
-            shown.append((inverse @ by_px, by_px.T @ inverse @ by_px))
-        return cls(tuple(shown))
+            one = (inverse @ by_px, by_px.T @ inverse @ by_px)
+            if _told(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
+                shown.append(one)
+        changes = "focus, principal point, distortion or mount" if several else "focus, principal point or distortion"
+        return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
 
     def error(self, covariance: FloatArray) -> FloatArray:
         """Return the root of the causes' variances together, each the geometric mean over its directions, so that none
-        is told at the cost of all others; huge where there is one of which the views say nothing."""
+        is told at the cost of all others; huge where there is one of which the frames say nothing."""
         variance = np.zeros(covariance.shape[:-2])
         for by_theta, whole in self.shown:
-            told = np.linalg.eigvalsh(whole - by_theta.T @ covariance @ by_theta)
-            told = np.maximum(told, NULL_RANK * np.trace(whole))
+            told = np.maximum(_told(by_theta, whole, covariance), NULL_RANK * np.trace(whole))
             variance = variance + np.exp(-np.log(told).mean(axis=-1))
         return np.asarray(np.sqrt(variance))
+
+
+def _told(by_theta: FloatArray, whole: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the eigenvalues (..., m) of N, with P the `covariance` (..., T, T)."""
+    return np.asarray(np.linalg.eigvalsh(whole - by_theta.T @ covariance @ by_theta))
+
+
+def _metric(watched: Watched, cause: Cause) -> FloatArray | None:
+    """Return the mean square over the image, px^2, that amounts of a cause move it by, (m, m): of a lens after the best
+    rotation, of a mount's turn what is far away; None for what is not looked for."""
+    c = watched.names.index(cause.camera or watched.names[0])
+    if cause.kind in LENS_KINDS:
+        return np.asarray(cause.directions.T @ lens_goals(watched)[c].weight @ cause.directions)
+    return np.radians(1.0) ** 2 * turn_weight(watched.cameras[c]) if cause.kind == "rotation" else None
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Frames:
+    """Frames that could be taken: boards in poses rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3), the
+    numbers of the boards (C,), which cameras see all of them (C, cameras), that for which each was thought of first
+    (C,), and what they say of theta (C, T, T) in px^2."""
+
+    rotation: FloatArray
+    translation_mm: Points
+    board: IntArray
+    seen: BoolArray
+    owner: IntArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, watched: Watched, boards: Sequence[Board], reach: Reach) -> _Frames:
+        """Raises DegenerateError where no board fits into the image of any camera."""
+        parts: list[_Frames] = []
+        refused: DegenerateError | None = None
+        for number, board in enumerate(boards):
+            for c in range(len(watched.cameras)):
+                try:
+                    parts.append(cls._before(watched, c, board, number, reach))
+                except DegenerateError as error:
+                    refused = error
+        if not parts:
+            assert refused is not None
+            raise refused
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
+
+    @classmethod
+    def _before(cls, watched: Watched, c: int, board: Board, number: int, reach: Reach) -> _Frames:
+        """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
+        held = held_boards(watched.cameras[c], board, reach)
+        held = held.chosen(np.arange(min(len(held), -(-KEPT // len(watched.cameras)))))
+        back = watched.cam_from_rig[c].inverse()
+        rotation, translation = back.rotation @ held.rotation, held.translation_mm @ back.rotation.T
+        translation = translation + back.translation_mm
+        seen = np.stack(
+            [
+                sees_held(camera, board, pose.rotation @ rotation, pose.apply(translation), reach)
+                for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
+            ],
+            axis=1,
+        )
+        seen[:, c] = True
+        corners = [own[:, None] & board.exists() for own in seen.T]
+        count = np.ones(len(held), dtype=np.int64)
+        told = told_by(watched, board, rotation, translation, corners)
+        return cls(rotation, translation, number * count, seen, c * count, told)
+
+    def proposal(self, index: int, watched: Watched, board: Board, error: float) -> Proposal:
+        """Return one as a view of the camera for which it was thought of."""
+        c = int(self.owner[index])
+        rig_from_board = Rigid3(self.rotation[index], self.translation_mm[index])
+        names = [watched.names[c], *(n for k, n in enumerate(watched.names) if self.seen[index, k] and k != c)]
+        return Proposal(
+            board,
+            watched.cam_from_rig[c] @ rig_from_board,
+            error,
+            watched.cameras[c],
+            tuple(names) if len(watched.names) > 1 else (),
+        )
 
 
 def views_that_tell(
     watched: Watched, boards: Sequence[Board], count: int, reach: Reach | None = None
 ) -> tuple[Plan, tuple[Power, ...]]:
-    """Return the pictures to check a camera with, and how well they would find what changed.
+    """Return the pictures to check a camera or a rig with, and how well they would find what changed. Of a rig a
+    picture is one of every camera at one moment, of one board.
 
-    Raises InputError for a rig, and as `plan_views`.
+    Raises
+    ------
+    InputError
+        No board, or no picture asked for.
+    DegenerateError
+        No board fits into any image at the distances allowed, or nothing can be told of the calibration.
     """
-    if len(watched.cameras) > 1:
-        raise InputError("plan: pictures to check with are planned for one camera; give its own calibration")
-    causes = [cause for cause in causes_of(watched) if cause.kind in LENS_KINDS]
-    sigma = watched.fresh_sigma_px
-    knowledge = Knowledge(watched.cameras[0], covariance_of(watched.covariance), CornerError(sigma))
-    aim = ChangeAim.of(watched, causes, knowledge.information)
-    # So few are taken that none is to be less than the best.
-    plan = plan_views(knowledge, boards, aim, count, reach=reach, nearly=0.0)
-    plan = replace(plan, error=float("inf"))  # Without any picture.
-    fresh = np.array([_told(knowledge, view) for view in plan.views])
+    if not boards or count < 1:
+        raise InputError("plan: at least one board and one picture are needed")
+    frames, sigma = _Frames.of(watched, boards, reach or Reach()), watched.fresh_sigma_px
+    inverse, told = covariance_of(watched.covariance), frames.information / sigma**2
+    aim = ChangeAim.of(watched, inverse, told.sum(axis=0))
+    taken, errors = choose_views(inverse, told, aim, count)
+    views = [
+        frames.proposal(i, watched, boards[frames.board[i]], error) for i, error in zip(taken, errors, strict=True)
+    ]
     evidence = FreshEvidence(
-        information=sigma**2 * fresh,
-        score=np.zeros(fresh.shape[:2]),
+        information=frames.information[taken],
+        score=np.zeros((len(taken), watched.size)),
         variance_px2=sigma**2,
         rms_px=float(np.sqrt(2.0) * sigma),
         expected_px=float(np.sqrt(2.0) * sigma),
-        corners=sum(view.board.corner_count for view in plan.views),
+        corners=sum(view.board.corner_count for view in views),
         left_out=0,
         overdispersion=watched.overdispersion,
         freedom=watched.freedom,
     )
-    return plan, powers_of(watched, evidence, causes_of(watched), ALARM_CHANCE)
-
-
-def _told(knowledge: Knowledge, view: Proposal) -> FloatArray:
-    """Return what a view adds to what is known, (T, T)."""
-    pose, points = view.cam_from_board, view.board.points()
-    held = HeldBoards(points, pose.rotation[None], pose.translation_mm[None], view.board.exists()[None])
-    return np.asarray(knowledge.of_views(held)[0])
+    # Without any picture nothing is told.
+    knowledge = Knowledge(watched.cameras[0], inverse, CornerError(sigma))
+    return Plan(knowledge, aim, float("inf"), tuple(views)), powers_of(
+        watched, evidence, causes_of(watched), ALARM_CHANCE
+    )
