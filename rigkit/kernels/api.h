@@ -303,8 +303,9 @@ EXPORT void read_modules(
 /* tags.c */
 
 /* What comes out of a tag: moves of the four corners (8), their standard deviations (4), blur, contrast, RMS residual,
- * whether it settled. Terms of a cubic polynomial of two variables. Doubles of a pixel. */
-enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SPOT = 9 };
+ * whether it settled. Terms of a cubic polynomial of two variables. Pixels on a side of the squares that are
+ * taken at once, and the doubles of one. */
+enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
 
 /* The constants of detection.tags.whole, under their names there. */
 typedef struct {
@@ -318,7 +319,7 @@ EXPORT void fit_tags(
     ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2), ARRAY(const double, scales, count),
     ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells, ARRAY(const double, breaks, cells - 1), double reach,
     ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
-    ARRAY(double, scratch, most, TAG_SPOT), ARRAY(double, out, count, TAG_OUTCOMES));
+    ARRAY(double, scratch, most, TAG_BLOCK), ARRAY(double, out, count, TAG_OUTCOMES));
 
 /* boards.c */
 

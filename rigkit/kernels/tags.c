@@ -5,11 +5,19 @@
  * A pixel's place in the tag is a cubic polynomial of its position, from which the four corners move the picture, each
  * by the share that it has in the bilinear interpolation of the place, and in which sides bend: by 4 x (1 - x) and
  * 4 y (1 - y) times how far their middles move. Free are these moves, those of the middles as far as they are not known,
- * the blur s, and the light (1 + g . x) (a + b S), S the share of ink. */
+ * the blur s, and the light (1 + g . x) (a + b S), S the share of ink.
+ *
+ * Pixels are taken in squares, for which the same edges count, side by side as the compiler vectorises them. */
 #include "kernels.h"
 
 enum { SHARES = 6, BENDS = 8, MOVES = 2 * SHARES, S = MOVES, A, B, GX, GY, PARAMETERS };
-enum { ORDERS = 4, MOST_CELLS = 32 };
+enum { ORDERS = 4, MOST_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, LANES = 8, GROUPS = BLOCK / LANES };
+
+/* To the compiler so many numbers side by side, of any alignment. */
+typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
+
+/* Edges further away, in s, are as far as this: `decay` has nothing for more than 12.6. */
+#define FURTHEST 12.0f
 
 typedef struct {
     const double *map, *centre, *breaks;
@@ -18,114 +26,189 @@ typedef struct {
     int64_t cells;
 } tag_t;
 
+/* Pixels of a square: positions from the centre, brightness, shares, and 0 for those that do not count. */
 typedef struct {
-    double u, v, value, share[SHARES];
-} tag_pixel_t;
+    float u[BLOCK], v[BLOCK], value[BLOCK], counts[BLOCK], share[SHARES][BLOCK];
+} tag_block_t;
+_Static_assert(sizeof(tag_block_t) <= TAG_BLOCK * sizeof(double), "scratch holds the pixels");
 
-/* A place (x, y) in the tag, and how it grows along u and v. */
+/* Places (x, y) in the tag, and how they grow along u and v. */
 typedef struct {
-    double at[2], grow[2][2];
+    float at[2][BLOCK], grow[2][2][BLOCK];
 } tag_place_t;
 
-/* How much of a pixel the cells from `first` on along one side are, and its derivatives along d / s. */
+/* The edges between the cells from `first` on along one side: shares of the pixels beyond them, and their derivatives
+ * along d / s. */
 typedef struct {
-    float part[ORDERS][MOST_CELLS];
+    float part[MOST_CELLS][ORDERS][BLOCK];
     int64_t first, count;
 } profile_t;
 
-INLINE tag_place_t tag_place(const tag_t *tag, double du, double dv)
+/* The share of ink of pixels, its gradient and its derivative by the blur. */
+typedef struct {
+    float of[BLOCK], gradient[2][BLOCK], by_blur[BLOCK];
+} share_t;
+
+INLINE void tag_place(const tag_t *tag, const float *restrict du, const float *restrict dv, tag_place_t *restrict out)
 {
-    const double u = du / tag->scale, v = dv / tag->scale, uu = u * u, uv = u * v, vv = v * v;
-    const double terms[TAG_TERMS] = {1.0, u, v, uu, uv, vv, uu * u, uu * v, uv * v, vv * v};
-    const double by_u[TAG_TERMS] = {0.0, 1.0, 0.0, 2.0 * u, v, 0.0, 3.0 * uu, 2.0 * uv, vv, 0.0};
-    const double by_v[TAG_TERMS] = {0.0, 0.0, 1.0, 0.0, u, 2.0 * v, 0.0, uu, 2.0 * uv, 3.0 * vv};
-    tag_place_t out = {{0.0}};
+    const float per_px = (float)(1.0 / tag->scale);
     for (int axis = 0; axis < 2; axis++) {
-        for (int k = 0; k < TAG_TERMS; k++) {
-            const double part = tag->map[axis * TAG_TERMS + k];
-            out.at[axis] += part * terms[k];
-            out.grow[axis][0] += part * by_u[k];
-            out.grow[axis][1] += part * by_v[k];
+        float m[TAG_TERMS];
+        for (int k = 0; k < TAG_TERMS; k++)
+            m[k] = (float)tag->map[axis * TAG_TERMS + k];
+        for (int i = 0; i < BLOCK; i++) {
+            const float u = du[i] * per_px, v = dv[i] * per_px, uu = u * u, uv = u * v, vv = v * v;
+            out->at[axis][i] = (m[0] + m[1] * u + m[2] * v) + (m[3] * uu + m[4] * uv + m[5] * vv)
+                + uu * (m[6] * u + m[7] * v) + vv * (m[8] * u + m[9] * v);
+            out->grow[axis][0][i] = per_px * ((m[1] + 2.0f * m[3] * u + m[4] * v) + (3.0f * m[6] * uu + 2.0f * m[7] * uv + m[8] * vv));
+            out->grow[axis][1][i] = per_px * ((m[2] + m[4] * u + 2.0f * m[5] * v) + (m[7] * uu + 2.0f * m[8] * uv + 3.0f * m[9] * vv));
         }
-        out.grow[axis][0] /= tag->scale;
-        out.grow[axis][1] /= tag->scale;
     }
-    return out;
 }
 
-/* Set `out` to the profile at `place`, where a px is `slope` along the side. */
-INLINE void profile_of(const tag_t *tag, double place, double slope, float kurtosis, const tag_rules_t *rules, profile_t *out)
+/* Set `out` to the profiles at `place`, where a px is `slope` along the side. */
+INLINE void profile_of(
+    const tag_t *tag, const float *restrict place, const float *restrict slope, const float *restrict kurtosis,
+    const tag_rules_t *rules, profile_t *restrict out)
 {
     const int64_t breaks = tag->cells - 1;
-    const double per_s = 1.0 / (slope * tag->s), reach = rules->tail_sigmas / per_s;
-    int64_t first = 0, last = breaks;
-    while (first < breaks && tag->breaks[first] < place - reach)
-        first++;
-    while (last > first && tag->breaks[last - 1] > place + reach)
-        last--;
-    const int count = (int)(last - first);
-    float edge[ORDERS][MOST_CELLS];
-    for (int k = 0; k < count; k++) {
-        float step[5];
-        blurred_edge((float)((place - tag->breaks[first + k]) * per_s), kurtosis, step);
-        edge[0][k] = 0.5f + 0.5f * step[0];
-        for (int order = 1; order < ORDERS; order++)
-            edge[order][k] = 0.5f * step[order];
+    const float s = (float)tag->s, tail = (float)rules->tail_sigmas * s;
+    float per_s[BLOCK], low = 1e30f, high = -1e30f;
+    for (int i = 0; i < BLOCK; i++) {
+        const float reach = tail * slope[i];
+        per_s[i] = 1.0f / (slope[i] * s);
+        low = place[i] - reach < low ? place[i] - reach : low;
+        high = place[i] + reach > high ? place[i] + reach : high;
     }
+    int64_t first = 0, last = breaks;
+    while (first < breaks && tag->breaks[first] < (double)low)
+        first++;
+    while (last > first && tag->breaks[last - 1] > (double)high)
+        last--;
     out->first = first;
-    out->count = count + 1;
-    for (int order = 0; order < ORDERS; order++) {
-        float before = order ? 0.0f : 1.0f;
-        for (int k = 0; k < count; k++) {
-            out->part[order][k] = before - edge[order][k];
-            before = edge[order][k];
+    out->count = last - first;
+    for (int64_t k = 0; k < out->count; k++) {
+        const float edge = (float)tag->breaks[first + k];
+        float(*restrict part)[BLOCK] = out->part[k];
+        for (int i = 0; i < BLOCK; i++) {
+            float x = (place[i] - edge) * per_s[i], step[5];
+            x = x < FURTHEST ? x : FURTHEST;
+            x = x > -FURTHEST ? x : -FURTHEST;
+            blurred_edge(x, kurtosis[i], step);
+            part[0][i] = 0.5f + 0.5f * step[0];
+            for (int order = 1; order < ORDERS; order++)
+                part[order][i] = 0.5f * step[order];
         }
-        out->part[order][count] = before;
     }
 }
 
-/* Return the share of ink of a pixel at (u, v) from the centre, its gradient and its derivative by the blur
- * (reference.tags.share_of_ink). */
-INLINE double share_of_ink(const tag_t *tag, double u, double v, const tag_rules_t *rules, double gradient[2], double *by_blur)
+/* Add to `sums`, by orders along x and y, what the cells of one row have more than those of the row before it, `before`,
+ * beyond the edge `beyond` between the two; without such a row nothing lies before it. */
+INLINE void add_row(
+    const profile_t *along, const uint8_t *ink, const uint8_t *before, const float (*restrict beyond)[BLOCK],
+    float (*restrict sums)[ORDERS][BLOCK])
 {
-    const tag_place_t here = tag_place(tag, u, v);
-    double slope[2], n[2][2];
+    float row[ORDERS][BLOCK];
+    int empty = 1;
+    for (int64_t k = 0; k <= along->count; k++) {
+        int more = (int)ink[k] - (before ? (int)before[k] : 0);
+        if (k)
+            more -= (int)ink[k - 1] - (before ? (int)before[k - 1] : 0);
+        if (!more)
+            continue;
+        if (empty)
+            memset(row, 0, sizeof row);
+        empty = 0;
+        for (int order = 0; order < ORDERS; order++)
+            for (int i = 0; i < BLOCK; i++)
+                row[order][i] += k ? (float)more * along->part[k - 1][order][i] : order ? 0.0f : (float)more;
+    }
+    if (empty)
+        return;
+    for (int order = 0; order < ORDERS; order++)
+        for (int other = 0; other < ORDERS; other++)
+            for (int i = 0; i < BLOCK; i++)
+                sums[order][other][i] += row[order][i] * (beyond ? beyond[other][i] : other ? 0.0f : 1.0f);
+}
+
+/* Set `out` to the share of ink of pixels at (u, v) from the centre (reference.tags.picture). */
+INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const tag_rules_t *rules, share_t *restrict out)
+{
+    tag_place_t here;
+    tag_place(tag, u, v, &here);
+    float n[2][2][BLOCK], slope[2][BLOCK], kurtosis[2][BLOCK];
     profile_t along[2];
     const double sharp = tag->s > rules->sharp_blur ? tag->s : rules->sharp_blur;
+    const float excess = (float)(rules->pixel_kurtosis / (sharp * sharp * sharp * sharp)), per_s = (float)(1.0 / tag->s);
     for (int axis = 0; axis < 2; axis++) {
-        slope[axis] = hypot(here.grow[axis][0], here.grow[axis][1]);
-        slope[axis] = slope[axis] > 1e-9 ? slope[axis] : 1e-9;
-        n[axis][0] = here.grow[axis][0] / slope[axis];
-        n[axis][1] = here.grow[axis][1] / slope[axis];
-        const double c2 = n[axis][0] * n[axis][0], s2 = n[axis][1] * n[axis][1];
-        const float kurtosis = (float)(rules->pixel_kurtosis * (c2 * c2 + s2 * s2) / (sharp * sharp * sharp * sharp));
-        profile_of(tag, here.at[axis], slope[axis], kurtosis, rules, along + axis);
+        for (int i = 0; i < BLOCK; i++) {
+            const float by_u = here.grow[axis][0][i], by_v = here.grow[axis][1][i], length = sqrtf(by_u * by_u + by_v * by_v);
+            slope[axis][i] = length > 1e-9f ? length : 1e-9f;
+            n[axis][0][i] = by_u / slope[axis][i];
+            n[axis][1][i] = by_v / slope[axis][i];
+            const float c2 = n[axis][0][i] * n[axis][0][i], s2 = n[axis][1][i] * n[axis][1][i];
+            kurtosis[axis][i] = excess * (c2 * c2 + s2 * s2);
+        }
+        profile_of(tag, here.at[axis], slope[axis], kurtosis[axis], rules, along + axis);
     }
-    float sums[ORDERS][ORDERS] = {{0.0f}};
-    for (int64_t j = 0; j < along[1].count; j++) {
-        const uint8_t *ink = tag->ink + (along[1].first + j) * tag->cells + along[0].first;
-        float row[ORDERS] = {0.0f};
-        for (int64_t i = 0; i < along[0].count; i++)
-            for (int order = 0; order < ORDERS; order++)
-                row[order] += ink[i] ? along[0].part[order][i] : 0.0f;
-        for (int k = 0; k < ORDERS; k++)
-            for (int order = 0; order < ORDERS; order++)
-                sums[order][k] += row[order] * along[1].part[k][j];
+    float sums[ORDERS][ORDERS][BLOCK] = {{{0.0f}}};
+    const uint8_t *ink = tag->ink + along[1].first * tag->cells + along[0].first, *before = NULL;
+    for (int64_t j = 0; j <= along[1].count; j++, before = ink, ink += tag->cells)
+        add_row(along, ink, before, j ? (const float(*)[BLOCK])along[1].part[j - 1] : NULL, sums);
+    for (int i = 0; i < BLOCK; i++) {
+        /* Blur along the two normals is correlated: Mehler's series, as in edges.c. */
+        const float rho = n[0][0][i] * n[1][0][i] + n[0][1][i] * n[1][1][i], half = 0.5f * rho * rho;
+        const float by_x = per_s * (sums[1][0][i] + rho * sums[2][1][i] + half * sums[3][2][i]);
+        const float by_y = per_s * (sums[0][1][i] + rho * sums[1][2][i] + half * sums[2][3][i]);
+        out->gradient[0][i] = by_x * n[0][0][i] + by_y * n[1][0][i];
+        out->gradient[1][i] = by_x * n[0][1][i] + by_y * n[1][1][i];
+        out->by_blur[i] = per_s * (sums[2][0][i] + sums[0][2][i] + 2.0f * rho * sums[1][1][i]);
+        out->of[i] = sums[0][0][i] + rho * sums[1][1][i] + half * (sums[2][2][i] + rho / 3.0f * sums[3][3][i]);
     }
-    /* Blur along the two normals is correlated: Mehler's series, as in edges.c. */
-    const double rho = n[0][0] * n[1][0] + n[0][1] * n[1][1], half = 0.5 * rho * rho;
-    const double by_x = (sums[1][0] + rho * sums[2][1] + half * sums[3][2]) / tag->s;
-    const double by_y = (sums[0][1] + rho * sums[1][2] + half * sums[2][3]) / tag->s;
-    gradient[0] = by_x * n[0][0] + by_y * n[1][0];
-    gradient[1] = by_x * n[0][1] + by_y * n[1][1];
-    *by_blur = (sums[2][0] + sums[0][2] + 2.0 * rho * sums[1][1]) / tag->s;
-    return sums[0][0] + rho * sums[1][1] + half * (sums[2][2] + rho / 3.0 * sums[3][3]);
 }
 
-/* Gather the pixels that lie in the tag, or up to `reach` of its side beside it; return how many, at most `most`. */
-static int64_t tag_pixels(
-    const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, tag_pixel_t *pixels, int64_t most)
+/* Set `pixels` to those of the square whose first is at (u, v), and what lies in the tag, or up to `reach` of its side
+ * beside it, to count; return how many. */
+INLINE int64_t block_pixels(
+    const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, int64_t u, int64_t v,
+    tag_block_t *restrict pixels)
 {
+    for (int i = 0; i < BLOCK; i++) {
+        int64_t column = u + i % SIDE, row = v + i / SIDE;
+        pixels->counts[i] = column < width && row < height ? 1.0f : 0.0f;
+        column = column < width ? column : width - 1;
+        row = row < height ? row : height - 1;
+        const int64_t k = row * width + column;
+        pixels->value[i] = bytes ? (float)((const uint8_t *)grey)[k] : ((const float *)grey)[k];
+        pixels->u[i] = (float)((double)(u + i % SIDE) - tag->centre[0]);
+        pixels->v[i] = (float)((double)(v + i / SIDE) - tag->centre[1]);
+    }
+    tag_place_t here;
+    tag_place(tag, pixels->u, pixels->v, &here);
+    const float low = (float)-reach, high = (float)(1.0 + reach);
+    float count = 0.0f;
+    for (int i = 0; i < BLOCK; i++) {
+        const float x = here.at[0][i], y = here.at[1][i];
+        /* Where the polynomial has turned over it shows the tag once more, mirrored. */
+        const float area = here.grow[0][0][i] * here.grow[1][1][i] - here.grow[0][1][i] * here.grow[1][0][i];
+        pixels->counts[i] *= (x >= low) & (x <= high) & (y >= low) & (y <= high) & (area > 0.0f) ? 1.0f : 0.0f;
+        const float share[SHARES] = {
+            (1.0f - x) * (1.0f - y), x * (1.0f - y), (1.0f - x) * y, x * y, 4.0f * x * (1.0f - x), 4.0f * y * (1.0f - y)};
+        for (int part = 0; part < SHARES; part++)
+            pixels->share[part][i] = share[part];
+        count += pixels->counts[i];
+    }
+    return (int64_t)count;
+}
+
+/* Gather the squares of pixels in and around the tag, at most `most`; return how many, and set `seen` to how many pixels
+ * count. */
+FOR_EACH_PROCESSOR
+static int64_t tag_pixels(
+    const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, tag_block_t *blocks,
+    int64_t most, int64_t *seen)
+{
+    *seen = 0;
     if (!isfinite(tag->centre[0] + tag->centre[1] + tag->scale))
         return 0;
     const double far = tag->scale * (1.0 + 2.0 * reach);
@@ -136,55 +219,81 @@ static int64_t tag_pixels(
     right = right < width - 1 ? right : width - 1;
     bottom = bottom < height - 1 ? bottom : height - 1;
     int64_t count = 0;
-    for (int64_t v = top; v <= bottom; v++)
-        for (int64_t u = left; u <= right; u++) {
-            const double du = (double)u - tag->centre[0], dv = (double)v - tag->centre[1];
-            const tag_place_t here = tag_place(tag, du, dv);
-            const double x = here.at[0], y = here.at[1];
-            if (!(x >= -reach && x <= 1.0 + reach && y >= -reach && y <= 1.0 + reach) || count == most)
-                continue;
-            const int64_t k = v * width + u;
-            const double value = bytes ? (double)((const uint8_t *)grey)[k] : (double)((const float *)grey)[k];
-            pixels[count++] = (tag_pixel_t){
-                du, dv, value,
-                {(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y, 4.0 * x * (1.0 - x), 4.0 * y * (1.0 - y)}};
+    for (int64_t v = top; v <= bottom; v += SIDE)
+        for (int64_t u = left; u <= right && count < most; u += SIDE) {
+            const int64_t mine = block_pixels(tag, grey, bytes, width, height, reach, u, v, blocks + count);
+            *seen += mine;
+            count += mine > 0;
         }
     return count;
+}
+
+/* Set `rows` to the derivatives of the residuals of the pixels of a square by every parameter, and to these. */
+INLINE void block_rows(const tag_t *tag, const tag_block_t *pixels, const tag_rules_t *rules, float (*restrict rows)[BLOCK])
+{
+    float u[BLOCK], v[BLOCK];
+    memcpy(u, pixels->u, sizeof u);
+    memcpy(v, pixels->v, sizeof v);
+    for (int part = 0; part < SHARES; part++) {
+        const float by_u = (float)tag->moves[2 * part], by_v = (float)tag->moves[2 * part + 1];
+        for (int i = 0; i < BLOCK; i++) {
+            u[i] -= pixels->share[part][i] * by_u;
+            v[i] -= pixels->share[part][i] * by_v;
+        }
+    }
+    share_t share;
+    share_of_ink(tag, u, v, rules, &share);
+    const float per_px = (float)(1.0 / tag->scale), a = (float)tag->a, b = (float)tag->b;
+    const float light_u = (float)tag->g[0], light_v = (float)tag->g[1];
+    for (int i = 0; i < BLOCK; i++) {
+        const float x = pixels->u[i] * per_px, y = pixels->v[i] * per_px, counts = pixels->counts[i];
+        const float light = counts * (1.0f + light_u * x + light_v * y), level = a + b * share.of[i], steep = light * b;
+        for (int part = 0; part < SHARES; part++) {
+            rows[2 * part][i] = -steep * pixels->share[part][i] * share.gradient[0][i];
+            rows[2 * part + 1][i] = -steep * pixels->share[part][i] * share.gradient[1][i];
+        }
+        rows[S][i] = steep * share.by_blur[i];
+        rows[A][i] = light;
+        rows[B][i] = light * share.of[i];
+        rows[GX][i] = counts * level * x;
+        rows[GY][i] = counts * level * y;
+        rows[PARAMETERS][i] = counts * pixels->value[i] - light * level;
+    }
 }
 
 /* Fill the normal equations; return the sum of squared residuals. */
 FOR_EACH_PROCESSOR
 static double tag_equations(
-    const tag_t *tag, const tag_pixel_t *pixels, int64_t count, const tag_rules_t *rules,
+    const tag_t *tag, const tag_block_t *blocks, int64_t count, const tag_rules_t *rules,
     double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
 {
-    double sum = 0.0;
-    memset(N, 0, PARAMETERS * PARAMETERS * sizeof(double));
-    memset(right, 0, PARAMETERS * sizeof(double));
+    lanes_t sums[(PARAMETERS + 1) * (PARAMETERS + 2) / 2];
+    memset(sums, 0, sizeof sums);
     for (int64_t k = 0; k < count; k++) {
-        const tag_pixel_t *here = pixels + k;
-        double u = here->u, v = here->v, gradient[2], by_blur;
-        for (int part = 0; part < SHARES; part++) {
-            u -= here->share[part] * tag->moves[2 * part];
-            v -= here->share[part] * tag->moves[2 * part + 1];
-        }
-        const double share = share_of_ink(tag, u, v, rules, gradient, &by_blur);
-        const double x = here->u / tag->scale, y = here->v / tag->scale, light = 1.0 + tag->g[0] * x + tag->g[1] * y;
-        const double level = tag->a + tag->b * share, off = here->value - light * level, steep = light * tag->b;
-        double row[PARAMETERS];
-        for (int part = 0; part < SHARES; part++) {
-            row[2 * part] = -steep * here->share[part] * gradient[0];
-            row[2 * part + 1] = -steep * here->share[part] * gradient[1];
-        }
-        row[S] = steep * by_blur;
-        row[A] = light;
-        row[B] = light * share;
-        row[GX] = level * x;
-        row[GY] = level * y;
-        sum += off * off;
-        add_residual(N, right, row, PARAMETERS, off);
+        float rows[PARAMETERS + 1][BLOCK];
+        block_rows(tag, blocks + k, rules, rows);
+        lanes_t *sum = sums;
+        for (int i = 0; i <= PARAMETERS; i++)
+            for (int j = 0; j <= i; j++, sum++) {
+                const lanes_t *one = (const lanes_t *)rows[i], *other = (const lanes_t *)rows[j];
+                lanes_t total = one[0] * other[0];
+                for (int group = 1; group < GROUPS; group++)
+                    total += one[group] * other[group];
+                *sum += total;
+            }
     }
-    return sum;
+    double products[PARAMETERS + 1];
+    const lanes_t *sum = sums;
+    for (int i = 0; i <= PARAMETERS; i++)
+        for (int j = 0; j <= i; j++, sum++) {
+            products[j] = 0.0;
+            for (int lane = 0; lane < LANES; lane++)
+                products[j] += (double)(*sum)[lane];
+            if (i < PARAMETERS)
+                N[i * PARAMETERS + j] = products[j];
+        }
+    memcpy(right, products, PARAMETERS * sizeof(double));
+    return products[PARAMETERS];
 }
 
 void fit_tags(
@@ -192,23 +301,25 @@ void fit_tags(
     const double *scales, const uint8_t *ink, int64_t cells, const double *breaks, double reach, const double *blur,
     const double *contrast, const double *bend_sigma, const tag_rules_t *rules, int64_t most, double *scratch, double *out)
 {
-    tag_pixel_t *pixels = (tag_pixel_t *)scratch;
+    tag_block_t *blocks = (tag_block_t *)scratch;
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * TAG_OUTCOMES;
         memset(result, 0, TAG_OUTCOMES * sizeof(double));
         tag_t tag = {
             .map = maps + 2 * TAG_TERMS * n, .centre = centres + 2 * n, .breaks = breaks, .scale = scales[n], .s = blur[n],
             .b = -contrast[n], .ink = ink + cells * cells * n, .cells = cells};
-        const int64_t seen = tag_pixels(&tag, grey, bytes, width, height, reach, pixels, most);
+        int64_t seen;
+        const int64_t squares = tag_pixels(&tag, grey, bytes, width, height, reach, blocks, most, &seen);
         if (seen <= PARAMETERS || cells > MOST_CELLS)
             continue;
-        for (int64_t k = 0; k < seen; k++)
-            tag.a += (pixels[k].value - 0.5 * tag.b) / (double)seen;
+        for (int64_t k = 0; k < squares; k++)
+            for (int i = 0; i < BLOCK; i++)
+                tag.a += (double)blocks[k].counts[i] * ((double)blocks[k].value[i] - 0.5 * tag.b) / (double)seen;
         const double dim = 1.0 / (rules->light_sigma * tag.scale);
         double N[PARAMETERS * PARAMETERS], step[PARAMETERS], variance = 0.0;
         int solved = 1, settled = 0;
         for (int64_t k = 0; k < rules->iterations && solved && !settled; k++) {
-            variance = tag_equations(&tag, pixels, seen, rules, N, step) / (double)(seen - PARAMETERS);
+            variance = tag_equations(&tag, blocks, squares, rules, N, step) / (double)(seen - PARAMETERS);
             variance = variance > rules->least_variance ? variance : rules->least_variance;
             const double straight = variance / (bend_sigma[n] * bend_sigma[n]);
             for (int i = BENDS; i < MOVES; i++) {

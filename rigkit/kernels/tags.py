@@ -10,7 +10,7 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-TAG_OUTCOMES, TAG_TERMS, TAG_SPOT = (header().constants[name] for name in ("TAG_OUTCOMES", "TAG_TERMS", "TAG_SPOT"))
+TAG_OUTCOMES, TAG_SIDE, TAG_BLOCK = (header().constants[name] for name in ("TAG_OUTCOMES", "TAG_SIDE", "TAG_BLOCK"))
 
 
 @structure("tag_rules_t")
@@ -45,12 +45,12 @@ def fit_tags(
     grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
     known = [np.ascontiguousarray(part, np.float64) for part in (maps, centres, scales)]
     starts = [np.ascontiguousarray(part, np.float64) for part in (blur, contrast, bend_sigma)]
-    most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) + 2.0) ** 2)
+    most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
     height, width = grey.shape
     out = np.empty((len(maps), TAG_OUTCOMES))
     kernels().fit_tags(
         *(grey, grey.dtype == np.uint8, width, height, len(maps), *known),
         *(np.ascontiguousarray(ink, np.bool_), ink.shape[1], np.ascontiguousarray(breaks, np.float64), reach),
-        *(*starts, rules, most, np.empty((most, TAG_SPOT)), out),
+        *(*starts, rules, most, np.empty((most, TAG_BLOCK)), out),
     )
     return out
