@@ -36,7 +36,7 @@ from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, TagSurface, seen_surface
-from rigkit.detection.tags.whole import with_whole_tags
+from rigkit.detection.tags.whole import WHOLE_ROUNDS, with_whole_tags
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
@@ -57,9 +57,6 @@ MAX_TAG_ROUNDS = 12
 NOTHING_NEAR_PX, LEAST_CONTRAST = 1e4, 10.0
 """Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
 starts from at least."""
-
-WHOLE_ROUNDS = 2
-"""Whole tags are fitted again with the picture bent as their finer corners have it."""
 
 TAG_OUTLIER, JUDGING_GAIN = 6.0, 1.5
 """A corner that lies off where those around have it by more than this, times what is usual and its own standard
@@ -265,8 +262,8 @@ class _Fitter:
         if self.tags.pattern.corner_squares:
             good = fit.valid & (fit.contrast > 0.0)
             factor = float(sigma_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0])
-        for _ in range(WHOLE_ROUNDS):
-            state = with_whole_tags(self.image, self.tags, self.places, state, self.map_of(state))
+        for rules in WHOLE_ROUNDS:
+            state = with_whole_tags(self.image, self.tags, self.places, state, self.map_of(state), rules)
         cells = state.known
         if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
             foretold = self.map_of(state).left_out()

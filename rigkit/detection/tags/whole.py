@@ -30,6 +30,7 @@ from rigkit.detection.subpixel.subpixel import LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tags import TagRules, fit_tags
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
 """A border narrower than this, s, has the code in all windows of its corners. On real images of a grid, made
@@ -44,19 +45,31 @@ of three tags or more, and a second difference of theirs has sqrt(6) of their si
 FELT_SIGMAS = 4.0
 """Edges further from a pixel than this, s, are nothing to it."""
 
-WHOLE_RULES = TagRules.of(
-    tail_sigmas=FELT_SIGMAS,
-    pixel_kurtosis=PIXEL_KURTOSIS,
-    sharp_blur=SHARP_BLUR_PX,
-    least_blur=BLUR_RANGE[0],
-    most_blur=BLUR_RANGE[1],
-    most_move_px=MAX_MOVE_PX,
-    most_blur_change=MAX_BLUR_CHANGE,
-    light_sigma=LIGHT_SIGMA_PER_PX,
-    least_variance=ROUNDING_VARIANCE,
-    converged_px=LAST_PASS[2],
-    iterations=LAST_PASS[1],
-)
+ROUGH_STEP_PX = 0.1
+"""A step that ends a round after which tags are fitted again: what is left after it is a tenth of it."""
+
+
+def _rules(converged_px: float) -> TagRules:
+    return TagRules.of(
+        tail_sigmas=FELT_SIGMAS,
+        pixel_kurtosis=PIXEL_KURTOSIS,
+        sharp_blur=SHARP_BLUR_PX,
+        least_blur=BLUR_RANGE[0],
+        most_blur=BLUR_RANGE[1],
+        most_move_px=MAX_MOVE_PX,
+        most_blur_change=MAX_BLUR_CHANGE,
+        light_sigma=LIGHT_SIGMA_PER_PX,
+        least_variance=ROUNDING_VARIANCE,
+        converged_px=converged_px,
+        iterations=LAST_PASS[1],
+    )
+
+
+WHOLE_ROUNDS = (_rules(ROUGH_STEP_PX), WHOLE_RULES := _rules(LAST_PASS[2]))
+"""Whole tags are fitted again with the picture bent as their finer corners have it."""
+
+PAPER_STEP = 2.0
+"""The whole step from ink to paper, in the contrast that the fit of the corner of a lone square has."""
 
 TAG_CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Of a tag, as the lattice has them row by row."""
@@ -66,7 +79,7 @@ MAP_NODES = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 5)] * 2), axis=-1).resh
 
 
 def with_whole_tags(
-    image: GreyImage, tags: TagBoard, places: FloatArray, state: BoardState, smooth: SmoothMap
+    image: GreyImage, tags: TagBoard, places: FloatArray, state: BoardState, smooth: SmoothMap, rules: TagRules
 ) -> BoardState:
     """Return the state with the corners of tags of narrow borders as the whole tags have them.
 
@@ -86,19 +99,33 @@ def with_whole_tags(
     row, column, corners, mine = row[narrow], column[narrow], corners[narrow], (mine[0][narrow], mine[1][narrow])
     maps, centres, scales = _maps(places[row, column], corners, smooth)
     ink, breaks = _ink(tags)
+    step = 1.0 if tags.pattern.corner_squares else PAPER_STEP
     found = fit_tags(
         *(image, maps, centres, scales, ink[row // 2, column // 2], breaks, 0.5 * tags.pattern.spacing),
-        *(np.full(len(row), blur), state.contrast[mine].mean(axis=1)),
-        *(BEND_SIGMAS * np.median(state.sigma_px[mine], axis=1), WHOLE_RULES),
+        *(np.full(len(row), blur), step * state.contrast[mine].mean(axis=1)),
+        *(BEND_SIGMAS * np.maximum(np.median(state.sigma_px[mine], axis=1), _scatter(state, smooth)), rules),
     )
     moves = found[:, :8].reshape(-1, 4, 2)
     furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
     good = (found[:, 15] > 0.5) & (found[:, 13] > 0.0)
     good &= furthest < np.maximum(VALID_MOVE_CELLS * longer[narrow], VALID_MOVE_PX)
-    pixels, sigma_px = state.pixels.copy(), state.sigma_px.copy()
+    pixels, sigma_px, blurs, contrast = (
+        part.copy() for part in (state.pixels, state.sigma_px, state.blur, state.contrast)
+    )
     better = mine[0][good], mine[1][good]
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
-    return replace(state, pixels=pixels, sigma_px=sigma_px)
+    blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
+    return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
+
+
+def _scatter(state: BoardState, smooth: SmoothMap) -> float:
+    """Return how far corners usually lie off where the others have them, px per axis, beside what those err by.
+
+    Where the map has too few terms for the lens, that is more than what corners are known to, and so are the bends.
+    """
+    foretold = smooth.left_out()
+    off = np.linalg.norm(state.pixels[state.known] - foretold.pixels, axis=1)
+    return float(np.nanmedian(off / np.hypot(1.0, foretold.gain))) / MEDIAN_OF_RAYLEIGH
 
 
 def _four(known: BoolArray) -> BoolArray:
