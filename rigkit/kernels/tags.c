@@ -11,7 +11,8 @@
 #include "kernels.h"
 
 enum { SHARES = 6, BENDS = 8, MOVES = 2 * SHARES, S = MOVES, A, B, GX, GY, PARAMETERS };
-enum { ORDERS = 4, MOST_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, LANES = 8, GROUPS = BLOCK / LANES };
+enum { ORDERS = 4, MOST_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, AT_ONCE = 4, LANES = 16 };
+_Static_assert(AT_ONCE * BLOCK == 4 * LANES, "products are taken in four parts");
 
 /* To the compiler so many numbers side by side, of any alignment. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
@@ -66,17 +67,17 @@ INLINE void tag_place(const tag_t *tag, const float *restrict du, const float *r
     }
 }
 
-/* Set `out` to the profiles at `place`, where a px is `slope` along the side. */
+/* Set `out` to the profiles at `place`, where a px is `slope` along the side, 1 / `per_slope`. */
 INLINE void profile_of(
-    const tag_t *tag, const float *restrict place, const float *restrict slope, const float *restrict kurtosis,
-    const tag_rules_t *rules, profile_t *restrict out)
+    const tag_t *tag, const float *restrict place, const float *restrict slope, const float *restrict per_slope,
+    const float *restrict kurtosis, const tag_rules_t *rules, profile_t *restrict out)
 {
     const int64_t breaks = tag->cells - 1;
-    const float s = (float)tag->s, tail = (float)rules->tail_sigmas * s;
+    const float once = (float)(1.0 / tag->s), tail = (float)(rules->tail_sigmas * tag->s);
     float per_s[BLOCK], low = 1e30f, high = -1e30f;
     for (int i = 0; i < BLOCK; i++) {
         const float reach = tail * slope[i];
-        per_s[i] = 1.0f / (slope[i] * s);
+        per_s[i] = once * per_slope[i];
         low = place[i] - reach < low ? place[i] - reach : low;
         high = place[i] + reach > high ? place[i] + reach : high;
     }
@@ -102,7 +103,7 @@ INLINE void profile_of(
     }
 }
 
-/* Add to `sums`, by orders along x and y, what the cells of one row have more than those of the row before it, `before`,
+/* Add to `sums`, by orders along x and y as far as the series below has them, what the cells of one row have more than those of the row before it, `before`,
  * beyond the edge `beyond` between the two; without such a row nothing lies before it. */
 INLINE void add_row(
     const profile_t *along, const uint8_t *ink, const uint8_t *before, const float (*restrict beyond)[BLOCK],
@@ -127,7 +128,7 @@ INLINE void add_row(
         return;
     for (int order = 0; order < ORDERS; order++)
         for (int other = 0; other < ORDERS; other++)
-            for (int i = 0; i < BLOCK; i++)
+            for (int i = 0; i < BLOCK && abs(order - other) != 3 && order * other != 3; i++)
                 sums[order][other][i] += row[order][i] * (beyond ? beyond[other][i] : other ? 0.0f : 1.0f);
 }
 
@@ -136,20 +137,21 @@ INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const
 {
     tag_place_t here;
     tag_place(tag, u, v, &here);
-    float n[2][2][BLOCK], slope[2][BLOCK], kurtosis[2][BLOCK];
+    float n[2][2][BLOCK], kurtosis[BLOCK], slope[BLOCK], per_slope[BLOCK];
     profile_t along[2];
     const double sharp = tag->s > rules->sharp_blur ? tag->s : rules->sharp_blur;
     const float excess = (float)(rules->pixel_kurtosis / (sharp * sharp * sharp * sharp)), per_s = (float)(1.0 / tag->s);
     for (int axis = 0; axis < 2; axis++) {
         for (int i = 0; i < BLOCK; i++) {
-            const float by_u = here.grow[axis][0][i], by_v = here.grow[axis][1][i], length = sqrtf(by_u * by_u + by_v * by_v);
-            slope[axis][i] = length > 1e-9f ? length : 1e-9f;
-            n[axis][0][i] = by_u / slope[axis][i];
-            n[axis][1][i] = by_v / slope[axis][i];
+            const float by_u = here.grow[axis][0][i], by_v = here.grow[axis][1][i], square = by_u * by_u + by_v * by_v;
+            slope[i] = sqrtf(square > 1e-18f ? square : 1e-18f);
+            per_slope[i] = 1.0f / slope[i];
+            n[axis][0][i] = by_u * per_slope[i];
+            n[axis][1][i] = by_v * per_slope[i];
             const float c2 = n[axis][0][i] * n[axis][0][i], s2 = n[axis][1][i] * n[axis][1][i];
-            kurtosis[axis][i] = excess * (c2 * c2 + s2 * s2);
+            kurtosis[i] = excess * (c2 * c2 + s2 * s2);
         }
-        profile_of(tag, here.at[axis], slope[axis], kurtosis[axis], rules, along + axis);
+        profile_of(tag, here.at[axis], slope, per_slope, kurtosis, rules, along + axis);
     }
     float sums[ORDERS][ORDERS][BLOCK] = {{{0.0f}}};
     const uint8_t *ink = tag->ink + along[1].first * tag->cells + along[0].first, *before = NULL;
@@ -228,8 +230,10 @@ static int64_t tag_pixels(
     return count;
 }
 
-/* Set `rows` to the derivatives of the residuals of the pixels of a square by every parameter, and to these. */
-INLINE void block_rows(const tag_t *tag, const tag_block_t *pixels, const tag_rules_t *rules, float (*restrict rows)[BLOCK])
+/* Set `rows`, from the pixel `first` of each on, to the derivatives of the residuals of the pixels of a square by every
+ * parameter, and to these. */
+INLINE void block_rows(
+    const tag_t *tag, const tag_block_t *pixels, const tag_rules_t *rules, int64_t first, float (*restrict rows)[AT_ONCE * BLOCK])
 {
     float u[BLOCK], v[BLOCK];
     memcpy(u, pixels->u, sizeof u);
@@ -248,16 +252,17 @@ INLINE void block_rows(const tag_t *tag, const tag_block_t *pixels, const tag_ru
     for (int i = 0; i < BLOCK; i++) {
         const float x = pixels->u[i] * per_px, y = pixels->v[i] * per_px, counts = pixels->counts[i];
         const float light = counts * (1.0f + light_u * x + light_v * y), level = a + b * share.of[i], steep = light * b;
+        const int64_t k = first + i;
         for (int part = 0; part < SHARES; part++) {
-            rows[2 * part][i] = -steep * pixels->share[part][i] * share.gradient[0][i];
-            rows[2 * part + 1][i] = -steep * pixels->share[part][i] * share.gradient[1][i];
+            rows[2 * part][k] = -steep * pixels->share[part][i] * share.gradient[0][i];
+            rows[2 * part + 1][k] = -steep * pixels->share[part][i] * share.gradient[1][i];
         }
-        rows[S][i] = steep * share.by_blur[i];
-        rows[A][i] = light;
-        rows[B][i] = light * share.of[i];
-        rows[GX][i] = counts * level * x;
-        rows[GY][i] = counts * level * y;
-        rows[PARAMETERS][i] = counts * pixels->value[i] - light * level;
+        rows[S][k] = steep * share.by_blur[i];
+        rows[A][k] = light;
+        rows[B][k] = light * share.of[i];
+        rows[GX][k] = counts * level * x;
+        rows[GY][k] = counts * level * y;
+        rows[PARAMETERS][k] = counts * pixels->value[i] - light * level;
     }
 }
 
@@ -269,18 +274,20 @@ static double tag_equations(
 {
     lanes_t sums[(PARAMETERS + 1) * (PARAMETERS + 2) / 2];
     memset(sums, 0, sizeof sums);
-    for (int64_t k = 0; k < count; k++) {
-        float rows[PARAMETERS + 1][BLOCK];
-        block_rows(tag, blocks + k, rules, rows);
+    for (int64_t start = 0; start < count; start += AT_ONCE) {
+        float rows[PARAMETERS + 1][AT_ONCE * BLOCK];
+        if (count - start < AT_ONCE)
+            memset(rows, 0, sizeof rows);
+        for (int64_t k = 0; k < AT_ONCE && start + k < count; k++)
+            block_rows(tag, blocks + start + k, rules, k * BLOCK, rows);
         lanes_t *sum = sums;
-        for (int i = 0; i <= PARAMETERS; i++)
+        for (int i = 0; i <= PARAMETERS; i++) {
+            const lanes_t *one = (const lanes_t *)rows[i], o0 = one[0], o1 = one[1], o2 = one[2], o3 = one[3];
             for (int j = 0; j <= i; j++, sum++) {
-                const lanes_t *one = (const lanes_t *)rows[i], *other = (const lanes_t *)rows[j];
-                lanes_t total = one[0] * other[0];
-                for (int group = 1; group < GROUPS; group++)
-                    total += one[group] * other[group];
-                *sum += total;
+                const lanes_t *other = (const lanes_t *)rows[j];
+                *sum += (o0 * other[0] + o1 * other[1]) + (o2 * other[2] + o3 * other[3]);
             }
+        }
     }
     double products[PARAMETERS + 1];
     const lanes_t *sum = sums;
