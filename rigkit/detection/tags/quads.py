@@ -3,6 +3,8 @@ the others have it is dropped."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +63,7 @@ def quadrilaterals(image: GreyImage) -> FloatArray:
     """
     grey = image if image.dtype == np.uint8 else np.clip(np.rint(image), 0, 255).astype(np.uint8)
     fewest = max(MIN_PERIMETER * max(grey.shape), MIN_OUTLINE_PX)
-    found: list[NDArray[np.int32]] = []
+    found: list[NDArray[np.integer[Any] | np.floating[Any]]] = []
     lengths: list[int] = []
     for side in THRESHOLD_SIDES:
         dark = cv2.adaptiveThreshold(
