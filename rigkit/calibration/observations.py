@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -24,12 +23,15 @@ class Workspace:
     def __init__(self) -> None:
         self._memory: FloatArray = np.empty(0)
 
-    def array(self, *shape: int) -> FloatArray:
-        """Return an array of that shape with arbitrary values; it is valid until the next call."""
-        size = math.prod(shape)
+    def derivatives(self, parameters: int, corners: int) -> tuple[FloatArray, FloatArray]:
+        """Return memory for the derivatives of N corners by their points (2, 3, N), with arbitrary values, and by P
+        parameters (2, P, N), zeros: valid until the next call."""
+        size = 2 * (3 + parameters) * corners
         if self._memory.size < size:
             self._memory = np.empty(size)
-        return self._memory[:size].reshape(shape)
+        by_point, by_parameters = self._memory[: 6 * corners], self._memory[6 * corners : size]
+        by_parameters.fill(0.0)
+        return by_point.reshape(2, 3, -1), by_parameters.reshape(2, parameters, -1)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -218,6 +218,47 @@ EXPORT void average_amounts(
     ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
     ARRAY(const double, sizes, count), int64_t count, ARRAY(double, out, DISPLACEMENTS, DISPLACEMENTS));
 
+/* linearise.c */
+
+/* Views of boards, padded to so many corners each, and what their residuals weigh (calibration.linearise): poses, the boards'
+ * points and by how much a warp moves them, which point each corner is, and where each point stands among those released (-1
+ * where it does not). Corners that do not project are `lost_px` off, along both axes; the loss is least squares where
+ * `loss_px` is zero. */
+typedef struct {
+    ARRAY(const double, rotation, views, 3, 3);
+    ARRAY(const double, translation, views, 3);
+    ARRAY(const double, table, points, 3);
+    ARRAY(const double, warp, points, 3, warps);
+    ARRAY(const int64_t, place, points);
+    ARRAY(const int64_t, point, views, corners);
+    ARRAY(const double, pixels, views, corners, 2);
+    ARRAY(const double, weight, views, corners);
+    int64_t views, corners, points, warps, released;
+    double loss_px, lost_px;
+} board_views_t;
+
+/* What they come to: residuals, which corners project, the cost of each view, and the sums of products of its `across` rows;
+ * of the released points those with all rows of their corners and their own three, and with the poses. */
+typedef struct {
+    ARRAY(double, residuals, 2, views, corners);
+    ARRAY(uint8_t, valid, views, corners);
+    ARRAY(double, costs, views);
+    ARRAY(double, products, views, across, across);
+    ARRAY(double, own, released, 3, across + 3);
+    ARRAY(double, poses, views, released, 3, POSE);
+    int64_t views, corners, across, released;
+} view_sums_t;
+
+/* Where the corners of the views from `first` on stand in the camera frame, and those without the translation. */
+EXPORT void place_corners(
+    const board_views_t *seen, int64_t first, int64_t count, ARRAY(double, lever, 3, count), ARRAY(double, points, 3, count));
+EXPORT int64_t rows_memory(int64_t across);
+EXPORT void add_views(
+    const board_views_t *seen, int64_t first, int64_t count, int64_t parameters,
+    ARRAY(const double, d_pixels_d_point, 2, 3, count), ARRAY(const double, d_pixels_d_parameters, 2, parameters, count),
+    ARRAY(const double, u, count), ARRAY(const double, v, count), ARRAY(const uint8_t, projects, count),
+    ARRAY(const double, lever, 3, count), ARRAY(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
+
 /* edges.c */
 
 /* How far two pixels lie apart, both ways, whose noise is compared: LAGS pairs, of which the opposite ones are the same.

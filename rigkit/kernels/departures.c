@@ -2,9 +2,6 @@
  * do. tests/kernels/reference/departures.py says in numpy what is computed. */
 #include "kernels.h"
 
-/* Corners whose rows are made at a time stay in the first cache; of the products four rows by eight stay in registers. */
-enum { CORNERS = 32, ACROSS = 8, DOWN = 4 };
-
 /* Write the displacements of the corner at (x, y), from the middle of the image in units of half its diagonal. */
 INLINE void displace(double x, double y, double u[DISPLACEMENTS], double v[DISPLACEMENTS])
 {
@@ -80,34 +77,14 @@ INLINE void write_rows(const lens_corners_t *c, double scale, int64_t n, int64_t
     displace(x, y, rows[0] + POSE + P, rows[1] + POSE + P);
 }
 
-/* Add to the upper triangle of `sums` (across, across), by blocks, the products of `count` rows. */
-INLINE void add_products(const double *rows, int64_t count, int64_t across, double *sums)
-{
-    for (int64_t i = 0; i < across; i += DOWN)
-        for (int64_t j = i - i % ACROSS; j < across; j += ACROSS) {
-            double block[DOWN][ACROSS] = {{0.0}};
-            for (int64_t r = 0; r < count; r++) {
-                const double *left = rows + r * across + i, *right = rows + r * across + j;
-                for (int64_t a = 0; a < DOWN; a++)
-#pragma omp simd
-                    for (int64_t b = 0; b < ACROSS; b++)
-                        block[a][b] += left[a] * right[b];
-            }
-            for (int64_t a = 0; a < DOWN; a++)
-                for (int64_t b = 0; b < ACROSS; b++)
-                    sums[(i + a) * across + j + b] += block[a][b];
-        }
-}
-
 int64_t lens_memory(int64_t parameters)
 {
-    const int64_t across = (POSE + parameters + DISPLACEMENTS + ACROSS) / ACROSS * ACROSS;
-    return across * (across + 2 * CORNERS);
+    return rows_memory(POSE + parameters + DISPLACEMENTS + 1);
 }
 
 EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *memory, double *with_pose, double *products)
 {
-    const int64_t all = POSE + c->parameters + DISPLACEMENTS + 1, across = (all + ACROSS - 1) / ACROSS * ACROSS;
+    const int64_t all = POSE + c->parameters + DISPLACEMENTS + 1, across = padded(all);
     const int64_t kept = all - POSE;
     const double scale = 2.0 / sqrt((double)(c->width * c->width + c->height * c->height));
     double *sums = memory, *rows = memory + across * across;

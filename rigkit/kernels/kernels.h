@@ -322,4 +322,32 @@ INLINE void blurred_edge(float x, float kurtosis, float out[5])
     out[4] = x * slope - 4.0f * third;
 }
 
+/* Rows of corners are made so many at a time: they stay in the first cache. Of their products four rows by eight stay in
+ * registers, so that rows are padded to a multiple of eight. */
+enum { CORNERS = 32, ACROSS = 8, DOWN = 4 };
+
+INLINE int64_t padded(int64_t across)
+{
+    return (across + ACROSS - 1) / ACROSS * ACROSS;
+}
+
+/* Add to the upper triangle of `sums` (across, across), by blocks, the products of `count` rows. */
+INLINE void add_products(const double *rows, int64_t count, int64_t across, double *sums)
+{
+    for (int64_t i = 0; i < across; i += DOWN)
+        for (int64_t j = i - i % ACROSS; j < across; j += ACROSS) {
+            double block[DOWN][ACROSS] = {{0.0}};
+            for (int64_t r = 0; r < count; r++) {
+                const double *left = rows + r * across + i, *right = rows + r * across + j;
+                for (int64_t a = 0; a < DOWN; a++)
+#pragma omp simd
+                    for (int64_t b = 0; b < ACROSS; b++)
+                        block[a][b] += left[a] * right[b];
+            }
+            for (int64_t a = 0; a < DOWN; a++)
+                for (int64_t b = 0; b < ACROSS; b++)
+                    sums[(i + a) * across + j + b] += block[a][b];
+        }
+}
+
 #endif

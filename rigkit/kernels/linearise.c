@@ -1,0 +1,112 @@
+/* The normal equations of views of boards: every corner's weighted rows of derivatives, and the sums of their products.
+ * tests/kernels/reference/linearise.py says in numpy what is computed. */
+#include "kernels.h"
+
+EXPORT FOR_EACH_PROCESSOR void place_corners(
+    const board_views_t *seen, int64_t first, int64_t count, double *lever, double *points)
+{
+    const int64_t C = seen->corners;
+    for (int64_t view = first, n = 0; n < count; view++) {
+        const double *R = seen->rotation + 9 * view, *t = seen->translation + 3 * view;
+        const int64_t *point = seen->point + C * view;
+        for (int64_t c = 0; c < C; c++, n++) {
+            const double *X = seen->table + 3 * point[c];
+            for (int64_t k = 0; k < 3; k++) {
+                const double q = R[3 * k] * X[0] + R[3 * k + 1] * X[1] + R[3 * k + 2] * X[2];
+                lever[count * k + n] = q;
+                points[count * k + n] = q + t[k];
+            }
+        }
+    }
+}
+
+int64_t rows_memory(int64_t across)
+{
+    return padded(across) * (padded(across) + 2 * CORNERS);
+}
+
+/* Add what the two rows (across) of a corner come to with its released point, whose derivatives are `left`. */
+INLINE void add_released(
+    const view_sums_t *sums, int64_t view, int64_t place, const double left[2][3], const double *row_u, const double *row_v)
+{
+    const int64_t K = sums->across, motion = K - 1 - POSE;
+    for (int64_t a = 0; a < 3; a++) {
+        double *own = sums->own + (3 * place + a) * (K + 3);
+        double *pose = sums->poses + ((view * sums->released + place) * 3 + a) * POSE;
+        for (int64_t k = 0; k < K; k++)
+            own[k] += left[0][a] * row_u[k] + left[1][a] * row_v[k];
+        for (int64_t b = 0; b < 3; b++)
+            own[K + b] += left[0][a] * left[0][b] + left[1][a] * left[1][b];
+        for (int64_t k = 0; k < POSE; k++)
+            pose[k] = left[0][a] * row_u[motion + k] + left[1][a] * row_v[motion + k];
+    }
+}
+
+EXPORT FOR_EACH_PROCESSOR void add_views(
+    const board_views_t *seen, int64_t first, int64_t count, int64_t parameters, const double *d_pixels_d_point,
+    const double *d_pixels_d_parameters, const double *u, const double *v, const uint8_t *projects, const double *lever,
+    double *memory, const view_sums_t *sums)
+{
+    const int64_t C = seen->corners, all = seen->views * C, B = seen->warps, K = sums->across, across = padded(K);
+    const double loss = seen->loss_px;
+    double *total = memory, *rows = memory + across * across;
+    memset(rows, 0, (size_t)(2 * CORNERS * across) * sizeof(double));
+    for (int64_t view = first, n = 0; n < count; view++) {
+        const double *R = seen->rotation + 9 * view;
+        double cost = 0.0;
+        int64_t used = 0;
+        memset(total, 0, (size_t)(across * across) * sizeof(double));
+        for (int64_t c = 0; c < C; c++, n++) {
+            const int64_t m = view * C + c, point = seen->point[m];
+            const double away[2] = {
+                projects[n] ? seen->pixels[2 * m] - u[n] : seen->lost_px,
+                projects[n] ? seen->pixels[2 * m + 1] - v[n] : seen->lost_px};
+            sums->residuals[m] = away[0];
+            sums->residuals[all + m] = away[1];
+            sums->valid[m] = projects[n];
+            double weight = seen->weight[m], squared = (away[0] * away[0] + away[1] * away[1]) * weight * weight;
+            if (loss > 0.0) {
+                squared /= loss * loss;
+                weight /= sqrt(1.0 + squared);
+                squared = loss * loss * log1p(squared);
+            }
+            cost += squared;
+            /* A corner outside the model's field of view has no derivative; it waits until a step brings it back. */
+            if (!projects[n] || weight == 0.0)
+                continue;
+            const double q[3] = {lever[n], lever[count + n], lever[2 * count + n]};
+            double left[2][3];
+            double *both = rows + 2 * across * used++;
+            for (int64_t i = 0; i < 2; i++) {
+                const double *J = d_pixels_d_point + 3 * count * i + n, *by = d_pixels_d_parameters + parameters * count * i + n;
+                const double j[3] = {weight * J[0], weight * J[count], weight * J[2 * count]};
+                double *row = both + across * i, *motion = row + parameters + B;
+                for (int64_t k = 0; k < parameters; k++)
+                    row[k] = weight * by[k * count];
+                for (int64_t k = 0; k < 3; k++)
+                    left[i][k] = j[0] * R[k] + j[1] * R[3 + k] + j[2] * R[6 + k];
+                const double *warp = seen->warp + 3 * B * point;
+                for (int64_t b = 0; b < B; b++)
+                    row[parameters + b] = left[i][0] * warp[b] + left[i][1] * warp[B + b] + left[i][2] * warp[2 * B + b];
+                motion[0] = q[1] * j[2] - q[2] * j[1];
+                motion[1] = q[2] * j[0] - q[0] * j[2];
+                motion[2] = q[0] * j[1] - q[1] * j[0];
+                for (int64_t k = 0; k < 3; k++)
+                    motion[3 + k] = j[k];
+                motion[POSE] = weight * away[i];
+            }
+            if (seen->released && seen->place[point] >= 0)
+                add_released(sums, view, seen->place[point], left, both, both + across);
+            if (used == CORNERS) {
+                add_products(rows, 2 * used, across, total);
+                used = 0;
+            }
+        }
+        add_products(rows, 2 * used, across, total);
+        sums->costs[view] = cost;
+        double *own = sums->products + K * K * view;
+        for (int64_t i = 0; i < K; i++)
+            for (int64_t j = i; j < K; j++)
+                own[i * K + j] = own[j * K + i] = total[i * across + j];
+    }
+}

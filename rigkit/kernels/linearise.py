@@ -1,0 +1,85 @@
+"""Calls of the kernels in linearise.c: the normal equations of views of boards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+
+
+@structure("board_views_t")
+class BoardViews(Struct):
+    """Views of boards, padded to the same number of corners: poses, boards, pixels, weights; members as in api.h."""
+
+    def placed(self, first: int, stop: int) -> tuple[FloatArray, FloatArray]:
+        """Return the lever arms R X and the points R X + t, (3, N) mm each, of the corners of the views from `first` to
+        before `stop`."""
+        count = (stop - first) * self.corners
+        lever, points = np.empty((3, count)), np.empty((3, count))
+        kernels().place_corners(self, first, count, lever, points)
+        return lever, points
+
+
+@structure("view_sums_t")
+class _ViewSums(Struct):
+    """Where the kernel writes to."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ViewSums:
+    """What views come to: `residuals` (2, V, C) px, which corners are `valid` (V, C), `costs` (V,) px^2, and of every
+    view the sums of `products` of its weighted rows (V, K, K): derivatives by the parameters, the warp and the pose
+    (w, t), and the residual. Those of the released points are `own` (R, 3, K + 3), with all rows of their corners and
+    their own three, and `poses` (V, R, 3, 6).
+    """
+
+    seen: BoardViews
+    residuals: FloatArray
+    valid: BoolArray
+    costs: FloatArray
+    products: FloatArray
+    own: FloatArray
+    poses: FloatArray
+    _memory: FloatArray = field(repr=False)
+    _struct: _ViewSums = field(repr=False)
+
+    @classmethod
+    def of(cls, seen: BoardViews, across: int) -> ViewSums:
+        """Return the sums of K = `across` rows, with no view added yet."""
+        v, c, r = seen.views, seen.corners, seen.released
+        residuals, valid, costs = np.empty((2, v, c)), np.empty((v, c), dtype=bool), np.empty(v)
+        products, own, poses = np.empty((v, across, across)), np.zeros((r, 3, across + 3)), np.zeros((v, r, 3, 6))
+        struct = _ViewSums.of(
+            residuals=residuals,
+            valid=valid,
+            costs=costs,
+            products=products,
+            own=own,
+            poses=poses,
+            views=v,
+            corners=c,
+            across=across,
+            released=r,
+        )
+        memory = np.empty(kernels().rows_memory(across))
+        return cls(seen, residuals, valid, costs, products, own, poses, memory, struct)
+
+    def add(
+        self,
+        first: int,
+        by_point: FloatArray,
+        by_parameters: FloatArray,
+        projected: tuple[FloatArray, FloatArray, BoolArray],
+        lever: FloatArray,
+    ) -> None:
+        """Add the views from `first` on, of N corners in all: `by_point` (2, 3, N), `by_parameters` (2, P, N) and what
+        `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
+        count, parameters = lever.shape[1], by_parameters.shape[1]
+        u, v, valid = (np.ascontiguousarray(one) for one in projected)
+        kernels().add_views(
+            self.seen, first, count, parameters, by_point, by_parameters, u, v, valid, lever, self._memory, self._struct
+        )
