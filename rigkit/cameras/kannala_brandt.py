@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -96,13 +96,9 @@ class KannalaBrandt(FocalCamera):
         values = knots * self._factor(knots * knots)
         valid = radius <= values[-1]
         radius = np.where(valid, radius, 0.0)
-        slope = self._slope_coefficients()
-
-        def residual(theta: FloatArray, index: IntArray | None) -> tuple[FloatArray, FloatArray]:
-            theta2 = theta * theta
-            wanted = radius if index is None else radius[index]
-            return theta * self._factor(theta2) - wanted, horner(slope, theta2)
-
-        theta = invert_increasing(residual, radius, knots, values)
+        odd = np.zeros(10)
+        odd[1], odd[3::2] = 1.0, self.parameters[4:]
+        parts = np.zeros_like(radius), np.ones_like(radius), radius
+        theta = invert_increasing(odd, parts, radius, knots, values)
         sine = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
         return sine, np.cos(theta), valid

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
+from rigkit.kernels.monotone import inverses
 
 REAL_ROOT = 1e-7
 """A computed root whose imaginary part is below this share of its size is real: rounding splits a double root."""
-LAST_STEP_REL = 1e-9
-"""Newton doubles the digits at each step: after one this small, as a share of the range, all are right."""
-QUICK_STEPS = 3
-"""Newton steps from the table for all points; nearly all are done after two."""
-RELATIVE_STEP = 1e-14
-MAX_BISECTIONS = 60
-"""The rest is bracketed: bisection alone reaches double precision in this many steps."""
 CELLS_PER_KNOT = 4
 """The table is looked up in equal cells of the target, found by a division instead of a search."""
 
@@ -61,54 +53,23 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
 
 
 def invert_increasing(
-    function: Callable[[FloatArray, IntArray | None], tuple[FloatArray, FloatArray]],
+    polynomial: FloatArray,
+    parts: tuple[FloatArray, FloatArray, FloatArray],
     target: FloatArray,
     knots: FloatArray,
     values: FloatArray,
 ) -> FloatArray:
-    """Return x with g(x) = target by Newton's method kept inside a bracket.
+    """Return x (N,) with linear x + factor P(x) = offset, where that increases in x, by Newton's method kept inside a
+    bracket.
 
     Parameters
     ----------
-    function : called with (x, index) where `index` says which of the targets are asked for (None: all); returns the
-        residual, zero at the solution and increasing in x, and its derivative.
-    target : (N,) values in [values[0], values[-1]]; the caller replaces what is outside, and NaN.
-    knots, values : (K,) a table of the function, both increasing: it gives the bracket and the start.
+    polynomial : coefficients of P, of the power zero first.
+    parts : linear, factor and offset, (N,) each.
+    target : (N,) values in [values[0], values[-1]] of a function of x; the caller replaces what is outside, and NaN.
+    knots, values : (K,) a table of that function, both increasing: it gives the bracket and the start.
     """
-    x = _looked_up(target, knots, values)
-    first, last = float(knots[0]), float(knots[-1])
-    for step in range(QUICK_STEPS):
-        residual, slope = function(x, None)
-        move = residual / slope
-        done = np.abs(move) <= LAST_STEP_REL * (last - first)
-        x = np.clip(x - move, first, last)
-        if step and done.all():
-            return x
-    index = np.flatnonzero(~done)
-    low, high = np.full(index.size, first), np.full(index.size, last)
-    # NaN (a slope of zero) must not be the start.
-    x[index] = np.where(np.isfinite(x[index]), x[index], 0.5 * (first + last))
-    for _ in range(MAX_BISECTIONS):
-        old = x[index]
-        residual, slope = function(old, index)
-        above = residual > 0.0
-        high = np.where(above, old, high)
-        low = np.where(above, low, old)
-        new = old - residual / slope
-        new = np.where((new >= low) & (new <= high), new, 0.5 * (low + high))
-        x[index] = new
-        moving = np.abs(new - old) > RELATIVE_STEP * (last - first)
-        if not moving.any():
-            break
-        index, low, high = index[moving], low[moving], high[moving]
-    return x
-
-
-def _looked_up(target: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:
-    """Return x from the table by linear interpolation in equal cells of the target."""
     cells = CELLS_PER_KNOT * (knots.size - 1)
-    table = np.interp(np.linspace(values[0], values[-1], cells + 1), values, knots)
-    position = (target - values[0]) * (cells / (values[-1] - values[0]))
-    cell = np.clip(position.astype(np.int64), 0, cells - 1)
-    left = table[cell]
-    return np.asarray(left + (position - cell) * (table[cell + 1] - left))
+    ends = float(values[0]), float(values[-1])
+    table = np.interp(np.linspace(*ends, cells + 1), values, knots)
+    return inverses(polynomial, parts, target, table, ends, (float(knots[0]), float(knots[-1])))

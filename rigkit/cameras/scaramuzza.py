@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.cameras.base import RadialCurve, image_center
 from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
 from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
 DEGREES = range(3, 11)
@@ -121,12 +121,9 @@ class Scaramuzza(RadialCamera):
         theta = np.where(valid, theta, 0.0)
         sine, cosine = np.where(valid, r / length, 0.0), np.where(valid, z / length, 1.0)
 
-        def residual(rho: FloatArray, index: IntArray | None) -> tuple[FloatArray, FloatArray]:
-            s, c = (sine, cosine) if index is None else (sine[index], cosine[index])
-            return c * rho - s * horner(self._polynomial, rho), c - s * horner(self._slope, rho)
-
         # z rho - r f = |(rho, f)| sin(angle(rho) - theta) changes sign once, from minus to plus, on the range.
-        return sine, cosine, invert_increasing(residual, theta, knots, angles), valid
+        parts = cosine, -sine, np.zeros_like(theta)
+        return sine, cosine, invert_increasing(self._polynomial, parts, theta, knots, angles), valid
 
     def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
         r, _, rho, valid = self._solve(r2, z)

@@ -259,6 +259,30 @@ EXPORT void add_views(
     ARRAY(const double, u, count), ARRAY(const double, v, count), ARRAY(const uint8_t, projects, count),
     ARRAY(const double, lever, 3, count), ARRAY(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
 
+/* coverage.c */
+
+EXPORT void cover_pixels(
+    ARRAY(const int64_t, grid, count, 2), ARRAY(const double, corners, count, 2), int64_t count,
+    ARRAY(const int64_t, counts, views), int64_t views, double squares, ARRAY(const double, pixels, asked, 2), int64_t asked,
+    ARRAY(uint8_t, covered, asked));
+
+/* monotone.c */
+
+/* Functions linear x + factor P(x) - offset that increase from `low` to `high`, and a table of their roots, even in a target
+ * from `first` to `last`. */
+typedef struct {
+    ARRAY(const double, polynomial, terms);
+    ARRAY(const double, linear, count);
+    ARRAY(const double, factor, count);
+    ARRAY(const double, offset, count);
+    ARRAY(const double, target, count);
+    ARRAY(const double, table, cells + 1);
+    int64_t terms, count, cells;
+    double first, last, low, high;
+} increasing_t;
+
+EXPORT void invert_increasing(const increasing_t *functions, ARRAY(double, out, functions.count));
+
 /* edges.c */
 
 /* How far two pixels lie apart, both ways, whose noise is compared: LAGS pairs, of which the opposite ones are the same.

@@ -1,0 +1,52 @@
+"""The call of the kernel in monotone.c: inverting increasing functions that a polynomial makes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+
+
+@structure("increasing_t")
+class _Increasing(Struct):
+    """The functions, a table from which each inverse starts, and the range of the inverses."""
+
+
+def inverses(
+    polynomial: FloatArray,
+    parts: tuple[FloatArray, FloatArray, FloatArray],
+    target: FloatArray,
+    table: FloatArray,
+    values: tuple[float, float],
+    limits: tuple[float, float],
+) -> FloatArray:
+    """Return the x (N,) between the `limits` at which linear x + factor P(x) - offset, increasing in x, vanishes: by
+    Newton's method kept inside a bracket.
+
+    Parameters
+    ----------
+    polynomial : coefficients of P, of the power zero first.
+    parts : linear, factor and offset, (N,) each.
+    target : (N,) by which the `table` of x (cells + 1,), even in it from the first of `values` to the second, is read.
+    """
+    linear, factor, offset = (np.ascontiguousarray(part, np.float64) for part in parts)
+    out = np.empty(len(target))
+    functions = _Increasing.of(
+        polynomial=np.ascontiguousarray(polynomial, np.float64),
+        linear=linear,
+        factor=factor,
+        offset=offset,
+        target=np.ascontiguousarray(target, np.float64),
+        table=table,
+        count=len(out),
+        terms=len(polynomial),
+        cells=len(table) - 1,
+        first=values[0],
+        last=values[1],
+        low=limits[0],
+        high=limits[1],
+    )
+    kernels().invert_increasing(functions, out)
+    return out
