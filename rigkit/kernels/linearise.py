@@ -29,7 +29,7 @@ class _ViewSums(Struct):
     """Where the kernel writes to."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewSums:
     """What views come to: `residuals` (2, V, C) px, which corners are `valid` (V, C), `costs` (V,) px^2, and of every
     view the sums of `products` of its weighted rows (V, K, K): derivatives by the parameters, the warp and the pose
@@ -66,7 +66,17 @@ class ViewSums:
             released=r,
         )
         memory = np.empty(kernels().rows_memory(across))
-        return cls(seen, residuals, valid, costs, products, own, poses, memory, struct)
+        return cls(
+            seen=seen,
+            residuals=residuals,
+            valid=valid,
+            costs=costs,
+            products=products,
+            own=own,
+            poses=poses,
+            _memory=memory,
+            _struct=struct,
+        )
 
     def add(
         self,
