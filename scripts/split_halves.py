@@ -7,7 +7,10 @@ difference is mostly of one kind, so that this ratio scatters by itself: beside 
 if the sigmas are true (the errors of all images drawn anew, the splits the same). And a test that never alarms is
 worthless: other cameras, and slightly moved lenses, must be found.
 
-    python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--cache DIR] [--power] [--model MODEL]
+    python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
+        [--model MODEL]
+
+With --images so many images are calibrated apart from all others: what a small session says of itself.
 """
 
 from __future__ import annotations
@@ -141,10 +144,11 @@ def load(name: str, data: Path, cache: Path) -> tuple[Views, tuple[int, int]]:
     return found, size
 
 
-def halves(views: Views, rng: np.random.Generator) -> tuple[Views, Views]:
-    """Return the images, split at random."""
+def halves(views: Views, rng: np.random.Generator, images: int | None = None) -> tuple[Views, Views]:
+    """Return the images, split at random: in halves, or so many `images` and all others."""
     names = rng.permutation(sorted(views)).tolist()
-    return tuple({name: views[name] for name in sorted(part)} for part in (names[::2], names[1::2]))  # type: ignore[return-value]
+    parts = (names[::2], names[1::2]) if images is None else (names[:images], names[images:])
+    return tuple({name: views[name] for name in sorted(part)} for part in parts)  # type: ignore[return-value]
 
 
 def calibrated(views: Views, size_px: tuple[int, int], model: str) -> Calibration:
@@ -205,13 +209,15 @@ def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str,
     return np.exp(np.quantile(logs, [0.025, 0.5, 0.975]))
 
 
-def split(name: str, loaded: tuple[Views, tuple[int, int]], splits: int, model: str) -> list[CalibrationComparison]:
-    """Print and return the comparisons of random halves of a set."""
+def split(
+    name: str, loaded: tuple[Views, tuple[int, int]], splits: int, model: str, images: int | None
+) -> list[CalibrationComparison]:
+    """Print and return the comparisons of random halves of a set, or of so many `images` with all others."""
     rng = np.random.default_rng(len(name))
     found = []
     for k in range(splits):
         try:
-            a, b = (calibrated(part, loaded[1], model) for part in halves(loaded[0], rng))
+            a, b = (calibrated(part, loaded[1], model) for part in halves(loaded[0], rng, images))
             found.append(compare_calibrations(a, b))
         except RigkitError as error:
             print(f"{name} split {k}: {error}", flush=True)
@@ -295,6 +301,7 @@ def main() -> None:
     parser.add_argument("--splits", type=int, default=6)
     parser.add_argument("--cache", type=Path, default=Path("/tmp/split_halves_cache"), help="of corners")
     parser.add_argument("--model", default="scaramuzza")
+    parser.add_argument("--images", type=int, help="so many against all others, instead of halves")
     parser.add_argument("--power", action="store_true", help="find other cameras and moved lenses")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
@@ -304,7 +311,7 @@ def main() -> None:
         if args.power:
             power(name, loaded, args.model)
         else:
-            everything[name] = split(name, loaded, args.splits, args.model)
+            everything[name] = split(name, loaded, args.splits, args.model, args.images)
     pairs = [(a, b) for a, b in OTHERS if args.power and (not args.sets or {a, b} <= set(args.sets))]
     for a, b in pairs:
         first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))
@@ -314,10 +321,13 @@ def main() -> None:
             ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
             other = sum(c.verdict is CameraVerdict.OTHER for c in found)
             views, size = load(name, args.data, args.cache)
-            low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
+            likely = ""
+            if args.images is None:
+                low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
+                likely = f" (if sigmas are true {usual:.2f}, 95 % from {low:.2f} to {high:.2f})"
             print(
-                f"{name} ({len(views)} images): geometric mean ratio {ratio:.2f} (if sigmas are true {usual:.2f}, 95 % "
-                f"from {low:.2f} to {high:.2f}); another camera in {other} of {len(found)}",
+                f"{name} ({len(views)} images): geometric mean ratio {ratio:.2f}{likely}; another camera in {other} of "
+                f"{len(found)}",
                 flush=True,
             )
 

@@ -31,8 +31,8 @@ import numpy as np
 from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.core.arrays import FloatArray, IntArray
 
-MIN_CLUSTERS = 4
-"""Fewer images (or frames) say nothing about how they differ."""
+MIN_CLUSTERS = 2
+"""One image (or frame) says nothing about how they differ."""
 MIN_LEFT = 0.05
 """What is left of an image's pull in a direction that it alone determines: less is rounding."""
 MAX_FOR_EIGENVALUES = 24

@@ -39,6 +39,8 @@ GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
 FOLD = 1e-6
 """A fold begins at the solution of all images: a step that promises less of the cost changes no digit shown."""
+LEAST_IMAGES = 3
+"""So many images can be left out one at a time: two others still show a camera."""
 SETTLE_ROUNDS = 8
 MAX_SCATTER_OF_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
@@ -238,14 +240,16 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
 
 def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
     """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
-    shape from the other images, only the poses of its boards refitted. None with fewer images than folds.
+    shape from the other images, only the poses of its boards refitted. Of fewer images than folds each is one. None
+    with less than LEAST_IMAGES.
 
     Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
     decides no more than it is worth.
     """
     images = list(dict.fromkeys(observations.images))
-    if folds < 2 or len(images) < folds:
+    if folds < 2 or len(images) < LEAST_IMAGES:
         return None
+    folds = min(folds, len(images))
     place = {name: i for i, name in enumerate(images)}
     image = np.array([place[name] for name in observations.images])
     fold = image % folds

@@ -302,7 +302,7 @@ class Calibration:
         convention; sqrt(2) larger than an RMS per coordinate.
     heldout_rms_px : the headline. The RMS over images that took no part, of a corner of median quality (residuals are
         weighted as in the solution): k-fold over images, intrinsics and board shape frozen, only the pose of the
-        held-out board refitted. None with fewer images than folds.
+        held-out board refitted. None with fewer than three images.
     covariance : (P, P) of `camera.parameters`.
     frame_covariance : (P + 6, P + 6) of the parameters together with the mean motion of the boards, (rad, mm): what
         `uncertainty` needs to tell a moved camera from another lens.

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calibration.test_clustered import disturbed
 from helpers.calibration_scenes import (
     BOARD,
     REACH_DEG,
@@ -208,9 +209,20 @@ def test_uncertainty_at_corners_from_pixels_or_points(rng: np.random.Generator) 
     assert there == pytest.approx(FarProjection.of(result).at_corners_px, rel=0.01)
 
 
-def test_too_few_images_for_folds(rng: np.random.Generator) -> None:
+def test_few_images_are_left_out_one_at_a_time(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("wide"), 3, rng, reach_deg=55.0)
-    assert calibrate(views, SIZE, model="kannala_brandt").heldout_rms_px is None
+    assert heldout(calibrate(views, SIZE, model="kannala_brandt")) > 0.0
+    assert calibrate(views[:2], SIZE, model="kannala_brandt").heldout_rms_px is None
+
+
+def test_a_board_is_not_bent_to_what_corners_of_an_image_have_in_common() -> None:
+    """To single corners that is what a bent board would be (by BIC in all six); to other images it is not."""
+    kinds = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        views, _, _ = random_views(lens("wide"), 4, rng, reach_deg=REACH_DEG["wide"], noise_px=0.0)
+        kinds.append(calibrate(disturbed(views, rng, 0.1), SIZE, model="kannala_brandt").boards[0].kind)
+    assert kinds.count("flat") >= 3
 
 
 def test_bad_input_says_what_to_do(rng: np.random.Generator) -> None:

@@ -25,6 +25,9 @@ RATIO = (0.75, 1.3)
 """Observed over predicted standard deviation, root mean square over parameters and runs: 40 runs of 15 views know it to
 about 10 %."""
 CORNERS_PX, IMAGES_PX = 0.05, 0.15
+FEW_RUNS = 20
+FEW_RATIO = (0.7, 2.2)
+"""The same of three images, median of runs: 1.4, and 4.3 if corners are taken for independent."""
 GOOD_PX, FAIR_PX = 0.03, 0.05
 """Errors in common of a good image, and of one with which a thousandth of a focal length is not found any more."""
 MOVED_PX = {"reg": 2.47, "wide": 1.82, "fish": 0.46}
@@ -102,10 +105,24 @@ def test_a_moved_principal_point_is_found_behind_an_uncertain_focal_length(name:
     assert found.difference.rms_px < 2.0 * found.usual_px[1]
 
 
-def test_few_clusters_say_nothing() -> None:
+def test_one_cluster_says_nothing() -> None:
     unit = np.diag([1.0, 4.0])
-    found = clustered_covariance(unit, np.tile(np.eye(2), (3, 1, 1)), np.ones((3, 2)), np.zeros((2, 2)), 0.5)
+    found = clustered_covariance(unit, np.eye(2)[None], np.ones((1, 2)), np.zeros((2, 2)), 0.5)
     assert (found.covariance == 0.25 * unit).all() and found.overdispersion == 1.0 and np.isinf(found.freedom)
+
+
+def test_three_images_say_how_much_they_disagree() -> None:
+    camera, squared, predicted = lens("fish"), [], []
+    rng = np.random.default_rng(8)
+    for _ in range(FEW_RUNS):
+        views, rotation, translation = random_views(camera, 3, rng, reach_deg=REACH_DEG["fish"], noise_px=0.0)
+        views = disturbed(views, rng, IMAGES_PX)
+        result = calibrated(views, State.start(camera, rotation, translation, Observations.from_views(views)))
+        assert 1.0 <= result.freedom <= 2.0
+        squared.append((result.camera.parameters - camera.parameters) ** 2)
+        predicted.append(np.diag(result.covariance))
+    ratio = float(np.median(np.sqrt(np.mean(np.array(squared) / predicted, axis=1))))
+    assert FEW_RATIO[0] < ratio < FEW_RATIO[1]
 
 
 def test_what_follows_the_block(rng: np.random.Generator) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigkit.calibration.fit import LEAST_IMAGES
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
@@ -15,8 +16,8 @@ FOLD_TOLERANCE = 1e-6
 
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
     """Return the 2-D RMS over frames that took no part, of all cameras together and of each: cameras, mounts, places
-    and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. None with fewer
-    frames than folds, or where those of one fold alone tell where a camera sits.
+    and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. Of fewer frames
+    than folds each is one. None with less than LEAST_IMAGES, or where those of one fold alone tell where a camera sits.
 
     It counts what a held-out error of single cameras cannot see: cameras that disagree. Residuals are weighted
     as in the solution.
@@ -24,8 +25,10 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
     observations, state = joint.observations, joint.solution.state
     frame = joint.frames
     nothing = None, (None,) * len(observations.cameras)
-    if folds < 2 or int(frame.max()) + 1 < folds:
+    frames = int(frame.max()) + 1
+    if folds < 2 or frames < LEAST_IMAGES:
         return nothing
+    folds = min(folds, frames)
     squared, count = np.zeros(len(observations.cameras)), np.zeros(len(observations.cameras))
     for k in range(folds):
         test = frame % folds == k
