@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -133,7 +134,7 @@ class CaptureGuide:
         error = plan.error if self.calibration is not None else None
         enough = (
             error is not None
-            and len(self.views) >= ENOUGH_FRAMES
+            and _distinct(self.views) >= ENOUGH_FRAMES
             and (error <= self.options.wanted or plan.gain < WORTH_GOING_ON)
         )
         unit = plan.goal.unit
@@ -206,8 +207,9 @@ class CaptureGuide:
         return knowledge, self.options.goal(knowledge.camera)
 
     def _worth(self, view: BoardView | None, plan: Plan) -> float:
-        """Return what this frame brings, as a part of what the outline would."""
-        if view is None:
+        """Return what this frame brings, as a part of what the outline would: nothing where the board was not moved
+        since one that is taken, for the two count as one."""
+        if view is None or _distinct([*self.views, view]) == _distinct(self.views):
             return 0.0
         pose = self._pose_of(view, plan.knowledge.camera)
         if pose is None:
@@ -222,6 +224,14 @@ class CaptureGuide:
             assert self.size_px is not None
             camera = self._known(self.size_px)[0].camera
         return _pose(camera, view)
+
+
+def _distinct(views: Sequence[BoardView]) -> int:
+    """Return how many views there are without those that repeat another."""
+    if not views:
+        return 0
+    names = [f"{k}" for k in range(len(views))]
+    return len(set(cluster_numbers(names, [v.board.board_id for v in views], [v.pixels for v in views]).tolist()))
 
 
 def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:

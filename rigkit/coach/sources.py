@@ -120,10 +120,9 @@ def _moment(sources: Sequence[cv2.VideoCapture]) -> list[NDArray[Any] | None]:
     """Return an image of each, None where there is none any more."""
     # All are told to take theirs before any is fetched, so that they are of one moment.
     grabbed = [source.grab() for source in sources]
-    read = [source.retrieve() for source in sources]
+    read = [source.retrieve() if good else (False, None) for good, source in zip(grabbed, sources, strict=True)]
     return [
-        np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) if good and got else None
-        for good, (got, frame) in zip(grabbed, read, strict=True)
+        np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) if got and frame is not None else None for got, frame in read
     ]
 
 

@@ -113,8 +113,9 @@ def finished_words(folder: Path) -> str:
 
 def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Severity, written: Sequence[Path]) -> str:
     error = f"rms {rms_px:.3f} px" if heldout_px is None else f"held-out {heldout_px:.3f} px"
-    why = "" if verdict is Severity.GOOD else f" ({written[-1].name} says why)"
-    return f"Done: {what}, {error}, {verdict}{why}; {written[0].name} written"
+    page = written[-1].name
+    more = {Severity.LOOK: f"; {page} says what to look at", Severity.BAD: f"; do not trust it: {page} says why"}
+    return f"Done: {what}, {error}, {written[0].name} written{more.get(verdict, '')}"
 
 
 def coach_frames(

@@ -72,7 +72,7 @@ def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.nda
     again = glance_at(pictures[0], [BOARD], "b", first)
     assert again.still and again.sharp and guide.advise(again).take
     guide.add(again.view, again.size_px)  # type: ignore[arg-type]
-    assert not guide.advise(again).take, "the same once more brings little"
+    assert guide.advise(again).worth == 0.0, "the same once more counts as one"
     blurred = glance_at(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c").as_photo()
     assert blurred.view is None or (not blurred.sharp and not guide.advise(blurred).take)
     empty = glance_at(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
