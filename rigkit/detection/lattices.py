@@ -39,6 +39,10 @@ MIN_PART_CORNERS = 6
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
 
+MORE_EVIDENCE = 0.5
+"""The second fit of small squares adds no more to the score of the evidence: on 21 boards, blurred by up to 4 px, from
+-2.7 to 0.1, on 38 other lattices in real images 0.3 at most."""
+
 
 def find_lattices(
     image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = (), *, marked: bool = False
@@ -81,7 +85,9 @@ def fitted(
     """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch."""
     size_px = (grey.shape[1], grey.shape[0])
     out = []
-    for item in _confirmed(boards, refine(grey, boards), min_corners, sizes):
+    least_score = -MORE_EVIDENCE - (OF_EXPECTED_SIZE if sizes else 0.0)
+    refined = refine(grey, boards, lambda item: Evidence.of(item).score > least_score)
+    for item in _confirmed(boards, refined, min_corners, sizes):
         own = without_outliers(item, size_px)
         parts = (
             split_at_discontinuities(own, several=too_large(own.lattice, sizes))
@@ -132,5 +138,5 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample])
+    (refined,) = refine(grey, [sample], lambda item: Evidence.of(item).score > -MORE_EVIDENCE)
     return trustworthy(refined, sample.count, 0)

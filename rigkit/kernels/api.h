@@ -79,8 +79,8 @@ EXPORT void smooth_bytes(
     ARRAY(float, half, (height + 1) / 2, (width + 1) / 2));
 EXPORT void typical_values(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width, int64_t step,
-    ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
-    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)));
+    int64_t few, ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
+    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
 EXPORT int64_t find_peaks(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float threshold,
     ARRAY(float, scratch, 5 * (width + STRIP + 4)), ARRAY(uint8_t, high, 5 * (width / STRIP + 1)),

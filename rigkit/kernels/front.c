@@ -3,6 +3,9 @@
  * The definitions in numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection: saddles and lattice.links. */
 #include "kernels.h"
 
+/* So many bits of a number at a time are counted to rank it. */
+#define RANK_BITS 11
+
 /* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
 FOR_EACH_PROCESSOR void shrink_floats(
     const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums,
@@ -129,16 +132,58 @@ INLINE float saddle_response(const float *at, int64_t width)
     return uv * uv - uu * vv;
 }
 
-/* |response| and brightness at every step-th inner pixel of every step-th inner row, row by row. */
-void typical_values(
-    const float *smooth, int64_t height, int64_t width, int64_t step, float *response, float *brightness)
+/* Return a number of the order of `value` among all floats: as integers of their bits positive ones are in order. */
+INLINE uint32_t order_of(float value)
 {
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits ^ (bits >> 31 ? UINT32_MAX : UINT32_C(1) << 31);
+}
+
+/* Return what `at` of `count` values are smaller than or equal to: its bits from the highest downwards, by counting the
+ * values that share those found so far. */
+static float value_at_rank(const float *values, int64_t count, int64_t at)
+{
+    uint32_t found = 0;
+    int32_t often[1 << RANK_BITS];
+    for (int left = 32; left > 0;) {
+        const int low = left > RANK_BITS ? left - RANK_BITS : 0;
+        const uint32_t mask = (UINT32_C(1) << (left - low)) - 1;
+        memset(often, 0, sizeof often);
+        for (int64_t k = 0; k < count; k++) {
+            const uint32_t order = order_of(values[k]);
+            /* A shift by 32 is undefined. */
+            if (((uint64_t)(order ^ found) >> left) == 0)
+                often[order >> low & mask]++;
+        }
+        uint32_t bits = 0;
+        for (; at >= often[bits] && bits < mask; bits++)
+            at -= often[bits];
+        found |= bits << low;
+        left = low;
+    }
+    const uint32_t sign = found >> 31 ? UINT32_C(1) << 31 : UINT32_MAX, back = found ^ sign;
+    float value;
+    memcpy(&value, &back, sizeof value);
+    return value;
+}
+
+/* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness
+ * that `few` of them are darker and brighter than. */
+void typical_values(
+    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness,
+    float *out)
+{
+    int64_t count = 0;
     for (int64_t v = 1; v < height - 1; v += step)
         for (int64_t u = 1; u < width - 1; u += step) {
             const float *at = smooth + v * width + u;
-            *response++ = fabsf(saddle_response(at, width));
-            *brightness++ = *at;
+            response[count] = fabsf(saddle_response(at, width));
+            brightness[count++] = *at;
         }
+    out[0] = value_at_rank(response, count, count / 2);
+    out[1] = value_at_rank(brightness, count, few);
+    out[2] = value_at_rank(brightness, count, count - 1 - few);
 }
 
 /* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row are peaks: not lower than the

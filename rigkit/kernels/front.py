@@ -88,12 +88,15 @@ def smoothed(image: Picture, kernel: Image) -> tuple[Image, Image]:
     return smooth, half
 
 
-def typical(smooth: Image, step: int) -> tuple[Image, Image]:
-    """Return |response| and brightness at every `step`-th inner pixel of every `step`-th inner row."""
+def typical(smooth: Image, step: int, extreme: float) -> tuple[float, float, float]:
+    """Return the upper median of |response|, and how bright all but the part `extreme` at either end are, at least and
+    at most: at every `step`-th inner pixel of every `step`-th inner row."""
     height, width = smooth.shape
-    out = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
-    kernels().typical_values(smooth, height, width, step, out[0], out[1])
-    return out[0], out[1]
+    seen = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
+    out, few = np.empty(3, np.float32), int(extreme * seen.shape[1])
+    kernels().typical_values(smooth, height, width, step, few, seen[0], seen[1], out)
+    response, darkest, brightest = out.tolist()
+    return response, darkest, brightest
 
 
 def peaks(smooth: Image, threshold: float, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:

@@ -209,12 +209,14 @@ def _splits(sums: _Sums, wide: int, several: bool) -> list[_Split]:
     possible = (np.minimum(left.corners, right.corners) >= MIN_BESIDE) & (corners - taken >= MIN_FREE)
     if not possible.any():
         return []
+    together = both.fitted(CUBIC)[1] / np.maximum(corners - CUBIC, 1)
+    floor = both.variance / np.maximum(corners, 1) + FLOOR_CELLS**2
+    if not several and not (possible & (together > TWO_SURFACES**2 * floor)).any():
+        return []
     one, apart1 = left.fitted(QUADRATIC)
     two, apart2 = right.fitted(QUADRATIC)
-    _, together = both.fitted(CUBIC)
-    floor = both.variance / np.maximum(corners, 1) + FLOOR_CELLS**2
     alone = (apart1 + apart2) / np.maximum(corners - taken, 1) + floor
-    ratio = np.sqrt(together / np.maximum(corners - CUBIC, 1) / alone)
+    ratio = np.sqrt(together / alone)
     if not several and not (possible & (ratio > TWO_SURFACES)).any():
         return []
     # How far apart the sides have rows that they share, anywhere from the last column of one to the first of the other.

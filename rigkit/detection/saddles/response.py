@@ -158,19 +158,9 @@ def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
 def _threshold(smooth: FloatImage) -> float:
     """Return the smallest D of a peak."""
     step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
-    response, brightness = front.typical(smooth, step)
-    few = int(EXTREME * len(brightness))
-    span = _ranked(brightness, len(brightness) - 1 - few) - _ranked(brightness, few)
-    contrast = (max(span, MIN_SPAN) / 200.0) ** 2
-    return min(
-        max(NOISE_FACTOR * _ranked(response, len(response) // 2), THRESHOLD_FLOOR * contrast),
-        THRESHOLD_CEILING * contrast,
-    )
-
-
-def _ranked(values: FloatImage, at: int) -> float:
-    """Return what `at` of the `values` (N,) are smaller than or equal to; for two of them at once numpy is slow."""
-    return float(np.partition(values, at)[at])
+    response, darkest, brightest = front.typical(smooth, step, EXTREME)
+    contrast = (max(brightest - darkest, MIN_SPAN) / 200.0) ** 2
+    return min(max(NOISE_FACTOR * response, THRESHOLD_FLOOR * contrast), THRESHOLD_CEILING * contrast)
 
 
 def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:

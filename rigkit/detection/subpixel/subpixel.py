@@ -73,11 +73,14 @@ alike. On rendered boards under a ruler the factor is 12 and more, on boards wit
 noise is 0.065 and more. Glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
 
 
-def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice]:
+def refine(
+    image: GreyImage, lattices: Sequence[Lattice], may_be: Callable[[RefinedLattice], bool] = lambda _: True
+) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
     Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
-    confirms are added.
+    confirms are added. Lattices with small squares that `may_be` no boards, as far as one fit tells, are not fitted
+    once more.
     """
     if not lattices:
         return []
@@ -88,6 +91,10 @@ def refine(image: GreyImage, lattices: Sequence[Lattice]) -> list[RefinedLattice
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
     blur = _typical_blur(first, sheet.parts)
     last, reached, factors = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts)
+    for part in sheet.parts if reached.any() else ():
+        # Clutter in the background is small, and would cost as much as the board.
+        mine = last.cut(*part)
+        reached[part] &= mine.lattice.count > 0 and may_be(mine)
     if reached.any():
         # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
         once = last.without(~reached)

@@ -57,8 +57,11 @@ def smoothed(image: GreyImage, kernel: FloatImage) -> tuple[FloatImage, FloatIma
     return smooth, np.ascontiguousarray(smooth[::2, ::2])
 
 
-def typical(smooth: FloatImage, step: int) -> tuple[FloatImage, FloatImage]:
-    return np.abs(_response(smooth)[::step, ::step]).ravel(), smooth[1:-1:step, 1:-1:step].ravel()
+def typical(smooth: FloatImage, step: int, extreme: float) -> tuple[float, float, float]:
+    response = np.sort(np.abs(_response(smooth)[::step, ::step]), axis=None)
+    brightness = np.sort(smooth[1:-1:step, 1:-1:step], axis=None)
+    few = int(extreme * len(brightness))
+    return float(response[len(response) // 2]), float(brightness[few]), float(brightness[-1 - few])
 
 
 def peaks(smooth: FloatImage, threshold: float, limit: int, side: int, finest: int) -> tuple[IntArray, FloatImage]:
