@@ -91,13 +91,13 @@ def test_a_board_in_a_room_with_tiles(pattern: Pattern) -> None:
     board = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
     camera = Pinhole((1400, 600), np.array([800.0, 800.0, 699.5, 299.5]))
     images = []
-    for k, size in enumerate(((9, 8), (10, 9), (11, 8), (12, 9))):
+    for k, size in enumerate(((9, 8), (10, 9), (11, 8))):
         tiles = PlacedBoard(Board("tiles", *size, 50.0, 50.0), Rigid3(np.eye(3), [80.0, -200.0, 800.0 + k]))
         held = PlacedBoard(board, Rigid3(np.eye(3), [-520.0 - 5.0 * k, -150.0, 700.0]))
         images.append(grey_image(render([tiles, held], camera, Rigid3.identity(), optics=Optics(0.5))))
     guess = guess_board(images)
     assert guess is not None and type(guess.board.pattern) is type(pattern)
-    assert guess.board.size == (8, 6) and sorted(guess.images) == [0, 1, 2, 3]
+    assert guess.board.size == (8, 6) and sorted(guess.images) == [0, 1, 2]
 
 
 def test_markers_far_into_a_dictionary_are_told() -> None:
