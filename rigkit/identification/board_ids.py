@@ -151,10 +151,10 @@ def _by_side(
     located: Sequence[LocatedBoard], names: list[str | None], free: list[int], sides: Mapping[str, str]
 ) -> None:
     """Give the boards with a side to the located boards that face most nearly as that side does."""
-    from scipy.optimize import linear_sum_assignment
-
     if not sides:
         return
+    from scipy.optimize import linear_sum_assignment
+
     ids = list(sides)
     likeness = np.array([[located[n].face @ BOARD_SIDES[sides[i]] for i in ids] for n in free])
     for row, column in zip(*linear_sum_assignment(-likeness), strict=True):
