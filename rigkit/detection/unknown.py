@@ -61,23 +61,20 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     """
     tags, markers = TagSightings(), MarkerSightings()
     plain: list[list[BoardDetection]] = []
-    looked, sure = 0, []
+    sure = []
     for k, image in enumerate(images):
         progress(LOOKING, k, len(images))
         plain.append([d for d in detect_boards(image) if d.complete])
         if any(_without_marks(image, found) for found in plain[-1]):
             sure.append(k)
             continue
-        # Many dictionaries take a second a picture: a board without markers is not asked for ever.
-        if not tags.look(k, image) and (markers.images or looked < MARKER_TRIES):
+        if not tags.look(k, image):
             markers.look(k, image)
-        looked += 1
     # A tiled floor is a chessboard without marks in every image, but hardly of one size in most.
     if tags.images or markers.images or not _in_most(plain):
         for k in sure:
-            if not tags.look(k, images[k]) and (markers.images or looked < MARKER_TRIES):
+            if not tags.look(k, images[k]):
                 markers.look(k, images[k])
-            looked += 1
     guess = _guess_of(images, plain, tags, markers)
     progress(LOOKING, len(images), len(images))
     return guess
@@ -97,12 +94,6 @@ def _guess_of(
         guess = _plain_guess(images, plain)
         if guess is not None:
             return guess
-        # Blurred frames at the beginning of a video show no markers.
-        for every in (False, True):
-            if not markers.images:
-                for k, image in enumerate(images):
-                    markers.look(k, image, every=every)
-        charuco = guessed_charuco(markers)
     if charuco is not None:
         return BoardGuess(charuco, tuple(markers.images))
     # Last, as the markers of ChArUco boards stand in rows, too.
@@ -200,9 +191,6 @@ def _differs(one: object, two: object) -> bool:
 def _article(kind: str) -> str:
     return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
 
-
-MARKER_TRIES = 2
-"""Pictures in which markers are looked for, until some are seen."""
 
 SAME_PRINTED_RATIO = 0.05
 """Ratios read from images differ from those of the print by less."""

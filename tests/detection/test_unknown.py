@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +15,9 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.tags.unknown_charuco import MarkerSightings
+from rigkit.detection.tags import unknown_tags
+from rigkit.detection.tags.codes import Codes, TagCode
+from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import TagSightings
 from rigkit.detection.unknown import LOOKING, difference, guess_board
 from rigkit.geometry.rigid3 import Rigid3
@@ -71,7 +74,7 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
 
 
 def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten dictionaries in two polarities take seconds a picture."""
+    """Ten dictionaries in two polarities take longer than the board."""
 
     def asked(*_: object) -> bool:
         raise AssertionError("marks are read")
@@ -105,6 +108,43 @@ def test_markers_far_into_a_dictionary_are_told() -> None:
     guess = guess_board([shown(board)])
     assert guess is not None and isinstance(guess.board.pattern, Charuco)
     assert guess.board.pattern.first_marker == 600 and guess.board.size == (8, 5)
+
+
+def test_markers_of_a_blurred_board_are_read() -> None:
+    """Edges as wide as modules: OpenCV reads none."""
+    image = shown(Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_4X4_1000", 45.0, first_marker=600)))
+    seen = MarkerSightings()
+    assert seen.look(0, cv2.GaussianBlur(np.asarray(image), (0, 0), 2.0).astype(np.uint8))
+    (kind, (numbers, _, _)) = seen.markers[0]
+    assert kind == ("DICT_4X4_1000", False)
+    assert len(numbers) >= 6 and numbers.min() >= 600 and numbers.max() < 627
+
+
+def test_a_misread_marker_does_not_make_the_board_larger() -> None:
+    pattern = Charuco("DICT_4X4_50", 0.75)
+    places = np.array(pattern.places(8, 5))
+    numbers = np.arange(len(places))
+    misread = numbers.copy()
+    misread[5] = 900
+    seen, kind = MarkerSightings(images=[0, 1]), ("DICT_4X4_1000", False)
+    seen.kinds[kind] = len(places)
+    # No image shows its whole height.
+    for part in (places[:, 1] < 4, places[:, 1] > 2):
+        seen.markers.append((kind, (misread[part], places[part], 0.75)))
+    board = guessed_charuco(seen)
+    assert board is not None and board.size == (8, 5) and board.pattern == pattern
+
+
+def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    def repeated(_: GreyImage, quads: np.ndarray, codes: Codes) -> TagCode:
+        count = len(quads)
+        return TagCode(
+            codes.numbers[4 * (np.arange(count) % 3)], np.zeros(count, np.int64), np.ones(count), np.ones(count)
+        )
+
+    monkeypatch.setattr(unknown_tags, "read_tags", repeated)
+    monkeypatch.setattr(TagSightings, "look_alone", lambda *_: False)
+    assert not TagSightings().look(0, shown(Board("b", 8, 6, 60.0, 60.0)))
 
 
 def test_circles_are_told_where_there_are_no_squares() -> None:

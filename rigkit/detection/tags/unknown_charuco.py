@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-import cv2
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
-from rigkit.core.patterns.aruco import SIZES, marker_count, smallest_dictionary
+from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies
+from rigkit.detection.tags.markers import ReadMarkers, read_markers
 
 DICTIONARIES = (
     *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)),
@@ -59,14 +58,10 @@ class MarkerSightings:
     kinds: Counter[tuple[str, bool]] = field(default_factory=Counter)
     markers: list[tuple[tuple[str, bool], Markers]] = field(default_factory=list)
 
-    def look(self, index: int, image: GreyImage, *, every: bool = True) -> bool:
-        """Read the markers of an image, or only the first ones of each dictionary; say whether some lie in squares."""
-        grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
-        both = {False: grey, True: 255 - grey}
-        for kind, dictionary in self._tries(every):
-            own = _in_squares(*_markers(both[kind[1]], dictionary))
-            if own is not None and dictionary != kind[0]:
-                own = _in_squares(*_markers(both[kind[1]], kind[0]))
+    def look(self, index: int, image: GreyImage) -> bool:
+        """Read the markers of an image; say whether some lie in squares."""
+        for kind, read in self._read(np.clip(np.rint(image), 0, 255).astype(np.uint8)):
+            own = _in_squares(read.corners, read.numbers)
             if own is not None:
                 self.kinds[kind] += len(own[0])
                 self.markers.append((kind, own))
@@ -74,31 +69,18 @@ class MarkerSightings:
                 return True
         return False
 
-    def _tries(self, every: bool) -> Iterator[tuple[tuple[str, bool], str]]:
-        """Yield the kinds and what is read of them: what was seen before is tried first; then, as the time goes by the
-        number of markers and most boards begin with marker 0, the first ones of every kind, then all."""
+    def _read(self, grey: np.ndarray[Any, np.dtype[np.uint8]]) -> list[tuple[tuple[str, bool], ReadMarkers]]:
+        """Return the kinds of markers that an image shows: those seen before, then those that more is like."""
         before = [kind for kind, _ in self.kinds.most_common(2)]
-        yield from ((kind, kind[0]) for kind in before)
-        if len(self.images) >= SURE_OF_KIND:
-            return
-        kinds = [(name, inverted) for inverted in (False, True) for name in DICTIONARIES]
-        yield from ((kind, _beginning(kind[0])) for kind in kinds)
-        if every:
-            yield from ((kind, kind[0]) for kind in kinds if kind not in before and _beginning(kind[0]) != kind[0])
-
-
-def _beginning(dictionary: str) -> str:
-    """Return the dictionary of a kind's first markers, where OpenCV has one."""
-    kind, _, count = dictionary.rpartition("_")
-    return f"{kind}_{SIZES[0]}" if count == str(SIZES[-1]) else dictionary
-
-
-def _markers(grey: np.ndarray[Any, np.dtype[np.uint8]], dictionary: str) -> tuple[FloatArray, IntArray]:
-    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
-    corners, numbers, _ = cv2.aruco.ArucoDetector(known).detectMarkers(grey)
-    if numbers is None or not len(numbers):
-        return np.zeros((0, 4, 2)), np.zeros(0, np.int64)
-    return np.array(corners, dtype=np.float64).reshape(-1, 4, 2), np.asarray(numbers, dtype=np.int64).ravel()
+        wanted = before
+        if len(self.images) < SURE_OF_KIND:
+            wanted = [(name, inverted) for inverted in (False, True) for name in DICTIONARIES]
+        read = []
+        for inverted in (False, True):
+            names = [name for name, other in wanted if other == inverted]
+            seen = read_markers(255 - grey if inverted else grey, names) if names else {}
+            read += [((name, inverted), markers) for name, markers in seen.items()]
+        return sorted(read, key=lambda item: (item[0] not in before, -float(item[1].likeness.sum())))
 
 
 def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
@@ -156,13 +138,14 @@ def guessed_charuco(seen: MarkerSightings) -> Board | None:
     columns = two_rows.most_common(1)[0][0] - 1 if two_rows else 0
     if columns < 2:
         return None
+    own = [_in_order(*markers, columns) for markers in own]
     first = _first_marker(own)
     last = max(int(numbers.max()) for numbers, *_ in own)
     side = round(float(np.median([side for _, _, side in own])), 2)
     tall = Counter(int(np.ptp(places[:, 1])) for _, places, _ in own)
     best: tuple[int, int, Board] | None = None
     for legacy in (False, True):
-        for rows in sorted({*tall, 2 * (last + 1 - first) // (columns + 1)}):
+        for rows in sorted({*tall, round(2.0 * (last + 1 - first) / (columns + 1)) - 1}):
             if rows < 2:
                 continue
             least = smallest_dictionary(dictionary, first + ((columns + 1) * (rows + 1) + 1) // 2)
@@ -175,6 +158,15 @@ def guessed_charuco(seen: MarkerSightings) -> Board | None:
             if best is None or (fitting, -rows) > best[:2]:
                 best = fitting, -rows, board
     return None if best is None else best[2]
+
+
+def _in_order(numbers: IntArray, places: IntArray, side: float, columns: int) -> Markers:
+    """Return the markers of an image without those whose numbers are not what their squares make them on a board of so
+    many columns of corners: misread ones."""
+    # Every second square has a marker, so that numbers are known to half a marker.
+    first = numbers - 0.5 * ((columns + 1) * places[:, 1] + places[:, 0])
+    kept = np.abs(first - np.median(first)) <= 1.0
+    return numbers[kept], places[kept], side
 
 
 def _fitting(pattern: Charuco, board: Board, numbers: IntArray, places: IntArray) -> int:

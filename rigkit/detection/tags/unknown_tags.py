@@ -115,7 +115,8 @@ class TagSightings:
         total, (family, border), codes = best
         turn = int(np.bincount(codes.turns[codes.read], minlength=4).argmax())
         own = codes.read & (codes.turns == turn)
-        if np.count_nonzero(own) < MIN_TAGS_READ:
+        # On a board every number stands once; what chance reads in squares that look alike is the same again and again.
+        if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_TAGS_READ:
             return False
         columns, rows = lattice.size
         cells = grid_turned(np.stack([column, row], axis=-1)[own], (columns - 1, rows - 1), -turn)
