@@ -128,7 +128,10 @@ def without_lookalikes(
     whole boards than are listed, there are copies of them, and their parts are welcome.
     """
     listed = {frozenset(board.size) for board in boards}
-    whole = {name: [frozenset((d.columns, d.rows)) in listed for d in own] for name, own in detections.items()}
+    whole = {
+        name: [d.board_id is not None or (d.complete and frozenset((d.columns, d.rows)) in listed) for d in own]
+        for name, own in detections.items()
+    }
     counts = [sum(own) for own in whole.values() if any(own)]
     copies = sum(count > len(boards) for count in counts) > MAX_SHARE_COPIES * len(counts)
     return {

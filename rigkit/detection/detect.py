@@ -11,6 +11,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.chessboard import Chessboard
+from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.nearby import near_any
@@ -37,7 +38,7 @@ def detect_boards(
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
         stays a grid of its own. A board is named only where one single given board has that size and one single
-        detection fits it, or by its marks.
+        detection fits it (whole, where others lack corners that would lie in the image), or by its marks.
     min_corners : boards with fewer corners are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known: it shows which parts are of one board (`guided.rejoin`) and where
         corners of known boards were missed, and fits all of them with windows and lines as it sees them
@@ -65,7 +66,8 @@ def detect_boards(
     if search.fewest < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank)
-    return tuple(_with_ids(_without_repeated(ordered), [board for board in search.boards if not board.identified]))
+    plain = [board for board in search.boards if not board.identified]
+    return tuple(_with_ids(_without_repeated(ordered), plain, (stored.shape[1], stored.shape[0])))
 
 
 def _whole(item: BoardDetection, sizes: Sequence[tuple[int, int]]) -> bool:
@@ -93,12 +95,25 @@ def _without_repeated(found: Sequence[BoardDetection]) -> list[BoardDetection]:
     return [found[k] for k in kept]
 
 
-def _with_ids(found: list[BoardDetection], boards: Sequence[Board]) -> list[BoardDetection]:
-    """Return `found` with the names of those boards that only one detection, and that only this board, can be."""
+def _cut_by_frame(item: BoardDetection, size_px: tuple[int, int]) -> bool:
+    """Return whether most of the corners that `item` lacks are not in the image, whose (width, height) is `size_px`."""
+    lattice = item.lattice()
+    missing = fit_cells(lattice, np.isnan(lattice[..., 0]), degree=1).pixels
+    return 2 * int(np.count_nonzero(((missing < 0.0) | (missing > np.array(size_px) - 1.0)).any(axis=1))) > len(missing)
+
+
+def _with_ids(found: list[BoardDetection], boards: Sequence[Board], size_px: tuple[int, int]) -> list[BoardDetection]:
+    """Return `found` with the names of those boards that only one detection, and that only this board, can be.
+
+    A whole board is it rather than a grid that lacks corners within the image: a floor or a shirt has patches of any
+    size. One that the frame cuts may be a copy.
+    """
     out = list(found)
     for board in boards:
         same_size = [other for other in boards if set(other.size) == set(board.size)]
         fitting = [i for i, item in enumerate(found) if (item.columns, item.rows) == board.size]
+        if any(found[i].complete for i in fitting):
+            fitting = [i for i in fitting if found[i].complete or _cut_by_frame(found[i], size_px)]
         if len(same_size) == 1 and len(fitting) == 1:
             out[fitting[0]] = found[fitting[0]].named(board.board_id)
     return out

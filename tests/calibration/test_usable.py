@@ -86,6 +86,8 @@ def test_tiles_beside_the_whole_board_are_no_part_of_it() -> None:
     # A board that is named is one, though only its lower half is seen.
     half = BoardDetection("stated", 9, 7, whole.grid[27:], whole.pixels[27:], whole.sigma_px[27:])
     assert left({"0.png": [half, tiles]}) == [[36]]
+    # A patch of tiles may have the board's size, but seldom all of its corners.
+    assert left({"0.png": [whole, grid(9, 7, corners=55)], "1.png": [grid(9, 7, corners=55)]}) == [[63], [56]]
     # A part of another board that is listed is welcome while that one is not seen.
     assert left({"0.png": [whole, tiles]}, (*STATED, Board("second", 6, 5, 30.0, 30.0))) == [[63, 20]]
 

@@ -105,6 +105,17 @@ def test_not_named_where_two_boards_have_the_size(rng: np.random.Generator) -> N
     assert found.board_id is None
 
 
+def test_a_whole_board_is_named_beside_a_patch_of_its_size() -> None:
+    squares = np.indices((7, 10)).sum(axis=0) % 2
+    board = np.pad(np.kron(40.0 + 160.0 * squares, np.ones((30, 30))), 30, constant_values=220.0)
+    patch = board.copy()
+    patch[100:160, 100:200] = 130.0
+    for beside, names in ((patch, ["only", None]), (board, [None, None])):
+        image = np.rint(cv2.GaussianBlur(np.hstack([board, beside]), (0, 0), 1.0)).astype(np.uint8)
+        found = detect_boards(image, [Board("only", 9, 6, 30.0, 30.0)])
+        assert [(item.columns, item.rows, item.board_id) for item in found] == [(9, 6, name) for name in names]
+
+
 def test_smallest_board_is_found_where_it_is_known(rng: np.random.Generator) -> None:
     board = Board("a", 3, 3, 60.0, 60.0)
     scene = single(board, [0.2, 0.15, 0.3], 620.0)
