@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.calibration.coverage import outline_of_corners
-from rigkit.calibration.displaced import LensModes
+from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
@@ -56,6 +56,15 @@ class SavedRig:
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     departures: tuple[LensModes, ...] = ()
+
+    @property
+    def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:
+        """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
+        these, camera by camera, and of the mounts; None where the file does not say it."""
+        cameras = tuple(camera for camera, _ in self.cameras.values())
+        if self.covariance is None or not self.departures:
+            return cameras, self.covariance
+        return with_modes(cameras, self.covariance, self.departures)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:

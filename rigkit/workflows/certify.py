@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.displaced import uncertain_camera, with_modes
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
@@ -100,14 +100,12 @@ def load_instrument(
             freedom=calibration.freedom,
         )
     saved = load_saved_rig(path)
-    if saved.covariance is None or saved.sigma_px is None:
+    lenses, covariance = saved.with_departures
+    if covariance is None or saved.sigma_px is None:
         raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
     names = list(saved.cameras)
     if len(names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
-    lenses, covariance = tuple(camera for camera, _ in saved.cameras.values()), saved.covariance
-    if saved.departures:
-        lenses, covariance = with_modes(lenses, covariance, saved.departures)
     return instrument_of_rig(
         names,
         lenses,

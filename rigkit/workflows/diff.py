@@ -142,7 +142,7 @@ def _rigs(a: Path, b: Path) -> RigPair:
             f"diff: '{a}' has the cameras {', '.join(names)}, '{b}' {', '.join(second.cameras)}; "
             "give rigs of the same cameras"
         )
-    mounts = compare_mounts(*(Mounted(rig.cameras, rig.covariance, rig.freedom) for rig in (first, second)))
+    mounts = compare_mounts(_mounted(first), _mounted(second))
     cameras = {}
     for name in names:
         beside = [path.with_name(f"{path.stem}-{name}.json") for path in (a, b)]
@@ -151,6 +151,13 @@ def _rigs(a: Path, b: Path) -> RigPair:
         else:
             cameras[name] = CameraPair(compare_cameras(first.cameras[name][0], second.cameras[name][0]), None)
     return RigPair(mounts, cameras)
+
+
+def _mounted(rig: SavedRig) -> Mounted:
+    """Return the cameras of a rig; mounts move with what their lenses may do beyond their models."""
+    lenses, covariance = rig.with_departures
+    cameras = {name: (lens, pose) for lens, (name, (_, pose)) in zip(lenses, rig.cameras.items(), strict=True)}
+    return Mounted(cameras, covariance, rig.freedom)
 
 
 def _named_like(rig: SavedRig, other: SavedRig, path: Path) -> SavedRig:

@@ -30,6 +30,7 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.io.rig_file import load_saved_rig, rig_text
 from rigkit.kernels.departures import displacements
 from rigkit.workflows.certify import load_instrument
+from rigkit.workflows.diff import RigPair, diff
 
 NOISE_PX = 0.2
 SIGMAS = 4.0
@@ -401,6 +402,13 @@ def test_the_rig_follows_a_departure_as_a_new_fit_does(rng: np.random.Generator)
     assert np.abs(expected[-12:]).max() > 0.02
 
 
+def mounts_apart(a: Path, b: Path) -> float:
+    """Return the chance of the difference of two rigs' mounts."""
+    found = diff(a, b)
+    assert isinstance(found, RigPair) and found.mounts.chance is not None
+    return found.mounts.chance
+
+
 def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.Generator, tmp_path: Path) -> None:
     rig = calibrated(rig_views(rng, 8))
     path = tmp_path / "rig.json"
@@ -412,7 +420,17 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
     instrument = load_instrument(path, ("reg", "fish"))
     assert [c.parameters.size for c in instrument.cameras] == [lenses[k].parameters.size for k in (0, 2)]
     assert instrument.intrinsic_count > sum(rig.cameras[k].camera.parameters.size for k in (0, 2))
+    # What lenses may do moves mounts: a difference of theirs is less of a surprise.
+    other = tmp_path / "other.json"
+    other.write_text(rig_text(calibrated(rig_views(rng, 8))))
+    found = mounts_apart(path, other)
     # A file of before files said so, and damaged ones.
+    for old in (path, other):
+        data = json.loads(old.read_text())
+        for camera in data["cameras"]:
+            camera.pop("departures")
+        (tmp_path / f"old-{old.name}").write_text(json.dumps(data))
+    assert found > mounts_apart(tmp_path / "old-rig.json", tmp_path / "old-other.json")
     data = json.loads(path.read_text())
     for camera in data["cameras"]:
         camera.pop("departures")
