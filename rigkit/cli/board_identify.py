@@ -11,6 +11,7 @@ from rigkit.core.errors import ExitCode, InputError
 def identify(args: argparse.Namespace) -> int:
     """Print which board the images show, write its file where one is named, and return the exit code."""
     from rigkit.cli.console import note, progress_on_stderr
+    from rigkit.detection.twins import ALIKE_REMEDY
     from rigkit.io.board_file import board_text
     from rigkit.io.files import ensure_writable, write_atomic
     from rigkit.io.video import is_video
@@ -36,6 +37,9 @@ def identify(args: argparse.Namespace) -> int:
         text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
         write_atomic(path, text, force=args.force)
         print(path)
+    if found.alike:
+        seen = f"{len(found.alike)} of {len(found.looked_at)} images, such as '{found.alike[0]}'"
+        note(f"two boards alike in {seen}: detect and calibrate find only one of them; {ALIKE_REMEDY}")
     for error in found.unreadable:
         note(f"left out: {error}")
     return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL

@@ -17,6 +17,9 @@ from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.tags.codes import Codes, read_tags
 from rigkit.detection.tags.quads import quadrilaterals
 
+ALIKE_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
+"""What is to be done about boards that nothing tells apart."""
+
 MIN_TWINS = 3
 """Marks that are seen twice: one may be misread."""
 
@@ -30,7 +33,10 @@ def alike_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | N
     grey = without_mosaic(grey_image(image))
     for board in boards:
         if board.identified and _twins(*_marks(grey, board)) >= MIN_TWINS:
-            return f"the marks of '{board.board_id}' are seen twice: of boards alike in one image only one is found"
+            return (
+                f"the marks of '{board.board_id}' are seen twice: of boards alike in one image only one is found; "
+                f"{ALIKE_REMEDY}"
+            )
     return None
 
 

@@ -14,6 +14,7 @@ from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
@@ -40,6 +41,7 @@ class IdentifiedBoard:
     words : as `--board` takes them, but for the length: "aprilgrid:6x6xMM,spacing=0.3".
     beside : the words of other boards that the images show.
     unreadable : why other images could not be read.
+    alike : names of images that show two of these boards: nothing tells whose marks are whose.
     """
 
     board: Board
@@ -48,6 +50,7 @@ class IdentifiedBoard:
     words: str
     beside: tuple[str, ...] = ()
     unreadable: tuple[InputError, ...] = ()
+    alike: tuple[str, ...] = ()
 
 
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
@@ -80,6 +83,8 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
         nothing = "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {nothing}")
+    pictures = list(images.values())
+    twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
         board=guess.board,
         seen=tuple(names[k] for k in guess.images),
@@ -87,6 +92,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
         words=words_of_board(guess.board),
         beside=tuple(words_of_board(board) for board in guess.beside),
         unreadable=tuple(unreadable),
+        alike=twice,
     )
 
 
