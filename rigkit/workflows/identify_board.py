@@ -30,7 +30,7 @@ FRAMES_APART = 10
 """Frames from one that is looked at to the next, of a video that does not say how many it has."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class IdentifiedBoard:
     """A board that images show.
 
