@@ -11,7 +11,6 @@ from rigkit.calibration.clustered import Clustered, clustered_covariance, reduce
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
@@ -38,9 +37,9 @@ def assemble(
     clusters: IntArray | None = None,
 ) -> Calibration:
     """Return the result, without verdicts; `rivals` are other lenses that the images support about as well, `clusters`
-    (V,) is what `clusters_of` returns, where it is known already."""
+    (V,) is what `Observations.clusters` returns, where it is known already."""
     state, sigma = fit.state, fit.sigma_px
-    covariance, clustered = _covariance(observations, fit, clusters_of(observations) if clusters is None else clusters)
+    covariance, clustered = _covariance(observations, fit, observations.clusters() if clusters is None else clusters)
     p = state.camera.parameters.size
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:p]))
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
@@ -81,12 +80,6 @@ def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tup
     covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)
     chosen = np.concatenate([np.arange(p), np.arange(n, n + 6)])
     return covariance[np.ix_(chosen, chosen)], clustered
-
-
-def clusters_of(observations: Observations) -> IntArray:
-    """Return the number of the image of each view (V,), images that repeat others taken as one."""
-    boards = [view.board.board_id for view in observations.views]
-    return cluster_numbers(observations.images, boards, [view.pixels for view in observations.views])
 
 
 def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from rigkit.calibration.assemble import assemble, clusters_of, require_determined
+from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.between_models import rival_fits, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.fit import Fit
@@ -212,7 +212,7 @@ def _result(
     """Return the result of a camera with its verdicts."""
     how, fit = begun.how, found.chosen.fit
     others = _others(tried, fit.state.camera.model) if len(tried.models) > 1 else []
-    clusters = clusters_of(found.observations)
+    clusters = found.observations.clusters()
     close = rival_fits(found.observations, fit, rivals, likely)
     result = assemble(
         found.observations,

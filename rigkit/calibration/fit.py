@@ -240,19 +240,22 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
 
 def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
     """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
-    shape from the other images, only the poses of its boards refitted. Of fewer images than folds each is one. None
-    with less than LEAST_IMAGES.
+    shape from the other images, only the poses of its boards refitted. Images that repeat each other take part
+    together, or not: else those that are left out would be known. Of fewer images than folds each is one. None with
+    less than LEAST_IMAGES that differ.
 
     Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
     decides no more than it is worth.
     """
     images = list(dict.fromkeys(observations.images))
-    if folds < 2 or len(images) < LEAST_IMAGES:
+    clusters = observations.clusters()
+    differ = len(np.unique(clusters))
+    if folds < 2 or differ < LEAST_IMAGES:
         return None
-    folds = min(folds, len(images))
+    folds = min(folds, differ)
     place = {name: i for i, name in enumerate(images)}
     image = np.array([place[name] for name in observations.images])
-    fold = image % folds
+    fold = clusters % folds
     squared = np.zeros(len(images))
     weight = fit.weight(observations)
     for k in range(folds):

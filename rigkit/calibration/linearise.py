@@ -75,7 +75,7 @@ def _board_views(observations: Observations, state: State, weight: FloatArray, l
         table=np.ascontiguousarray(shape.points(state.unknowns)),
         warp=np.ascontiguousarray(shape.basis),
         place=place,
-        point=observations.corner,
+        point=np.ascontiguousarray(observations.corner),
         pixels=np.ascontiguousarray(observations.pixels),
         weight=np.ascontiguousarray(weight),
         views=weight.shape[0],

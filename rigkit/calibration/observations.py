@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, median_of
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -138,6 +139,12 @@ class Observations:
     def images(self) -> list[str]:
         """Name of the image of each view."""
         return [view.image for view in self.views]
+
+    def clusters(self) -> IntArray:
+        """Return the number of the image of each view (V,), images that repeat others taken as one."""
+        return cluster_numbers(
+            self.images, [view.board.board_id for view in self.views], [view.pixels for view in self.views]
+        )
 
 
 def _check(views: Sequence[BoardView], view_of: IntArray, grid: IntArray, size: IntArray, sigma: FloatArray) -> None:

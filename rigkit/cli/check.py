@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", action="store_true", help="no board: matches of any textured scene (rigs)")
     parser.add_argument("--length", type=float, metavar="MM", help="tell what it costs in a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
-    parser.add_argument("--fix", type=Path, metavar="FILE.json", help="write the calibration with the smallest change")
+    parser.add_argument("--fix", type=Path, metavar="FILE.json", help="where it does not hold: write it corrected")
     parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
     parser.add_argument("--register", type=Path, metavar="FILE.jsonl", help="add the check to this register")
     parser.add_argument("--temperature", type=float, metavar="C", help="when the pictures were taken, for the register")
@@ -77,6 +77,8 @@ def run(args: argparse.Namespace) -> int:
         note(f"left out: {reason}")
     for path in done.written:
         note(f"{path} written")
+    if args.fix is not None and args.fix not in done.written:
+        note(f"{args.fix} not written: {'nothing changed' if check.holds else 'no change explains the pictures'}")
     if not check.holds:
         return ExitCode.CHECK_FAILED
     return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL

@@ -50,7 +50,8 @@ class CheckOptions:
     length: Task | None = None
     """A length at a distance: what a change costs is told in mm."""
     fix: Path | None = None
-    """File for the calibration with the smallest change that explains the pictures; None: none is written."""
+    """File for the calibration with the smallest change that explains the pictures, written where it does not hold
+    and one explains them; None: none is written."""
     report: Path | None = None
     """File for a page to look at; None: no page."""
     history: Path | None = None
@@ -118,12 +119,7 @@ def check_pictures(
             views = _views(watched, source, frames, boards, left_out, unreadable, progress)
             check = check_views(watched, views, cost)
     words = check_words(check)
-    files: dict[Path, str | bytes] = {}
-    if options.fix is not None and check.change is not None:
-        files[options.fix] = fixed_text(source, check)
-    if options.report is not None:
-        facts = {source.name: digest_line(source), **software_facts()}
-        files[options.report] = check_page(check, f"Check of {source.name}", facts)
+    files = _files(source, check, options)
     if files:
         write_together(files, force=options.force)
     if options.history is not None:
@@ -133,6 +129,18 @@ def check_pictures(
     return CheckedPictures(
         check=check, words=words, left_out=tuple(left_out), unreadable=tuple(unreadable), written=written
     )
+
+
+def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Path, str | bytes]:
+    """Return what is written, each with its place: the calibration corrected, and the page."""
+    files: dict[Path, str | bytes] = {}
+    # What holds needs no correction, and what nothing explains has none.
+    if options.fix is not None and check.change is not None and not check.holds and not check.unexplained:
+        files[options.fix] = fixed_text(source, check)
+    if options.report is not None:
+        facts = {source.name: digest_line(source), **software_facts()}
+        files[options.report] = check_page(check, f"Check of {source.name}", facts)
+    return files
 
 
 def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:

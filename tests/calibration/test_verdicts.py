@@ -150,6 +150,21 @@ def test_repeated_images_count_as_one(rng: np.random.Generator) -> None:
     assert np.median(twice.parameter_sigmas / once.parameter_sigmas) > 0.85
 
 
+def test_repeated_images_are_held_out_together(rng: np.random.Generator) -> None:
+    """Else those that are left out would be known from their copies, and the headline would praise the copying."""
+    views, _, _ = random_views(lens("reg"), 6, rng, reach_deg=33.0, noise_px=0.0)
+    # What the corners of an image have in common is what another image of the same place does not tell.
+    bent = [v.pixels + 0.2 * np.sin(v.pixels / 150.0 + rng.uniform(0.0, 6.0, 2)) for v in views]
+    views = [replace(v, pixels=px + 0.02 * rng.normal(size=(54, 2))) for v, px in zip(views, bent, strict=True)]
+    copies = [
+        [v, *(replace(v, image=f"{k} {v.image}", pixels=v.pixels + 0.02 * rng.normal(size=(54, 2))) for k in range(2))]
+        for v in views
+    ]
+    once = calibrate(views, SIZE, model="brown", board="flat").heldout_rms_px
+    thrice = calibrate([one for own in copies for one in own], SIZE, model="brown", board="flat").heldout_rms_px
+    assert once is not None and thrice is not None and thrice > 0.9 * once
+
+
 def test_two_images_are_not_good(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 3, rng, reach_deg=33.0)
     result = calibrate(views, SIZE, model="brown", board="flat")

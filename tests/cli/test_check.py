@@ -112,9 +112,11 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, register = str(home / "cam.json"), tmp_path / "cam.jsonl"
     also = ["--register", str(register), "--temperature", "20.5"]
-    assert main(["check", calibration, str(home / "same"), *also]) == 0
-    assert "Still holds" in capsys.readouterr().out
     page, fixed = tmp_path / "check.html", tmp_path / "fixed.json"
+    assert main(["check", calibration, str(home / "same"), "--fix", str(fixed), *also]) == 0
+    said_and_noted = capsys.readouterr()
+    assert "Still holds" in said_and_noted.out
+    assert "fixed.json not written: nothing changed" in said_and_noted.err and not fixed.exists()
     command = ["check", calibration, str(home / "moved"), "--json", "-r", str(page), "--fix", str(fixed), *also]
     assert main([*command, "--length", "200", "--distance", "600"]) == 1
     said = json.loads(capsys.readouterr().out)
