@@ -32,7 +32,7 @@ class Workspace:
             self._memory = np.empty(size)
         by_point, by_parameters = self._memory[: 6 * corners], self._memory[6 * corners : size]
         by_parameters.fill(0.0)
-        return by_point.reshape(2, 3, -1), by_parameters.reshape(2, parameters, -1)
+        return by_point.reshape(2, 3, corners), by_parameters.reshape(2, parameters, corners)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

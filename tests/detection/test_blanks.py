@@ -28,9 +28,9 @@ def test_nothing_is_found_and_work_is_bounded(name: str, monkeypatch: pytest.Mon
     grown: list[int] = []
     grow_one = grow._grown
 
-    def counted_refine(image: np.ndarray, lattices: list[Lattice]) -> object:
+    def counted_refine(image: np.ndarray, lattices: list[Lattice], *rest: object) -> object:
         fitted.extend(item.count for item in lattices)
-        return refine(image, lattices)
+        return refine(image, lattices, *rest)  # type: ignore[arg-type]
 
     def counted_growth(lattice: Lattice, *rest: object) -> tuple[Lattice, bool]:
         out = grow_one(lattice, *rest)  # type: ignore[arg-type]
