@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigkit.benchmark.scenes import BenchScene, one_board
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -16,6 +16,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.guided.guided import complete_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.synthetic.photometry import develop
+from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import Panel
 
 BOARD = Board("b", 9, 6, 30.0, 30.0)
@@ -171,3 +173,19 @@ def test_corners_at_the_end_of_the_lens_model_stay_as_they_are(rng: np.random.Ge
     (again,) = complete_boards(image, [found], [BOARD], camera)  # type: ignore[arg-type]
     assert again.complete
     assert judged(again, scene)[:2] == (54, 0)
+
+
+def test_a_blurred_board_is_placed_together_with_a_camera_too() -> None:
+    scene = one_board(np.random.default_rng(1), lens="fisheye", board=BOARD)
+    photometry = replace(BENCH_PHOTOMETRY, noise_levels=2.0)
+    image = develop(scene.radiance(Optics(4.0)), photometry, np.random.default_rng(1))
+    plain, guided = (whole(detect_boards(image, [BOARD], camera=camera)) for camera in (None, scene.camera))
+    assert plain is not None
+    assert guided is not None
+    assert judged(guided, scene)[:2] == judged(plain, scene)[:2] == (54, 0)
+    off, best = (
+        np.sqrt(np.mean((judged(found, scene)[2] * found.sigma_px.repeat(2)) ** 2)) for found in (guided, plain)
+    )
+    # Fitted alone, corners have 1.9 times the error of those placed together in a regular lens, 3.5 times here.
+    assert off < 1.1 * best
+    assert np.sqrt(np.mean(judged(guided, scene)[2] ** 2)) < 1.3

@@ -6,7 +6,7 @@ quite follow the lens, the board is not quite flat); without a camera the corner
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,8 +41,8 @@ take the image: it is not asked."""
 POSE_STEPS, POSE_SCALE = 5, 3.0
 """Gauss-Newton steps of the pose, and the scale of their Cauchy weights in medians of the misses."""
 
-FITTED = ("pixels", "contrast", "residual", "sigma_px", "blur")
-"""What `BoardState` holds of a fit."""
+FITTED = ("pixels", "contrast", "residual", "noise", "sigma_px", "blur")
+"""What `BoardState` holds of a fit, in its order."""
 
 UNSOUND = 3.0
 """Corners with more than this times the usual standard deviation, which other things in their windows raise, say
@@ -51,14 +51,26 @@ nothing of their neighbours; nor does so much more excuse them."""
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardState:
-    """Corners of the board (R, C) with what the fit says of each, NaN where missing; contrast is positive."""
+    """Corners of the board (R, C) with what the fit says of each, NaN where missing; contrast is positive.
+
+    `together` : whether they were then placed together, as `placed_together` does; pixels and sigmas are of that.
+    """
 
     pixels: FloatArray
     contrast: FloatArray
     residual: FloatArray
+    noise: FloatArray
     sigma_px: FloatArray
     blur: FloatArray
+    _: KW_ONLY
     signs: FloatArray
+    together: bool = False
+
+    @classmethod
+    def unfitted(cls, pixels: FloatArray, signs: FloatArray) -> BoardState:
+        """Return corners (R, C, 2) of which no fit has said anything yet."""
+        nothing = np.full(pixels.shape[:2], np.nan)
+        return cls(pixels, nothing, nothing, nothing, nothing, nothing, signs=signs)
 
     @property
     def known(self) -> BoolArray:
@@ -72,18 +84,18 @@ class BoardState:
         """Return the state with the `good` of the corners fitted at `cells` put in."""
         where = cells.copy()
         where[cells] = good
-        fitted = (fit.pixels, fit.contrast, fit.residual, fit.sigma_px, fit.blur)
+        fitted = (getattr(fit, name) for name in FITTED)
         values = [old.copy() for old in self._values()]
         for value, new in zip(values, fitted, strict=True):
             value[where] = new[good]
-        return replace(self, **dict(zip(FITTED, values, strict=True)))
+        return BoardState(*values, signs=self.signs, together=self.together)
 
     def without(self, drop: BoolArray) -> BoardState:
         """Return the state with the corners `drop` (R, C) forgotten."""
         values = [old.copy() for old in self._values()]
         for value in values:
             value[drop] = np.nan
-        return replace(self, **dict(zip(FITTED, values, strict=True)))
+        return BoardState(*values, signs=self.signs, together=self.together)
 
     def _values(self) -> list[FloatArray]:
         return [getattr(self, name) for name in FITTED]

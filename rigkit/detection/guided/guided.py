@@ -22,11 +22,14 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, BoardState, Guide
+from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 RADIUS_PX, FIT_STEPS = 18.0, 8
@@ -158,7 +161,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     state = opened
     guide = Guide.of(board, camera, state)
     if guide.camera is not None:
-        state = _unanimous(guide, _again(image, guide, state))
+        state = _judged(image, guide, state)
     before = state
     for _ in range(MAX_GUIDE_ROUNDS):
         guide = guide.by(state)
@@ -167,23 +170,27 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
             break
         state = more
     if guide.camera is None:
-        return found if state is before else _with_added(guide, found, opened, state)
+        return found if state is before else _with_added(image, guide, found, opened, state)
     if state is not before:
-        state = _unanimous(guide, _again(image, guide, state))
+        state = _judged(image, guide, state)
     state = state.without(~np.isfinite(state.sigma_px))
     row, column = np.nonzero(state.known)
     if len(row) < MIN_GUIDE_CORNERS:
         return found
     # Noise that cancels from pixel to pixel lets sigmas be smaller; where they must be larger, the scatter shows it.
-    state = replace(state, sigma_px=min(1.0, _known_factor(found, opened)) * state.sigma_px)
+    alike = state if state.together else opened
+    state = replace(state, sigma_px=min(1.0, _known_factor(found, alike)) * state.sigma_px)
     sigma = _scatter(guide, state) * state.sigma_px[row, column]
     return replace(found, grid=np.stack([column, row], axis=-1), pixels=state.pixels[row, column], sigma_px=sigma)
 
 
-def _with_added(guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState) -> BoardDetection:
+def _with_added(
+    image: GreyImage, guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState
+) -> BoardDetection:
     """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
+    state = _together(image, guide.board, state)
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
-    sigma = _known_factor(found, opened) * state.sigma_px
+    sigma = _known_factor(found, state if state.together else opened) * state.sigma_px
     row, column = np.nonzero(added)
     grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])
     order = np.lexsort((grid[:, 0], grid[:, 1]))
@@ -195,9 +202,12 @@ def _with_added(guide: Guide, found: BoardDetection, opened: BoardState, state: 
     )
 
 
-def _known_factor(found: BoardDetection, opened: BoardState) -> float:
-    """Return the factor that the detector, which saw scatter and noise of the board as a whole, gave its sigmas."""
-    return float(np.nanmedian(found.sigma_px / opened.sigma_px[found.grid[:, 1], found.grid[:, 0]]))
+def _known_factor(found: BoardDetection, state: BoardState) -> float:
+    """Return the factor that the detector, which saw scatter and noise of the board as a whole, gave its sigmas.
+
+    `state` : the same corners, placed as the detector has placed them: alone or together.
+    """
+    return float(np.nanmedian(found.sigma_px / state.sigma_px[found.grid[:, 1], found.grid[:, 0]]))
 
 
 def _scatter(guide: Guide, state: BoardState) -> float:
@@ -214,9 +224,8 @@ def _scatter(guide: Guide, state: BoardState) -> float:
 def _opened(image: GreyImage, found: BoardDetection, board: Board) -> BoardState | None:
     """Return what the fit says of the corners found; None where they do not alternate like a chessboard's."""
     shape = (found.rows, found.columns)
-    empty = np.full(shape, np.nan)
     signs = np.where(np.add.outer(np.arange(shape[0]), np.arange(shape[1])) % 2 == 1, -1.0, 1.0)
-    state = BoardState(found.lattice(), empty, empty, empty, empty, signs)
+    state = BoardState.unfitted(found.lattice(), signs)
     cells = state.known
     if not (cells.any(axis=0).sum() >= 3 and cells.any(axis=1).sum() >= 3):
         return None
@@ -295,7 +304,33 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
         return state
     blur = float(np.nanmedian(state.blur))
     fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
-    return state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
+    return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)
+
+
+def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
+    """Return the state with its corners placed together where blur asks for it, as plain detection places them.
+
+    A ChArUco board's stay as they are: with markers in them its squares are not even.
+    """
+    if isinstance(board.pattern, Charuco):
+        return state
+    lattice = Lattice(state.pixels, state.contrast, bool(state.signs[0, 0] > 0.0))
+    alone = RefinedLattice(lattice, state.sigma_px, state.blur, state.residual, state.noise)
+    placed = placed_together(image, alone)
+    if placed is alone:
+        return state
+    return replace(state, pixels=placed.lattice.pixels, sigma_px=placed.sigma_px, together=True)
+
+
+def _judged(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
+    """Return the state with every corner fitted anew, without those that contradict the camera and the others."""
+    again = _again(image, guide, state)
+    state = _together(image, guide.board, again)
+    kept = _unanimous(guide, state)
+    if not state.together or np.array_equal(kept.known, state.known):
+        return kept
+    # What covers a corner had a say in where the others are.
+    return _together(image, guide.board, again.without(~kept.known))
 
 
 def _unanimous(guide: Guide, state: BoardState) -> BoardState:

@@ -171,8 +171,7 @@ class _Fitter:
 
     def first(self, pixels: FloatArray) -> BoardState:
         """Return the rough corners fitted quickly, those that failed left out."""
-        nothing = np.full(pixels.shape[:2], np.nan)
-        state = BoardState(pixels, nothing, nothing, nothing, nothing, nothing)
+        state = BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan))
         cells = state.known
         fit = self.fit(
             cells, self.map_of(state).at(self.places[cells]), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False
