@@ -81,4 +81,4 @@ def quaternion_wxyz(rotation: Mat3) -> FloatArray:
     """Return (w, x, y, z) of a rotation, COLMAP's order."""
     from scipy.spatial.transform import Rotation
 
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+    return np.roll(Rotation.from_matrix(np.array(rotation)).as_quat(), 1)

@@ -225,12 +225,14 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
         ]
     )
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
+    # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
+    step = np.r_[log_so3(two_view.rotation @ own.rotation.T), two_view.translation_mm - own.translation_mm]
     return [
         _method(
             TWO_VIEW,
             reconstruction,
             two_view,
-            covariance if settled else unknown,
+            covariance + np.outer(step, step) if settled else unknown,
             {},
             np.nan,
             result.inliers,
