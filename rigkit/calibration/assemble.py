@@ -15,7 +15,7 @@ from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlie
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -33,13 +33,10 @@ def assemble(
     dropped: tuple[tuple[str, str], ...],
     candidates: tuple[Candidate, ...],
     rivals: Sequence[RivalFit] = (),
-    *,
-    clusters: IntArray | None = None,
 ) -> Calibration:
-    """Return the result, without verdicts; `rivals` are other lenses that the images support about as well, `clusters`
-    (V,) is what `Observations.clusters` returns, where it is known already."""
+    """Return the result, without verdicts; `rivals` are other lenses that the images support about as well."""
     state, sigma = fit.state, fit.sigma_px
-    covariance, clustered = _covariance(observations, fit, observations.clusters() if clusters is None else clusters)
+    covariance, clustered = _covariance(observations, fit)
     p = state.camera.parameters.size
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:p]))
     px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
@@ -63,7 +60,7 @@ def assemble(
     )
 
 
-def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tuple[FloatArray, Clustered]:
+def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clustered]:
     """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
     the independent units, and what the images said."""
     normal = fit.normal
@@ -74,7 +71,7 @@ def _covariance(observations: Observations, fit: Fit, clusters: IntArray) -> tup
     variance = np.diag(unit)
     if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
         raise not_identifiable(fit.state.camera.model)
-    information, score = reduced_by_cluster(fit.data.products[0], n, clusters)
+    information, score = reduced_by_cluster(fit.data.products[0], n, observations.clusters(), normal.covariance[2])
     prior = (normal.gg - fit.data.gg)[:n, :n]
     clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
     covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)

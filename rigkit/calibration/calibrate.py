@@ -212,7 +212,6 @@ def _result(
     """Return the result of a camera with its verdicts."""
     how, fit = begun.how, found.chosen.fit
     others = _others(tried, fit.state.camera.model) if len(tried.models) > 1 else []
-    clusters = found.observations.clusters()
     close = rival_fits(found.observations, fit, rivals, likely)
     result = assemble(
         found.observations,
@@ -221,12 +220,11 @@ def _result(
         (*begun.dropped, *found.reasons),
         with_rivals([*others, *found.candidates], [one.rival for one in close]),
         close,
-        clusters=clusters,
     )
     in_force = [name for name, value in (("model", how.model), ("board_shape", how.board)) if value == "auto"]
     moved = moved_lens(found.observations, fit) if how.folds else ()
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
-    far = _determined(result, found.observations, fit)
+    far, clusters = _determined(result, found.observations, fit), found.observations.clusters()
     return replace(result, verdicts=judge(result, also, far=far, clusters=clusters, in_force=in_force))
 
 

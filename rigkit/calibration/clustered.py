@@ -57,13 +57,16 @@ class Clustered:
     freedom: float
 
 
-def reduced_by_cluster(products: FloatArray, count: int, cluster: IntArray) -> tuple[FloatArray, FloatArray]:
+def reduced_by_cluster(
+    products: FloatArray, count: int, cluster: IntArray, inverses: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return information (N, P, P) and score (N, P) of every cluster of views after their poses are eliminated.
 
-    `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) numbers the clusters.
+    `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) numbers the clusters,
+    `inverses` (V, 6, 6) are those of the poses' blocks, where they are known.
     """
     coupling, pose = products[:, :count, count : count + 6], products[:, count : count + 6, count : count + 6]
-    back = coupling @ pose_inverses(pose)
+    back = coupling @ (pose_inverses(pose) if inverses is None else inverses)
     total = int(cluster.max()) + 1
     information, score = np.zeros((total, count, count)), np.zeros((total, count))
     np.add.at(information, cluster, products[:, :count, :count] - back @ np.swapaxes(coupling, -1, -2))

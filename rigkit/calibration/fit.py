@@ -247,10 +247,12 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
     Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
     decides no more than it is worth.
     """
+    if folds < 2:
+        return None
     images = list(dict.fromkeys(observations.images))
     clusters = observations.clusters()
     differ = len(np.unique(clusters))
-    if folds < 2 or differ < LEAST_IMAGES:
+    if differ < LEAST_IMAGES:
         return None
     folds = min(folds, differ)
     place = {name: i for i, name in enumerate(images)}

@@ -51,6 +51,7 @@ class Observations:
     first_row : (len(boards) + 1,) first row of each board in the table.
     board : (V,) int, board of each view.
     workspace : of the solver; subsets share it.
+    known_clusters : what `clusters` has found, once it was asked; observations of the same views share it.
     """
 
     views: tuple[BoardView, ...]
@@ -63,6 +64,7 @@ class Observations:
     first_row: IntArray
     board: IntArray
     workspace: Workspace = field(default_factory=Workspace, repr=False)
+    known_clusters: list[IntArray] = field(default_factory=list, repr=False)
 
     @classmethod
     def from_views(cls, views: Sequence[BoardView]) -> Observations:
@@ -133,6 +135,7 @@ class Observations:
             weight=self.weight[chosen],
             present=self.present[chosen],
             board=self.board[chosen],
+            known_clusters=[],
         )
 
     @property
@@ -142,9 +145,10 @@ class Observations:
 
     def clusters(self) -> IntArray:
         """Return the number of the image of each view (V,), images that repeat others taken as one."""
-        return cluster_numbers(
-            self.images, [view.board.board_id for view in self.views], [view.pixels for view in self.views]
-        )
+        if not self.known_clusters:
+            boards, pixels = [view.board.board_id for view in self.views], [view.pixels for view in self.views]
+            self.known_clusters.append(cluster_numbers(self.images, boards, pixels))
+        return self.known_clusters[0]
 
 
 def _check(views: Sequence[BoardView], view_of: IntArray, grid: IntArray, size: IntArray, sigma: FloatArray) -> None:

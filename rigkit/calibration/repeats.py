@@ -29,20 +29,20 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     images, boards : name of each view's image and of its board.
     pixels : (N, 2) of each view's corners.
     """
-    shown: dict[str, list[tuple[str, list[float]]]] = {}
-    for image, board, place in zip(images, boards, _places(pixels).tolist(), strict=True):
-        shown.setdefault(image, []).append((board, place))
+    places, shown = _places(pixels), dict[str, list[int]]()
+    for view, image in enumerate(images):
+        shown.setdefault(image, []).append(view)
     # Only images of the same boards can repeat each other.
-    alike: dict[tuple[str, ...], list[tuple[str, list[float]]]] = {}
-    for image, views in shown.items():
-        ordered = sorted(views)
-        places = [value for _, place in ordered for value in place]
-        alike.setdefault(tuple(board for board, _ in ordered), []).append((image, places))
+    alike: dict[tuple[str, ...], list[list[int]]] = {}
+    for own in shown.values():
+        if len(own) > 1:
+            own.sort(key=lambda view: (boards[view], places[view].tolist()))
+        alike.setdefault(tuple(boards[view] for view in own), []).append(own)
     number = {image: i for i, image in enumerate(shown)}
     for group in alike.values():
-        one, other = close_pairs(np.array([places for _, places in group]), REPEATED_PX)
+        one, other = close_pairs(places[np.array(group)].reshape(len(group), -1), REPEATED_PX)
         for earlier, later in sorted(zip(one.tolist(), other.tolist(), strict=True), key=lambda pair: pair[::-1]):
-            names = group[earlier][0], group[later][0]
+            names = images[group[earlier][0]], images[group[later][0]]
             number[names[1]] = min(number[names[0]], number[names[1]])
     _, dense = np.unique([number[name] for name in images], return_inverse=True)
     return dense.astype(np.int64)
@@ -74,9 +74,12 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
             count = ahead[block]
             first = np.repeat(block, count)
             second = np.arange(len(first)) + np.repeat(begin[block] - np.cumsum(count) + count, count)
-            for values in ordered:
+            # The widest axis but the one that they are sorted along tells the most of them apart.
+            for values in np.roll(ordered[::-1], -1, axis=0):
                 close = np.abs(values[first] - values[second]) <= reach
                 first, second = first[close], second[close]
+                if not len(first):
+                    break
             found.append(order[np.stack([first, second])])
     pairs = np.sort(np.concatenate(found, axis=1), axis=0)
     return pairs[0], pairs[1]
@@ -86,9 +89,8 @@ def _places(pixels: Sequence[Pixels]) -> FloatArray:
     """Return for each view how many corners there are, their centre, and their extents along the image's axes and
     diagonals, px: (V, 7)."""
     count = np.array([len(corners) for corners in pixels])
-    start = np.cumsum(count) - count
-    every = np.concatenate([np.asarray(corners) for corners in pixels])
-    along = every @ np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])
-    centre = np.add.reduceat(every, start) / count[:, None]
-    extents = np.maximum.reduceat(along, start) - np.minimum.reduceat(along, start)
-    return np.concatenate([count[:, None], centre, extents], axis=1)
+    start, corners = np.cumsum(count) - count, np.concatenate([np.asarray(one) for one in pixels])
+    along = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, -1.0]]) @ corners.T
+    centre = np.add.reduceat(along[:2], start, axis=1) / count
+    extents = np.maximum.reduceat(along, start, axis=1) - np.minimum.reduceat(along, start, axis=1)
+    return np.concatenate([count[None], centre, extents]).T

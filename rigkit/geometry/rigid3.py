@@ -13,6 +13,8 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation, unit
 
 ROTATION_TOLERANCE = 1e-4
 """A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
+ROUNDING = 1e-9
+"""A matrix this near to orthonormal needs no singular values to be a rotation to the last digit."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, init=False)
@@ -45,15 +47,16 @@ class Rigid3:
         """Return the motions of rotations (N, 3, 3) and translations (N, 3), checked together as one is alone."""
         rotation = as_array(rotation, (None, 3, 3), "rotation")
         translation = as_array(translation_mm, (len(rotation), 3), "translation_mm")
-        nearest = _checked(rotation)
-        nearest.flags.writeable = False
-        out = []
-        for one, shift in zip(nearest, translation, strict=True):
-            motion = object.__new__(cls)
-            object.__setattr__(motion, "rotation", one)
-            object.__setattr__(motion, "translation_mm", shift)
-            out.append(motion)
-        return tuple(out)
+        return tuple(cls._of(one, shift) for one, shift in zip(_checked(rotation), translation, strict=True))
+
+    @classmethod
+    def _of(cls, rotation: Mat3, translation_mm: FloatArray) -> Rigid3:
+        """Return the motion of arrays of its own that need no check: they come from motions that were checked."""
+        motion = object.__new__(cls)
+        rotation.flags.writeable = translation_mm.flags.writeable = False
+        object.__setattr__(motion, "rotation", rotation)
+        object.__setattr__(motion, "translation_mm", translation_mm)
+        return motion
 
     @classmethod
     def identity(cls) -> Rigid3:
@@ -85,12 +88,14 @@ class Rigid3:
         return Rigid3(exp_so3(step[:3]) @ self.rotation, self.translation_mm + step[3:])
 
     def inverse(self) -> Rigid3:
-        return Rigid3(self.rotation.T, -self.rotation.T @ self.translation_mm)
+        back = self.rotation.T.copy()
+        return Rigid3._of(back, -back @ self.translation_mm)
 
     def __matmul__(self, other: Rigid3) -> Rigid3:
         if not isinstance(other, Rigid3):
             return NotImplemented
-        return Rigid3(self.rotation @ other.rotation, self.rotation @ other.translation_mm + self.translation_mm)
+        rotation = _orthonormal(self.rotation @ other.rotation)
+        return Rigid3._of(rotation, self.rotation @ other.translation_mm + self.translation_mm)
 
     def allclose(self, other: Rigid3, *, rotation_tol: float = 1e-9, translation_tol_mm: float = 1e-9) -> bool:
         """Say whether two motions agree entry by entry."""
@@ -102,10 +107,24 @@ class Rigid3:
 
 def _checked(matrix: Mat3) -> Mat3:
     """Return the rotations nearest to `matrix` (..., 3, 3); raises InputError where one is further than rounding."""
+    off = _off(matrix)
+    if np.abs(off).max(initial=0.0) <= ROUNDING and (np.linalg.det(matrix) > 0.0).all():
+        return _orthonormal(matrix, off)
     nearest = nearest_rotation(matrix)
     if np.abs(nearest - matrix).max(initial=0.0) > ROTATION_TOLERANCE:
         raise InputError("rotation: not a rotation matrix (orthonormal, determinant +1); check scale and order")
     return nearest
+
+
+def _off(matrix: Mat3) -> Mat3:
+    """Return by how much matrices (..., 3, 3) are not orthonormal."""
+    return np.asarray(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3))
+
+
+def _orthonormal(matrix: Mat3, off: Mat3 | None = None) -> Mat3:
+    """Return matrices (..., 3, 3) that are rotations but for rounding without that: the first step of Newton's
+    iteration for the polar factor, which leaves the square of `off`."""
+    return np.asarray(matrix - 0.5 * (matrix @ (_off(matrix) if off is None else off)))
 
 
 def cam_from_world_look_at(eye_mm: ArrayLike, target_mm: ArrayLike, down: ArrayLike = (0.0, 1.0, 0.0)) -> Rigid3:

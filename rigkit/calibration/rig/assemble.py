@@ -50,7 +50,7 @@ def assemble_rig(
     off = shape_error(observations, state, sigma * overdispersion)
     covariance[: len(off), : len(off)] += np.outer(off, off)
     covariance += between_rig_models(joint, single, np.sqrt(np.diag(covariance)))
-    own *= (sigma * overdispersion) ** 2
+    own = own * (sigma * overdispersion) ** 2
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.clustered import Clustered, clustered_covariance
-from rigkit.calibration.normal_equations import NormalEquations, pose_inverses
+from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.rig.solver import pose_jacobians, with_rig_priors
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray
@@ -37,8 +37,7 @@ def clustered_by_frame(
     """
     information, score = _by_frame(normal.products, observations, state, frame)
     n = score.shape[1]
-    coupling = normal.gp[:, :n]
-    back = coupling @ pose_inverses(normal.pp)
+    coupling, back = normal.gp[:, :n], np.swapaxes(normal.covariance[1][..., :n], -1, -2)
     np.subtract.at(information, frame, back @ np.swapaxes(coupling, -1, -2))
     np.subtract.at(score, frame, (back @ normal.p[..., None])[..., 0])
     nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
