@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--watch", type=Path, action="append", default=[], metavar="FOLDER", help=f"pictures appear in it{each}"
     )
     source.add_argument(
-        "--video", type=Path, action="append", default=[], metavar="FILE", help=f"frames of a video{each}"
+        "--video", type=Path, action="append", default=[], metavar="FILE", help=f"the best frames of a recording{each}"
     )
     source.add_argument(
         "--device", type=int, action="append", default=[], metavar="N", help=f"camera N of this machine{each}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from enum import Enum
 from typing import Any
 
 import cv2
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
-from rigkit.coach.rig import RigGuide
+from rigkit.coach.rig import RigAdvice, RigGuide
 from rigkit.core.errors import InputError
 from rigkit.io.image_size import announced_size
 from rigkit.io.images import quiet_opencv
@@ -24,6 +25,8 @@ MAX_PICTURE_PX = 12000
 LOOK_S = 0.06
 """A look that takes longer is had at a smaller picture next time: ten of them fit into a second then."""
 MAX_SHRINK = 4
+LEAST_WORTH = 0.05
+"""A frame of a recording that brings less than this part of what the outline would is left where it is."""
 
 Image = NDArray[Any]
 
@@ -46,6 +49,14 @@ def decoded(data: bytes) -> Image:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
+class Take(Enum):
+    """Whether a frame is kept: not at all, where it is worth it, or wherever a board is in it."""
+
+    NO = "look"
+    WORTH = "offer"
+    YES = "take"
+
+
 class Coach:
     """A session of one camera, or of several whose frames are taken together. Frames may come from several threads;
     each is dealt with by itself."""
@@ -58,15 +69,17 @@ class Coach:
         self._lock = threading.Lock()
         self._last: list[Glance | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
-        self._shown: dict[str, Any] = self.guide.state(None, None)
+        self._names: list[str] = []
+        self._offered: tuple[Sequence[Image], bool] | None = None
+        self._shown: dict[str, Any] = self.guide.state(None, None) | {"looks": 0}
         for name, images in keeper.images():
             seen = [glance_at(image, options.boards, name) for image in images]
             if any(glance.view is not None for glance in seen):
-                self.guide.add(seen)
+                self._add(name, seen)
 
-    def look(self, images: Sequence[Image], *, take: bool = False, photo: bool = False) -> dict[str, Any]:
-        """Look at a frame, an image a camera, and say what to do; with `take` keep it where a board is in it, whatever
-        it is worth.
+    def look(self, images: Sequence[Image], *, take: Take = Take.NO, photo: bool = False) -> dict[str, Any]:
+        """Look at a frame, an image a camera, and say what to do, and whether it was kept. A `photo` was taken by
+        itself, of a board that was held as still as it shows.
 
         Raises InputError for other cameras' images.
         """
@@ -74,52 +87,111 @@ class Coach:
         if len(images) != len(names):
             raise InputError(f"coach: {len(images)} images of {len(names)} cameras ({', '.join(names)})")
         with self._lock:
-            glances = [self._glance(c, image, full=take or photo) for c, image in enumerate(images)]
-            for name, lens, glance in zip(names, self.guide.lenses, glances, strict=True):
-                if lens.size_px not in (None, glance.size_px):
-                    raise InputError(f"coach: frames of {glance.size_px} px; '{name}' has {lens.size_px} so far")
-            if photo:
-                glances = [glance.as_photo() for glance in glances]
-            self._last = list(glances)
-            taken = None
-            if take and any(glance.view is not None for glance in glances):
-                taken = self.keeper.keep(images)
-                self.guide.add(glances)
+            whole = photo or take is Take.YES
+            glances = self._glances(images, whole=whole, photo=photo)
             advice = self.guide.advise(glances)
-            self._shown = self.guide.state(glances, advice) | {"taken": taken, "finished": self.finished}
+            kept = take is Take.YES or (take is Take.WORTH and advice.take)
+            taken = None
+            if kept and any(glance.view is not None for glance in glances):
+                if not whole and max(self._shrink) > 1:
+                    glances = self._glances(images, whole=True, photo=photo)
+                taken = self.keeper.keep(images)
+                self._add(taken, glances)
+                advice = self.guide.advise(glances)
+            self._last = list(glances)
+            self._offered = None if taken else (images, photo)
+            self._show(glances, advice, taken=taken)
+            if photo and not taken:
+                self.say(f"Not taken, as {_reason(glances)}. {self._shown['words']}")
             return self._shown
 
-    def _glance(self, c: int, image: Image, *, full: bool) -> Glance:
-        shrink = 1 if full else self._shrink[c]
-        began = time.thread_time()
-        glance = glance_at(image, self.guide.options.boards, "frame", self._last[c], shrink=shrink)
-        if not full:
-            # The work grows with the picture's area.
-            whole = (time.thread_time() - began) * shrink**2
-            self._shrink[c] = int(np.clip(np.ceil(np.sqrt(whole / LOOK_S)), 1, MAX_SHRINK))
-        return glance
+    def _add(self, name: str, glances: Sequence[Glance]) -> None:
+        self._names.append(name)
+        self.guide.add(glances)
+
+    def _show(self, glances: Sequence[Glance] | None, advice: RigAdvice | None, **more: Any) -> None:
+        looks = self._shown["looks"] + (advice is not None)
+        self._shown = self.guide.state(glances, advice) | {"looks": looks, "finished": self.finished, **more}
+
+    def _glances(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[Glance]:
+        """Return what all cameras show; what is `whole` is not looked at in a smaller picture."""
+        out = []
+        for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
+            shrink = 1 if whole else self._shrink[c]
+            began = time.thread_time()
+            glance = glance_at(image, self.guide.options.boards, "frame", self._last[c], shrink=shrink)
+            if not whole:
+                # The work grows with the picture's area.
+                spent = (time.thread_time() - began) * shrink**2
+                self._shrink[c] = int(np.clip(np.ceil(np.sqrt(spent / LOOK_S)), 1, MAX_SHRINK))
+            if lens.size_px not in (None, glance.size_px):
+                raise InputError(f"coach: frames of {glance.size_px} px; '{name}' has {lens.size_px} so far")
+            out.append(glance.as_photo() if photo else glance)
+        return out
+
+    def say(self, words: str) -> None:
+        """Tell pages something between two frames."""
+        self._shown = self._shown | {"words": words}
 
     def state(self) -> dict[str, Any]:
         """Return what was said last: for pages whose frames come from this machine."""
         return self._shown | {"finished": self.finished}
 
-    def offer(self, images: Sequence[Image], *, photo: bool = False) -> dict[str, Any]:
-        """Look at a frame that is at hand in full: it is taken where it is worth it."""
-        state = self.look(images, photo=photo)
-        return self.look(images, take=True, photo=photo) if state["take"] else state
+    def take_shown(self) -> dict[str, Any]:
+        """Keep the frame that came from this machine last, whatever it is worth; raises InputError where there is no
+        new one."""
+        if self._offered is None:
+            raise InputError("coach: no new picture to take")
+        images, photo = self._offered
+        return self.look(images, take=Take.YES, photo=photo)
+
+    def choose(self, frames: Sequence[Sequence[Image]], show: Callable[[Sequence[Image]], None]) -> None:
+        """Take the frames that help most out of a recording, the best first, each of which is shown, until there are
+        enough or none that is left helps."""
+        glances: list[list[Glance]] = []
+        left = list(range(len(frames)))
+        for images in frames:
+            self.say(f"Looking closely: {len(glances) + 1} of {len(frames)}")
+            glances.append(self._glances(images, whole=True, photo=True))
+        while left:
+            advice = [self.guide.advise(glances[k]) for k in left]
+            if advice[0].enough or max(a.worth for a in advice) < LEAST_WORTH:
+                return
+            best = left.pop(int(np.argmax([a.worth for a in advice])))
+            with self._lock:
+                self._add(self.keeper.keep(frames[best]), glances[best])
+                show(frames[best])
+                chosen = f"Choosing frames: {len(self.guide.frames)} so far"
+                self._show(glances[best], self.guide.advise(glances[best]), words=chosen)
 
     def undo(self) -> dict[str, Any]:
-        """Set the last frame aside."""
+        """Set the last frame aside; raises InputError where there is none."""
         with self._lock:
-            self.keeper.drop_last()
+            if not self._names:
+                raise InputError("coach: there is no frame to undo")
+            self.keeper.drop(self._names.pop())
             frames = self.guide.frames[:-1]
             self.guide = RigGuide(self.keeper.names, self.guide.options)
             for glances in frames:
                 self.guide.add(glances)
-            return self.guide.state(None, None)
+            self._show(None, None)
+            return self._shown
 
-    def finish(self) -> str:
-        """Calibrate the session, and say what came of it."""
+    def finish(self, missing: str = "") -> str:
+        """Calibrate the session, and say what came of it, and what is `missing`."""
         with self._lock:
-            self.finished = self._finish()
+            self.finished = self._finish() + missing
             return self.finished
+
+
+def _reason(glances: Sequence[Glance]) -> str:
+    """Return why a picture is not taken."""
+    seeing = [glance for glance in glances if glance.view is not None]
+    wrong = next((glance.complaint for glance in seeing if glance.complaint), "")
+    return (
+        f"it is not good enough ({wrong})"
+        if wrong
+        else "it brings little that is new"
+        if seeing
+        else "no board is seen"
+    )

@@ -106,23 +106,25 @@ class CaptureGuide:
         self.options = options
         self.views: list[BoardView] = []
         self.size_px: tuple[int, int] | None = None
-        self.calibration: Calibration | None = None
+        self._found: Calibration | None = None
+        self._stale = False
         self._plan: Plan | None = None
-        self._held: list[HeldBoards] = []
-        self._last: Rigid3 | None = None
         self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
-        """Take a frame: calibrate anew, and plan the next."""
+        """Take a frame."""
         self.size_px = size_px
         self.views.append(view)
-        if len(self.views) >= FIRST_FRAMES:
-            self.calibration = _calibrated(self.views, size_px) or self.calibration
-        pose = self._pose_of(view)
-        if pose is not None:
-            self._last = pose
-            self._held.append(held_view(view, pose))
-        self._plan = self._map = None
+        self._stale, self._plan, self._map = True, None, None
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """What the frames so far say, once they say anything."""
+        # Many frames may come at once, when a session goes on: only then is there something to be asked of it.
+        if self._stale and self.size_px is not None and len(self.views) >= FIRST_FRAMES:
+            self._found = _calibrated(self.views, self.size_px) or self._found
+        self._stale = False
+        return self._found
 
     def advise(self, glance: Glance) -> Advice:
         """Return what to do, and whether to take this frame."""
@@ -194,7 +196,8 @@ class CaptureGuide:
         if self._plan is None:
             knowledge, goal = self._known(size_px)
             o = self.options
-            self._plan = plan_views(knowledge, o.boards, goal, 2, reach=o.reach, last=self._last)
+            last = _pose(knowledge.camera, self.views[-1]) if self.views else None
+            self._plan = plan_views(knowledge, o.boards, goal, 2, reach=o.reach, last=last)
         return self._plan
 
     def _known(self, size_px: tuple[int, int]) -> tuple[Knowledge, Goal]:
@@ -202,8 +205,10 @@ class CaptureGuide:
             knowledge = Knowledge.of(self.calibration)
         else:
             knowledge = Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), USUAL_ERROR)
-            for held in self._held:
-                knowledge = knowledge.with_views(held)
+            for view in self.views:
+                pose = _pose(knowledge.camera, view)
+                if pose is not None:
+                    knowledge = knowledge.with_views(held_view(view, pose))
         return knowledge, self.options.goal(knowledge.camera)
 
     def _worth(self, view: BoardView | None, plan: Plan) -> float:
@@ -211,19 +216,13 @@ class CaptureGuide:
         since one that is taken, for the two count as one."""
         if view is None or _distinct([*self.views, view]) == _distinct(self.views):
             return 0.0
-        pose = self._pose_of(view, plan.knowledge.camera)
+        pose = _pose(plan.knowledge.camera, view)
         if pose is None:
             return 0.0
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
         after = float(plan.goal.error(covariance_of(known.information + more)))
         return (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
-
-    def _pose_of(self, view: BoardView, camera: Camera | None = None) -> Rigid3 | None:
-        if camera is None:
-            assert self.size_px is not None
-            camera = self._known(self.size_px)[0].camera
-        return _pose(camera, view)
 
 
 def _distinct(views: Sequence[BoardView]) -> int:

@@ -46,7 +46,9 @@ class Keeper:
             place.mkdir(parents=True, exist_ok=True)
         for path, text in files.items():
             if path.exists() and read_text(path, "coach:") != text:
-                raise InputError(f"coach: '{path}' says something else; give another folder, or the same boards")
+                raise InputError(
+                    f"coach: '{path}' says something else; give another folder, or the same boards and cameras"
+                )
             if not path.exists():
                 write_atomic(path, text)
 
@@ -75,12 +77,11 @@ class Keeper:
             write_atomic(place / name, np.asarray(cv2.imencode(".png", bgr)[1]).tobytes())
         return name
 
-    def drop_last(self) -> None:
-        """Set the last frame aside: it stays on disk, under a name that no session reads."""
-        for name in self.frames[-1:]:
-            for path in (place / name for place in self._places):
-                if path.exists():
-                    path.rename(path.with_suffix(".png.dropped"))
+    def drop(self, name: str) -> None:
+        """Set a frame aside: it stays on disk, under a name that no session reads."""
+        for path in (place / name for place in self._places):
+            if path.exists():
+                path.rename(path.with_suffix(".png.dropped"))
 
 
 def _number(name: str) -> int:

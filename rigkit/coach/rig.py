@@ -23,17 +23,20 @@ from rigkit.planning.words import placement
 
 SHARED_FRAMES = 5
 """Fewer boards that two cameras see at once do not tell how these disagree."""
+TAKING = "Good: taking it"
 MAX_MARKS = 1500
 """Corners that are drawn, at the most."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigAdvice:
-    """What the coach says: words, whether to take these frames and whether there are enough, the number of the camera
-    that it speaks of, what each camera's guide says, outlines (K, 2) to hold the board into by camera (None: none), and
-    how wrong the mounts are (px; None where nobody knows)."""
+    """What the coach says: words, what these frames bring as a part of what a board in the outline would, whether to
+    take them and whether there are enough, the number of the camera that it speaks of, what each camera's guide says,
+    outlines (K, 2) to hold the board into by camera (None: none), and how wrong the mounts are (px; None where nobody
+    knows)."""
 
     words: str
+    worth: float
     take: bool
     enough: bool
     speaks: int
@@ -84,11 +87,15 @@ class RigGuide:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
             words, targets = self._shared_target(speaks, glances)
             worth = self._shared_worth(speaks, glances)
-        if not enough and worth >= WORTH_TAKING and not good:
+        take = good and worth >= WORTH_TAKING and not enough
+        if take:
+            words = TAKING
+        elif not enough and worth >= WORTH_TAKING:
             words = next((g.complaint.capitalize() for g in seeing if g.complaint), words)
         return RigAdvice(
             words=words,
-            take=good and worth >= WORTH_TAKING and not enough,
+            worth=worth,
+            take=take,
             enough=enough,
             speaks=speaks,
             lenses=lenses,

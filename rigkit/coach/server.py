@@ -13,7 +13,7 @@ from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from rigkit.coach.coach import Coach, decoded
+from rigkit.coach.coach import Coach, Take, decoded
 from rigkit.core.errors import InputError, InstallationError, RigkitError
 
 if TYPE_CHECKING:
@@ -147,11 +147,11 @@ def _parts(data: bytes, sizes: str | None) -> list[bytes]:
 
 
 def _done(coach: Coach, what: str, parts: list[bytes]) -> dict[str, Any] | None:
-    if what in ("look", "take", "photo"):
+    if what == "take" and not parts:
+        return coach.take_shown()
+    if what in ("look", "offer", "take", "photo"):
         images = [decoded(part) for part in parts]
-        if what == "photo":
-            return coach.look(images, take=True, photo=True)
-        return coach.look(images, take=what == "take")
+        return coach.look(images, take=Take.YES if what == "photo" else Take(what), photo=what == "photo")
     if what == "undo":
         return coach.undo()
     if what == "finish":

@@ -1,4 +1,4 @@
-"""Frames that do not come from the page: folders that are watched, videos, or cameras of this machine."""
+"""Frames that do not come from the page: folders that are watched, or cameras of this machine."""
 
 from __future__ import annotations
 
@@ -87,43 +87,35 @@ def _moments(folders: Sequence[Path]) -> dict[str, list[Path]]:
     return {f: [m[k] for k in by_path] for f, m in sorted(moments.items()) if len(m) == len(folders)}
 
 
-def video_frames(paths: Sequence[Path]) -> Iterator[Frame]:
-    """Return every frame of a video, or of several that run together; raises InputError where one cannot be read."""
-    return _captured([cv2.VideoCapture(str(path)) for path in paths], [f"video '{path}'" for path in paths])
-
-
 def device_frames(numbers: Sequence[int]) -> Iterator[Frame]:
-    """Return frames of cameras of this machine, the newest each time; raises InputError where there is none."""
-    return _captured([cv2.VideoCapture(number) for number in numbers], [f"camera {number}" for number in numbers])
+    """Return frames of cameras of this machine, the newest each time; raises InputError at once where there is none,
+    later where one is gone."""
+    sources = [cv2.VideoCapture(number) for number in numbers]
+    first = _moment(sources, numbers)
+
+    def going_on() -> Iterator[Frame]:
+        try:
+            yield first
+            while True:
+                yield _moment(sources, numbers)
+        finally:
+            _release(sources)
+
+    return going_on()
 
 
-def _captured(sources: Sequence[cv2.VideoCapture], names: Sequence[str]) -> Iterator[Frame]:
-    """Return the frames of all sources; the first is fetched at once, so that one that gives none is told of."""
-    first = _moment(sources)
-    bad = [name for name, frame in zip(names, first, strict=True) if frame is None]
-    if bad:
-        _release(sources)
-        raise InputError(f"coach: {bad[0]} gives no picture; check the path, or that no other program has it")
-    return _going_on([frame for frame in first if frame is not None], sources)
-
-
-def _going_on(frames: Frame, sources: Sequence[cv2.VideoCapture]) -> Iterator[Frame]:
-    try:
-        while len(frames) == len(sources):
-            yield frames
-            frames = [frame for frame in _moment(sources) if frame is not None]
-    finally:
-        _release(sources)
-
-
-def _moment(sources: Sequence[cv2.VideoCapture]) -> list[NDArray[Any] | None]:
-    """Return an image of each, None where there is none any more."""
+def _moment(sources: Sequence[cv2.VideoCapture], numbers: Sequence[int]) -> Frame:
+    """Return an image of each camera; raises InputError where one gives none."""
     # All are told to take theirs before any is fetched, so that they are of one moment.
     grabbed = [source.grab() for source in sources]
     read = [source.retrieve() if good else (False, None) for good, source in zip(grabbed, sources, strict=True)]
-    return [
-        np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) if got and frame is not None else None for got, frame in read
-    ]
+    silent = [f"{number}" for (got, frame), number in zip(read, numbers, strict=True) if not got or frame is None]
+    if silent:
+        _release(sources)
+        raise InputError(
+            f"coach: camera {', '.join(silent)} gives no picture; check the cable, and that no other program has it"
+        )
+    return [np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read if frame is not None]
 
 
 def _release(sources: Sequence[cv2.VideoCapture]) -> None:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
@@ -14,22 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
-from rigkit.coach.coach import Coach
+from rigkit.coach.coach import Coach, Image, Take
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.keeper import Keeper, folder_of
+from rigkit.coach.look import Glance
 from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
-from rigkit.coach.sources import Frame, device_frames, video_frames, watched_frames
+from rigkit.coach.sources import Frame, device_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import Severity, worst
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
+from rigkit.io.video import Video
 from rigkit.planning.goal import Goal
 from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.folder_session import session_to_come
+from rigkit.workflows.frames import frames_of_videos, moments_of_videos, timestamps_beside
 from rigkit.workflows.next_views import goal_of
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
@@ -87,8 +91,8 @@ def open_coach(options: CoachOptions) -> Coach:
 
 def _names(options: CoachOptions) -> tuple[str, ...]:
     """Return what the cameras are called."""
-    names = [path.stem for path in (*options.watch, *options.video)] or [f"camera{n}" for n in options.device]
-    names = names or [f"camera{n}" for n in range(options.cameras)]
+    names = [path.resolve().name for path in options.watch] + [path.stem for path in options.video]
+    names = names or [f"camera{n}" for n in options.device or range(options.cameras)]
     if len(names) == 1:
         return (ONE,)
     if len(set(names)) < len(names):
@@ -118,20 +122,54 @@ def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Sever
     return f"Done: {what}, {error}, {written[0].name} written{more.get(verdict, '')}"
 
 
+def _unseen(images: Sequence[Image]) -> None:
+    """Show nothing."""
+
+
 def coach_frames(
-    coach: Coach, frames: Iterator[Frame], *, photos: bool, show: Callable[[list[bytes]], None] | None = None
+    coach: Coach,
+    frames: Iterator[Sequence[Image]],
+    *,
+    photos: bool,
+    show: Callable[[Sequence[Image]], None] = _unseen,
 ) -> None:
-    """Offer frames to the coach until there are enough, or no more."""
+    """Offer frames to the coach until there are enough, or no more, or somebody finished it."""
     for images in frames:
+        show(images)
         try:
-            state = coach.offer(images, photo=photos)
+            state = coach.look(images, take=Take.WORTH, photo=photos)
         except RigkitError as error:
             _log.warning("%s", error)
+            coach.say(str(error))
             continue
-        if show is not None:
-            show([_preview(image) for image in images])
-        if state.get("enough"):
+        if state["enough"] or coach.finished is not None:
             break
+
+
+def coach_recording(coach: Coach, videos: Sequence[Path], *, show: Callable[[Sequence[Image]], None] = _unseen) -> str:
+    """Let the coach choose frames of a video, or of several that run together; return what the recording lacks, in
+    words, "" where nothing.
+
+    Raises InputError where a video cannot be read, or shows no board.
+    """
+    sources, boards = dict(zip(coach.keeper.names, videos, strict=True)), coach.guide.options.boards
+    times = timestamps_beside(videos)
+
+    def tell(what: str, done: int, total: int) -> None:
+        coach.say(f"{what.capitalize()}: {done} of {total}")
+
+    with TemporaryDirectory(prefix="rigkit-coach-") as place:
+        kept = frames_of_videos(sources, Path(place) / "frames", boards, timestamps=times, progress=tell)
+    numbers = {int(path.stem) for paths in kept.images.values() for path in paths}
+    frames = [[moment[name] for name in sources] for moment in moments_of_videos(sources, numbers, times)]
+    coach.choose(frames, show)
+    guide = coach.guide
+    if not guide.frames:
+        return ""
+    advice = guide.advise([Glance(size_px=glance.size_px, view=None) for glance in guide.frames[-1]])
+    more = advice.lenses[advice.speaks].more_percent
+    bring = "" if more is None else f"; two more pictures would bring {more:.0f} %"
+    return "" if advice.enough else f". What it lacks: {advice.words[0].lower()}{advice.words[1:]}{bring}"
 
 
 def _preview(frame: NDArray[Any]) -> bytes:
@@ -146,23 +184,36 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
 
     Raises InputError for a folder or source that cannot be used, InstallationError without the extra `coach`.
     """
+    for path in options.video:
+        with Video(path):
+            pass
     frames = _frames(options)
     coach = open_coach(options)
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
-    app = coach_app(coach, token, (host, *LOCAL), camera="page" if frames is None else "server")
-    if frames is not None:
-        preview: dict[int, bytes] = app.state.preview
+    of_server = bool(options.video) or frames is not None
+    app = coach_app(coach, token, (host, *LOCAL), camera="server" if of_server else "page")
+    preview: dict[int, bytes] = app.state.preview
 
-        def work() -> None:
-            try:
-                coach_frames(
-                    coach, frames, photos=bool(options.watch), show=lambda jpegs: preview.update(dict(enumerate(jpegs)))
-                )
-                told(coach.finish())
-            except RigkitError as error:
-                told(str(error))
+    def show(images: Sequence[Image]) -> None:
+        preview.update(enumerate(map(_preview, images)))
 
+    def work() -> None:
+        missing = ""
+        try:
+            if frames is None:
+                missing = coach_recording(coach, options.video, show=show)
+            else:
+                coach_frames(coach, frames, photos=bool(options.watch), show=show)
+            if coach.finished is None:
+                told(coach.finish(missing))
+        except RigkitError as error:
+            coach.say(str(error))
+            told(str(error))
+
+    if options.watch:
+        coach.say(f"Waiting for pictures in {' and '.join(map(str, options.watch))}")
+    if of_server:
         threading.Thread(target=work, daemon=True).start()
     if options.lan:
         _log.warning("%s", LAN_WARNING)
@@ -176,6 +227,4 @@ def _frames(options: CoachOptions) -> Iterator[Frame] | None:
         raise InputError("coach: frames come from one place: --watch, --video or --device")
     if options.watch:
         return watched_frames(options.watch)
-    if options.video:
-        return video_frames(options.video)
     return device_frames(options.device) if options.device else None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -169,6 +169,18 @@ def _moments(
         pictures = {name: x for name, k in fresh.items() if (x := videos[name].frame(k)) is not None}
         if pictures:
             yield number, pictures
+
+
+def moments_of_videos(
+    sources: Mapping[str, Path], numbers: Collection[int], timestamps: Path | None = None
+) -> Iterator[dict[str, Image]]:
+    """Yield what all cameras show at some moments, by their numbers; those that one of them lacks are left out."""
+    with ExitStack() as stack:
+        videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
+        moments = None if timestamps is None else read_timestamps(timestamps, list(sources))
+        for number, pictures in _moments(videos, moments):
+            if number in numbers and len(pictures) == len(sources):
+                yield pictures
 
 
 def _described(number: int, pictures: Mapping[str, Image], boards: Sequence[Board]) -> KeptFrame | None:

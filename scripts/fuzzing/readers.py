@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.cli.main import main
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.sources import video_frames, watched_frames
+from rigkit.coach.sources import watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
 from rigkit.interop.ocamcalib import read_py_ocamcalib
@@ -21,7 +21,7 @@ from rigkit.io.session import load_session
 from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.video import read_timestamps
 from rigkit.workflows.calibrate import calibrate_session
-from rigkit.workflows.coach import CoachOptions, coach_frames, open_coach
+from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach
 from rigkit.workflows.frames import frames_of_video
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)
@@ -90,7 +90,7 @@ def read_times(path: Path) -> None:
 
 def coach_video(path: Path) -> None:
     """Let the coach choose from the frames of a video."""
-    coach_frames(_coach(), video_frames([path]), photos=False, show=lambda jpeg: None)
+    coach_recording(_coach(), [path])
 
 
 def coach_folder(path: Path) -> None:
@@ -99,7 +99,7 @@ def coach_folder(path: Path) -> None:
     for name in (path.name, "image.png"):
         shutil.copy(name, Path("watched") / name)
     coach = _coach()
-    coach_frames(coach, watched_frames([Path("watched")], until_idle_s=0.5), photos=True, show=lambda jpeg: None)
+    coach_frames(coach, watched_frames([Path("watched")], until_idle_s=0.5), photos=True)
     assert coach.guide.frames, "the picture after the damaged one was not looked at"
 
 

@@ -14,6 +14,7 @@ import pytest
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
+from rigkit.coach.coach import Take
 from rigkit.coach.guide import GuideOptions
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
@@ -295,7 +296,7 @@ def test_the_coach_takes_pictures_of_it(lab: Lab, tmp_path: Path) -> None:
     coach = open_coach(options)
     for n in range(VIEWS):
         grey = to_grey(read_image(lab.path(f"left/{n:02d}.png")))
-        state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=True)
+        state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=Take.YES)
         assert state["taken"] is not None
     assert "px" in coach.finish()
     assert (tmp_path / "coached" / "calibration.json").exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -13,11 +14,11 @@ import pytest
 
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
-from rigkit.coach.coach import Coach
+from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import CaptureGuide, GuideOptions
 from rigkit.coach.look import glance_at
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
-from rigkit.coach.sources import video_frames, watched_frames
+from rigkit.coach.sources import device_frames, watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -28,7 +29,7 @@ from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.coach import CoachOptions, coach_frames, open_coach
+from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach, run_coach
 
 SIZE = (640, 480)
 BOARD = Board("board-9x6x25", 9, 6, 25.0, 25.0)
@@ -88,7 +89,16 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
         cv2.imwrite(str(watched / f"{k:02d}.png"), image)
     (watched / "notes.png").write_text("no picture")
     coach = open_coach(options(tmp_path / "session"))
-    coach_frames(coach, watched_frames([watched], until_idle_s=1.0), photos=True)
+    # The first picture once more: whoever took it is told that it brought nothing.
+    cv2.imwrite(str(watched / "001.png"), pictures[0])
+    said = []
+    coach_frames(
+        coach,
+        watched_frames([watched], until_idle_s=1.0),
+        photos=True,
+        show=lambda images: said.append(coach.state().get("words")),
+    )
+    assert any(str(words).startswith("Not taken, as it brings little that is new. Hold the board: ") for words in said)
     assert len(coach.guide.frames) >= 7
     kept = sorted((tmp_path / "session/images").glob("*.png"))
     assert len(kept) == len(coach.guide.frames)
@@ -101,11 +111,57 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     assert error < max(4.0 * stated, 0.15)
 
 
+def test_a_recording_is_gone_through_whole_and_what_it_lacks_is_said(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    film = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(film), cv2.VideoWriter.fourcc(*"FFV1"), 10.0, SIZE)
+    blurred = [cv2.GaussianBlur(image, (0, 0), 2.5) for image in pictures]
+    # The board comes blurred into every pose, is held, and the recording begins with nothing.
+    for image in [np.full_like(pictures[0], 90), *(x for pair in zip(blurred, pictures, strict=True) for x in pair)]:
+        writer.write(image)
+    writer.release()
+    coach = open_coach(options(tmp_path / "session", video=(film,)))
+    shown: list[object] = []
+    lacks = coach_recording(coach, [film], show=shown.append)
+    kept = [np.asarray(cv2.imread(str(path))) for path in sorted((tmp_path / "session/images").glob("*.png"))]
+    assert 7 <= len(kept) == len(shown) == len(coach.guide.frames)
+    # Grey as the recording is decoded: of every pose the sharp picture.
+    assert all(min(np.abs(k.astype(int) - p).max() for p in pictures) <= 2 for k in kept)
+    assert lacks == "" or "two more pictures would bring" in lacks
+    few = tmp_path / "few.avi"
+    writer = cv2.VideoWriter(str(few), cv2.VideoWriter.fourcc(*"FFV1"), 10.0, SIZE)
+    for image in pictures[:3]:
+        writer.write(image)
+    writer.release()
+    lacks = coach_recording(open_coach(options(tmp_path / "other", video=(few,))), [few])
+    assert lacks.startswith(". What it lacks: hold the board: ")
+
+
+def test_what_is_shown_can_be_taken_once_and_undone(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    coach = open_coach(options(tmp_path))
+    with pytest.raises(InputError, match="no frame to undo"):
+        coach.undo()
+    with pytest.raises(InputError, match="no new picture"):
+        coach.take_shown()
+    coach.look([pictures[0]])
+    assert coach.take_shown()["taken"] == "frame-0001.png"
+    with pytest.raises(InputError, match="no new picture"):
+        coach.take_shown()
+    # An image that shows no board, as a person may leave one there, is none of the coach's frames.
+    cv2.imwrite(str(tmp_path / "images/frame-0009.png"), np.full((480, 640), 90, np.uint8))
+    again = open_coach(options(tmp_path))
+    assert again.undo()["frames"] == 0
+    assert (tmp_path / "images/frame-0001.png.dropped").exists() and again.keeper.frames == ["frame-0009.png"]
+
+
 def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a folder"):
         watched_frames([tmp_path / "none"])
-    with pytest.raises(InputError, match="gives no picture"):
-        video_frames([tmp_path / "none.mp4"])
+    with pytest.raises(InputError, match="camera 97 gives no picture"):
+        device_frames([97])
+    with pytest.raises(InputError, match="does not exist"):
+        run_coach(options(tmp_path / "session", video=(tmp_path / "none.mp4",)), print)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file, not a folder"):
         open_coach(options(tmp_path / "file"))
@@ -114,7 +170,7 @@ def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
 def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tmp_path: Path) -> None:
     coach = open_coach(options(tmp_path))
     for image in pictures[:5]:
-        coach.look([image], take=True)
+        coach.look([image], take=Take.YES)
     # Nothing was said to it: it is simply gone.
     again = open_coach(options(tmp_path))
     assert len(again.guide.frames) == 5
@@ -122,7 +178,7 @@ def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tm
     assert lens.calibration is not None
     drawn = lens.sigma_map()
     assert drawn is not None and lens.sigma_map() is drawn, "nothing new was seen"
-    again.look([pictures[5]], take=True)
+    again.look([pictures[5]], take=Take.YES)
     assert again.keeper.frames[-1] == "frame-0006.png"
     again.undo()
     assert len(again.guide.frames) == len(again.keeper.frames) == 5
@@ -140,7 +196,18 @@ def served(tmp_path: Path, serve: Callable[[Coach, tuple[str, ...]], int]) -> tu
 def ask(port: int, method: str, path: str, body: bytes = b"", **headers: str) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     own = {"Origin": f"http://127.0.0.1:{port}", **headers} if method == "POST" else headers
-    connection.request(method, path, body, {k.replace("_", "-"): v for k, v in own.items() if v})
+    if headers.get("chunks"):
+        # Nobody says how much it will be.
+        connection.putrequest(method, path)
+        for name, value in own.items():
+            connection.putheader(name, value)
+        connection.endheaders()
+        megabyte = b"100000\r\n" + bytes(2**20) + b"\r\n"
+        with suppress(OSError):
+            for _ in range(MAX_UPLOAD_BYTES // 2**20 + 2):
+                connection.send(megabyte)
+    else:
+        connection.request(method, path, body, {k.replace("_", "-"): v for k, v in own.items() if v})
     answer = connection.getresponse()
     return answer.status, answer.read()
 
@@ -162,6 +229,10 @@ def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictur
         ("POST", "/secre%74x/take", png, {}, 404),
         ("POST", "/secret/take", png, {"Origin": "http://evil.example"}, 403),
         ("POST", "/secret/take", png, {"Origin": ""}, 403),
+        ("POST", "/secret/take", png, {"Origin": "null"}, 403),
+        ("GET", "/secret/", b"", {"Host": f"127.0.0.1@evil.example:{port}"}, 403),
+        ("GET", "/secret/", b"", {"Host": "["}, 400),
+        ("PUT", "/secret/take", png, {}, 405),
         ("GET", "/secret/", b"", {"Host": "evil.example"}, 403),
         ("GET", "/secret/../../etc/passwd", b"", {}, 404),
         ("GET", "/secret/%2e%2e%2f%2e%2e%2fetc%2fpasswd", b"", {}, 404),
@@ -173,7 +244,10 @@ def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictur
         ("POST", "/secret/take?sizes=x", png, {}, 400),
         ("POST", f"/secret/take?sizes={len(png)},{len(png)}", png + png, {}, 400),
         ("POST", "/secret/take", b"no picture", {}, 400),
+        # A kilobyte that announces a gigabyte.
+        ("POST", "/secret/take", png[:16] + (60_000).to_bytes(4, "big") * 2 + png[24:900], {}, 400),
         ("POST", "/secret/take", b"", {"Content-Length": str(MAX_UPLOAD_BYTES + 1)}, 413),
+        ("POST", "/secret/take", b"", {"Transfer-Encoding": "chunked", "chunks": "too many"}, 413),
     ):
         assert ask(port, method, path, body, **headers)[0] == wanted, (method, path, headers)
     assert len(coach.keeper.frames) == 1

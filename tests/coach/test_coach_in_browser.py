@@ -11,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, picture
+from coach.test_rig import shared_boards
 from helpers.browser import chromium
 from helpers.driven import DrivenPage
 
 from rigkit.cameras.compare import compare_cameras
+from rigkit.coach.look import glance_at
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import load_calibration
@@ -39,7 +41,7 @@ def person_like_video(path: Path, poses: int) -> Path:
     known = Knowledge.guessed(CAMERA, CornerError(0.1))
     plan = plan_views(known, [BOARD], projection_goal(CAMERA), poses)
     with path.open("wb") as out:
-        out.write(f"YUV4MPEG2 W{SIZE[0]} H{SIZE[1]} F{RATE}:1 Ip A1:1 C420jpeg\n".encode())
+        out.write(_head(SIZE[0]))
         for view in plan.views:
             pose = view.cam_from_board
             turned = exp_so3(np.radians(2.0) * rng.standard_normal(3)) @ pose.rotation
@@ -54,23 +56,48 @@ def person_like_video(path: Path, poses: int) -> Path:
     return path
 
 
+def _head(width: int) -> bytes:
+    return f"YUV4MPEG2 W{width} H{SIZE[1]} F{RATE}:1 Ip A1:1 C420jpeg\n".encode()
+
+
 def _write(out, image: np.ndarray) -> None:
-    chroma = np.full(SIZE[0] * SIZE[1] // 2, 128, np.uint8)
+    chroma = np.full(image[..., 0].size // 2, 128, np.uint8)
     out.write(b"FRAME\n" + image[..., 0].tobytes() + chroma.tobytes())
 
 
+HALVES = """
+const real = navigator.mediaDevices.getUserMedia.bind(navigator.mediaDevices);
+navigator.mediaDevices.enumerateDevices = async () =>
+  [0, 1].map((k) => ({ deviceId: `${k}`, label: `Half ${k}`, kind: "videoinput", groupId: "" }));
+let film = null;
+navigator.mediaDevices.getUserMedia = async (want) => {
+  const half = Number(want.video.deviceId?.exact ?? 0), part = document.createElement("canvas");
+  if (!film) {
+    film = Object.assign(document.createElement("video"), { muted: true, srcObject: await real({ video: true }) });
+    await film.play();
+  }
+  part.width = film.videoWidth / 2; part.height = film.videoHeight;
+  const draw = () => part.getContext("2d").drawImage(film, -half * part.width, 0);
+  draw(); setInterval(draw, 50);
+  return part.captureStream(15);
+};
+"""
+"""Chromium plays one film for all cameras: two of them are its halves."""
+
+
 @contextmanager
-def _guided(video: Path, folder: Path, profile: Path) -> Iterator[DrivenPage]:
+def _guided(video: Path | None, folder: Path, profile: Path, *more: str, before: str = "") -> Iterator[DrivenPage]:
     """Run the coach and its page, and kill both in the end; nothing may be complained of in the browser's console."""
     chromium()
     pytest.importorskip("uvicorn")
     command = ["-c", "import sys; from rigkit.cli.main import main; sys.exit(main())", "coach", str(folder)]
-    command += ["--board", "9x6x25", "--lens", "52", "--goal", str(GOAL_PX), "--port", "0"]
+    command += ["--board", "9x6x25", "--lens", "52", "--goal", str(GOAL_PX), "--port", "0", *more]
     with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         camera = ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
         url = server.stdout.readline().strip()
-        page = DrivenPage(url, profile, *camera, f"--use-file-for-fake-video-capture={video}")
+        film = [] if video is None else [*camera, f"--use-file-for-fake-video-capture={video}"]
+        page = DrivenPage(url, profile, *film, before=before)
         try:
             yield page
         finally:
@@ -99,6 +126,41 @@ def test_the_page_finds_a_board_and_takes_a_frame_and_obeys_keys(tmp_path: Path)
         page.press("u")
         page.wait("coach.state.frames == 2", PATIENCE_S)
     assert (folder / "images/frame-0003.png.dropped").exists()
+
+
+@pytest.mark.thorough
+def test_two_cameras_take_frames_together(tmp_path: Path) -> None:
+    chromium()
+    rng, (in_a, in_b) = np.random.default_rng(6), shared_boards(40)
+    film, folder = tmp_path / "pair.y4m", tmp_path / "session"
+    with film.open("wb") as out:
+        out.write(_head(2 * SIZE[0]))
+        for k in (0, 20, 39):
+            pair = np.concatenate([picture(held.pose(k), rng) for held in (in_a, in_b)], axis=1)
+            for _ in range(3 * HELD_FRAMES):
+                _write(out, pair)
+    with _guided(film, folder, tmp_path / "profile", "--cameras", "2", before=HALVES) as page:
+        page.wait("coach.state.frames >= 1", PATIENCE_S)
+        assert "camera" in _words(page)
+    kept = [read_image(folder / f"images/camera{c}/frame-0001.png") for c in (0, 1)]
+    # Both see one pose: the board is where the mount puts it, and not in one picture twice.
+    assert all(image.shape[:2] == SIZE[::-1] for image in kept) and not np.array_equal(kept[0], kept[1])
+    found = [glance_at(image, [BOARD], "kept").view for image in kept]
+    assert all(view is not None and len(view.grid) == BOARD.corner_count for view in found)
+
+
+@pytest.mark.thorough
+def test_who_has_no_camera_is_told_what_to_do(tmp_path: Path) -> None:
+    """And nothing is complained of where the pictures come from elsewhere, and none is there yet."""
+    (tmp_path / "incoming").mkdir()
+    with _guided(None, tmp_path / "a", tmp_path / "pa", "--watch", str(tmp_path / "incoming")) as page:
+        page.wait("coach.looks > 2", PATIENCE_S)
+        assert _words(page).startswith("Waiting for pictures in ")
+        page.press("u")
+        page.wait('document.getElementById("words").textContent.includes("no frame to undo")', PATIENCE_S)
+    with _guided(None, tmp_path / "b", tmp_path / "pb") as page:
+        page.wait('document.getElementById("words").textContent.startsWith("No live camera: no camera")', PATIENCE_S)
+        assert page.evaluate('!document.getElementById("photo").hidden')
 
 
 @pytest.mark.slow

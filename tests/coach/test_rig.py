@@ -12,7 +12,7 @@ import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 
 from rigkit.calibration.result import Calibration
-from rigkit.coach.coach import Coach
+from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import SHARED_FRAMES, RigGuide
@@ -135,7 +135,7 @@ def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.nda
     (incoming[0] / "img7.png").write_bytes((incoming[0] / "img0.png").read_bytes())
     coach = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
     for images in watched_frames(incoming, until_idle_s=0.7):
-        coach.look(images, take=True)
+        coach.look(images, take=Take.YES)
     taken = len(coach.guide.frames)
     assert taken == len(pairs)
     kept = [sorted((tmp_path / "session/images" / name).glob("*.png")) for name in ("left", "right")]
@@ -146,7 +146,7 @@ def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.nda
     kept[1][-1].unlink()
     again = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
     assert len(again.guide.frames) == taken - 1 and kept[0][-1].exists()
-    again.look(pairs[0], take=True)
+    again.look(pairs[0], take=Take.YES)
     assert again.keeper.frames[-1] == f"frame-{taken + 1:04d}.png"
     with pytest.raises(InputError, match="1 images of 2 cameras"):
         again.look(pairs[0][:1])

@@ -20,7 +20,10 @@ PATIENCE_S = 60.0
 class DrivenPage:
     """A page at an address; `complaints` are what its scripts wrote to the console or did not catch."""
 
-    def __init__(self, url: str, profile: Path, *options: str, size_px: tuple[int, int] = (1366, 900)) -> None:
+    def __init__(
+        self, url: str, profile: Path, *options: str, size_px: tuple[int, int] = (1366, 900), before: str = ""
+    ) -> None:
+        """Open the page; the script `before` runs before its own."""
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         command = [
@@ -47,6 +50,8 @@ class DrivenPage:
         self._ask("Runtime.enable")
         self._ask("Log.enable")
         self._ask("Page.enable")
+        if before:
+            self._ask("Page.addScriptToEvaluateOnNewDocument", source=before)
         self._ask("Page.navigate", url=url)
 
     def evaluate(self, script: str) -> Any:
