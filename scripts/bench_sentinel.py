@@ -4,14 +4,16 @@ lens, rig: simulated corners. Cameras calibrated from planned views, checked wit
 `rigkit plan --check` asks ("advised"), and lenses also with three as people take them ("free"). Changes leave 0.15 px
 rms over the image after the best rotation; mounts turn by 0.02 degrees. Beside what was found stands what no test could
 find more often: the change in its own direction, known before. `--board` takes another board for all of it.
+departs: lenses that no model is, calibrated with boards in the left part of the image and checked with three in the
+right: what they do there beyond their models is no change.
 rendered: pictures of all five lenses, detected; three or half of them are checked against the rest, and three pictures
 after a change.
 scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
 pairs: real pairs of textured scenes whose cameras and pose are known; the pose told is right, or 0.05 degrees off.
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
-    python scripts/bench_sentinel.py [lens] [rig] [rendered] [scene] [pairs] [real] [--seeds 20] [--lens NAME ...]
-        [--board 9x6x25]
+    python scripts/bench_sentinel.py [lens] [rig] [departs] [rendered] [scene] [pairs] [real] [--seeds 20]
+        [--lens NAME ...] [--board 9x6x25]
 """
 
 from __future__ import annotations
@@ -34,15 +36,18 @@ from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, ch
 from split_halves import identified
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import DisplacedCamera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
@@ -60,6 +65,9 @@ from rigkit.validation.sentinel.whitened import Whitened
 BOARD = bench_planner.BOARD
 """Another by `--board`."""
 TURNED_DEG, STRETCHED = 0.02, 1.003
+DEPARTS_PX, LONGER, DEPARTING_VIEWS = 0.1, 1.01, 90
+"""At the corners of the image; and boards of which some are left, and three right of the middle."""
+DEPARTING = ("reg", "wide", "fish")
 VIEWS = 16
 RENDERED_PLANNED, RENDERED_FREE = 16, 12
 MOUNT = Rigid3(exp_so3(np.array([0.0, -0.08, 0.01])), [-120.0, 1.0, 2.0])
@@ -97,6 +105,20 @@ def seen(camera: Camera, pose: Rigid3, name: str, noise_px: float, rng: np.rando
     noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
     noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
     return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), noise_px))
+
+
+def views_on(
+    camera: Camera, poses: Sequence[Rigid3], board: Board, noise_px: float, rng: np.random.Generator
+) -> list[BoardView]:
+    """Return noisy views of all corners that are on the image."""
+    out = []
+    for k, pose in enumerate(poses):
+        pixels, valid = camera.project(pose.apply(board.points()))
+        valid &= camera.on_image(pixels)
+        noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
+        noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
+        out.append(BoardView(f"{k:02d}", board, board.grid()[valid], noisy, np.full(len(noisy), noise_px)))
+    return out
 
 
 def views_of(camera: Camera, poses: Sequence[Rigid3], noise_px: float, rng: np.random.Generator) -> list[BoardView]:
@@ -154,11 +176,44 @@ def one_camera(name: str, seeds: int, noise_px: float) -> None:
                 BEST.setdefault(how, []).extend(most[what])
 
 
+def departing(name: str, seeds: int, noise_px: float) -> None:
+    """A lens that departs from its model, unchanged and with a longer focal length, where the calibration had no
+    boards; and the same where what lenses may do beyond their models is not counted."""
+    sys.path.append(str(Path(__file__).parents[1] / "tests"))
+    from helpers.calibration_scenes import REACH_DEG, random_views
+    from helpers.calibration_scenes import lens as scene_lens
+
+    found: dict[tuple[str, bool], list[SentinelCheck]] = {}
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 5])
+        amounts = DEPARTS_PX * rng.normal(size=DISPLACEMENTS)
+        model = scene_lens(name)
+        size = model.size_px
+        camera = DisplacedCamera(size, np.append(model.parameters, amounts), model, np.eye(DISPLACEMENTS))
+        reach = 0.95 * REACH_DEG[name]
+        views, rotations, shifts = random_views(camera, DEPARTING_VIEWS, rng, reach_deg=reach, noise_px=noise_px)
+        left = [view for view in views if view.pixels[:, 0].max() < 0.6 * size[0]][:VIEWS]
+        right = [k for k, view in enumerate(views) if view.pixels[:, 0].min() > 0.5 * size[0]][:FRESH]
+        known = calibrate(left, size, model=model.model, board="flat", folds=0)
+        longer = model.with_parameters(model.parameters * np.where(np.arange(model.parameters.size) < 2, LONGER, 1.0))
+        changed = DisplacedCamera(size, np.append(longer.parameters, amounts), longer, camera.modes)
+        poses = [Rigid3(rotations[k], shifts[k]) for k in right]
+        fresh = {"nothing": [views[k] for k in right], "focus": views_on(changed, poses, views[0].board, noise_px, rng)}
+        for what, own in fresh.items():
+            for beyond in (False, True):
+                watched = watched_camera(known, "camera", beyond_model=beyond)
+                check = check_views(watched, [FreshView(v.image, 0, v) for v in own])
+                found.setdefault((what, beyond), []).append(check)
+    for (what, beyond), checks in found.items():
+        counted = "counted" if beyond else "not counted"
+        tell(f"{name} departs, {counted}: {what}", checks, what, f"departing lens ({counted}),")
+
+
 def best_chance(known: Calibration, views: Sequence[BoardView], change: FloatArray) -> float:
     """Return how often the best test of all, which knows the change but for its sign, finds it with as few alarms."""
     watched = watched_camera(known, "camera")
     whitened = Whitened.of(watched, evidence_of(watched, [FreshView(v.image, 0, v) for v in views]))
-    moved = whitened.by_theta @ change
+    moved = whitened.by_theta[:, : len(change)] @ change
     size = float(np.sqrt(moved @ np.linalg.solve(whitened.covariance, moved)))
     limit = float(-ndtri(0.5 * ALARM_CHANCE))
     return float(ndtr(size - limit) + ndtr(-size - limit))
@@ -207,9 +262,9 @@ def watched_rig(views: Sequence[FreshView], camera: Camera) -> Watched:
     rig = calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model)
     return Watched(
         names=names,
-        cameras=tuple(c.camera for c in rig.cameras),
+        cameras=rig.with_departures[0],
         cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
-        covariance=rig.covariance,
+        covariance=rig.with_departures[1],
         sigma_px=rig.sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
@@ -288,7 +343,7 @@ REAL = ("caliper", "camodocal", "ov-plane", "ocam", "fisheye-chess", "cylinder",
 
 
 def main() -> None:
-    kinds = ("lens", "rig", "rendered", "scene", "pairs", "real")
+    kinds = ("lens", "rig", "departs", "rendered", "scene", "pairs", "real")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", choices=[*kinds, []], help="default all")
     parser.add_argument("--seeds", type=int, default=20)
@@ -304,6 +359,7 @@ def main() -> None:
     work: dict[str, list[Callable[[], None]]] = {
         "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
         "rig": [partial(stereo, args.seeds, args.noise, n) for n in args.lens],
+        "departs": [partial(departing, n, args.seeds, args.noise) for n in DEPARTING],
         "rendered": [partial(rendered, n, args.seeds, args.cache) for n in args.lens],
         "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],
         "pairs": [partial(pairs, args.data, args.seeds)],

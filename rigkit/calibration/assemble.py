@@ -158,9 +158,10 @@ def not_identifiable(model: str) -> DegenerateError:
 
 def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
     """Raise DegenerateError where the views leave the lens open, even at the corners that they have: `at_corners_px` is
-    the uncertainty there. How much a wrong model makes the images disagree says nothing about that."""
+    the uncertainty there. How much a wrong model makes the images disagree, and how well they tell that, says nothing
+    about it."""
     sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
-    sigma /= result.overdispersion
+    sigma /= result.overdispersion * result.widening
     if result.sigma_px > 0.0:
         sigma *= max(result.sigma_px, MIN_RESULT_SIGMA_PX) / result.sigma_px
     if not sigma < UNKNOWN_SHARE * result.camera.size_px[0]:

@@ -45,14 +45,21 @@ class Option:
         return int(self.fit.state.camera.parameters.size + self.fit.state.shape.count)
 
 
-def choose(observations: Observations, options: list[Option], surely: float | None = None) -> Option:
+def settled(options: Sequence[Option]) -> Sequence[Option]:
+    """Return the options whose solver converged, where any did. The others creep along a ridge: a model with more
+    numbers than the lens has (a double sphere for a lens without distortion) shows the images with many of them."""
+    return [option for option in options if option.fit.convergence.converged] or options
+
+
+def choose(observations: Observations, options: Sequence[Option], surely: float | None = None) -> Option:
     """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
     (if given) `surely` standard errors of the difference; with too few images for that, the one with the smallest BIC.
+    One whose solver was stopped is taken only where all were; two images leave too much open to say that of it.
 
     Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
     rule, here paired over images.
     """
-    judged = [o for o in options if o.heldout is not None]
+    judged = [o for o in settled(options) if o.heldout is not None]
     if not judged:
         return min(options, key=lambda o: _bic(observations, o))
     good = _as_good(np.array([o.heldout for o in judged]), surely)
@@ -79,7 +86,8 @@ def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
 class HeldOut:
     """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
     numbers (most of the cameras') and squared held-out residuals (M, N), of each camera in units of its smallest mean:
-    cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by rounding."""
+    cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by rounding. Those
+    whose solver was stopped say nothing where others converged."""
 
     names: list[str]
     counts: list[int]
@@ -89,7 +97,7 @@ class HeldOut:
     @classmethod
     def of(cls, cameras: Sequence[Sequence[Option]]) -> HeldOut:
         """Put the evidence of cameras with their options together."""
-        known = [{o.name: o for o in options if o.heldout is not None} for options in cameras]
+        known = [{o.name: o for o in settled(options) if o.heldout is not None} for options in cameras]
         names = [name for name in known[0] if all(name in own for own in known)]
         counts = [max(own[name].count for own in known) for name in names]
         parts = [np.array([own[name].heldout for name in names]) for own in known]
@@ -145,6 +153,8 @@ def described(options: list[Option], chosen: Option, *, rivals: bool = False) ->
     for o in options:
         if len(options) == 1 and not rivals:
             reason = "the only one tried"
+        elif chosen.fit.convergence.converged and not o.fit.convergence.converged:
+            reason = "its solver was stopped before it converged"
         elif o.heldout_px is None or chosen.heldout_px is None:
             reason = "too few images to cross-validate: " + ("smallest BIC" if o is chosen else "larger BIC")
         elif o is chosen:

@@ -23,7 +23,7 @@ from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, Rays
 from rigkit.core.errors import InputError
 from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
 
@@ -31,8 +31,8 @@ MODES_GRID = (24, 18)
 """Columns and rows of pixels at which modes are weighed against the whole uncertainty."""
 MAX_LEFT_OUT = 0.02
 """Modes that together make up less than this part of the variance at every pixel are left out: 1 % of a sigma."""
-TOLD_APART = 1e-6
-"""Displacements that differ by less than this part have the same share in a rival."""
+SOFTEST, HARDEST, PENALTIES = 1e-6, 1.0, 19
+"""Amounts that stand for a rival are looked for with so many penalties on their size, as parts of what moves most."""
 SLOPE_STEP_PX = 1e-2
 """For the slope of displacements, which are polynomials over hundreds of pixels: exact to eight digits."""
 MAX_ROUNDS, ROUNDING_PX = 20, 1e-10
@@ -121,6 +121,11 @@ class DisplacedCamera(Camera):
         return u + du, v + dv, valid
 
 
+def lens_of(camera: Camera) -> Camera:
+    """Return a camera as its model alone has it."""
+    return camera._own if isinstance(camera, DisplacedCamera) else camera
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class LensModes:
     """What a lens may do beyond its model: modes (J, M) of displacements, px, of one standard deviation each,
@@ -130,10 +135,15 @@ class LensModes:
     moves: FloatArray
 
 
-def uncertain_camera(calibration: Calibration) -> UncertainCamera:
+def uncertain_camera(calibration: Calibration, *, quoted: bool = True) -> UncertainCamera:
     """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
-    with boards all over the image and a model that fits none do, and the camera is the calibration's own."""
-    (camera,), covariance = with_modes((calibration.camera,), calibration.covariance, (lens_modes(calibration),))
+    with boards all over the image and a model that fits none do, and the camera is the calibration's own.
+
+    The covariance is that which is `quoted`; otherwise Student's, for what counts the calibration's degrees of freedom
+    itself.
+    """
+    known = calibration.covariance * (calibration.widening**2 if quoted else 1.0)
+    (camera,), covariance = with_modes((calibration.camera,), known, (lens_modes(calibration),))
     return UncertainCamera(camera, covariance)
 
 
@@ -182,13 +192,13 @@ def telling_modes(far: FarProjection) -> FloatArray:
     if not known.any():
         return np.zeros((DISPLACEMENTS, 0))
     # In sigmas of the whole: what matters where boards were is not less than what matters far from them.
-    relative = far.left_over(rays, design)[..., known].transpose(1, 2, 0) / whole[known, None]
+    rays, design, whole = rays[known], design[..., known], whole[known]
+    relative = far.left_over(rays, design).transpose(1, 2, 0) / whole[:, None]
     fields = relative.reshape(DISPLACEMENTS, -1)
     covariance = far.departures.covariance.copy()
     for rival, away in far.away(rays, design):
-        moved = (away[known] / whole[known, None]).ravel()
-        amounts = np.linalg.lstsq(fields.T, moved, rcond=TOLD_APART)[0]
-        covariance += rival.likely * np.outer(amounts, amounts)
+        amounts = _amounts_like(far, rays, design, whole, fields, np.sqrt(rival.likely) * away)
+        covariance += np.outer(amounts, amounts)
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
     flat = root.T @ fields
@@ -197,3 +207,39 @@ def telling_modes(far: FarProjection) -> FloatArray:
     share = ((turn.T @ flat) ** 2).reshape(DISPLACEMENTS, -1, 2).sum(axis=-1)
     matters = np.cumsum(share, axis=0).max(axis=1) > MAX_LEFT_OUT
     return np.asarray((root @ turn)[:, matters])
+
+
+def _amounts_like(
+    far: FarProjection, rays: Rays, design: FloatArray, whole: FloatArray, fields: FloatArray, away: FloatArray
+) -> FloatArray:
+    """Return the amounts (J,) with which the displaced camera, its parameters following, shows rays (M, 3) nearest to
+    `away` (M, 2) px from where it has them, in units of `whole` (M,) px; `fields` (J, 2 M) are the displacements less
+    what parameters and a rotation have taken up, in these units, `design` is `projection_design`.
+
+    Displacements of many pixels that parameters and a turned camera take up again but for a little would show any
+    difference at first order. Of a camera that is moved so far that is not true, and what is seen in its frame turns
+    with it. So the turn is to be none, large amounts are penalised, and of all penalties that is taken with which the
+    camera that is really moved comes nearest.
+    """
+    p = len(far.sigmas)
+    turned = np.einsum("wj,iwm->jmi", far.hides_departures, design[:, p:]) / whole[:, None]
+    values, axes = np.linalg.eigh(far.departures.covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    rows = np.concatenate([fields, turned.reshape(DISPLACEMENTS, -1)], axis=1).T @ root
+    wanted = np.concatenate([(away / whole[:, None]).ravel(), np.zeros(2 * len(rays))])
+    left, size, right = np.linalg.svd(rows, full_matrices=False)
+    pixels = far.camera.project(rays)[0]
+    best, amounts = float((wanted**2).sum()), np.zeros(DISPLACEMENTS)
+    for penalty in size[0] * np.geomspace(SOFTEST, HARDEST, PENALTIES):
+        tried = root @ (right.T @ (size / (size**2 + penalty**2) * (left.T @ wanted)))
+        parameters = np.append(far.camera.parameters - far.departures.followed @ tried, tried)
+        try:
+            moved = DisplacedCamera(far.camera.size_px, parameters, far.camera, np.eye(DISPLACEMENTS))
+            shown, valid = moved.project(rays)
+        except InputError:
+            continue
+        off = ((np.where(valid[:, None], shown, np.inf) - pixels - away) / whole[:, None]).ravel()
+        error = float((off**2).sum())
+        if error < best:
+            best, amounts = error, tried
+    return amounts

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choice import SURELY, HeldOut, Option, choose
+from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, settled
 from rigkit.calibration.fit import fit_kept, heldout_squares
 from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
 from rigkit.calibration.observations import Observations
@@ -91,13 +91,7 @@ def lenses_on_boards(found: Solved, tried: Lenses, names: Sequence[str], how: Ho
     for option in options:
         if all(option.fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
             judged.append(replace(option, heldout=heldout_squares(observations, option.fit, how.folds)))
-    return Lenses(observations, settled(judged))
-
-
-def settled(options: list[Option]) -> list[Option]:
-    """Return the options whose solver converged, where any did. The others creep along a ridge: a model with more
-    numbers than the lens has (a double sphere for a lens without distortion) shows the images with many of them."""
-    return [option for option in options if option.fit.convergence.converged] or options
+    return Lenses(observations, list(settled(judged)))
 
 
 def choose_lenses(cameras: Sequence[Lenses]) -> list[Choice]:

@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from rigkit.calibration.clustered import widening
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
 from rigkit.core.boards import Board
@@ -303,13 +304,14 @@ class Calibration:
     heldout_rms_px : the headline. The RMS over images that took no part, of a corner of median quality (residuals are
         weighted as in the solution): k-fold over images, intrinsics and board shape frozen, only the pose of the
         held-out board refitted. None with fewer than three images.
-    covariance : (P, P) of `camera.parameters`.
+    covariance : (P, P) of `camera.parameters`: Student's, with `freedom` degrees of freedom.
     frame_covariance : (P + 6, P + 6) of the parameters together with the mean motion of the boards, (rad, mm): what
         `uncertainty` needs to tell a moved camera from another lens.
     sigma_px : standard deviation per coordinate of a corner of median quality, from the residuals.
     overdispersion : by how much more the images disagree than independent corners would, as a ratio of standard
         deviations. The covariances count it in: they rest on what repeats from image to image.
-    freedom : degrees of freedom of the covariances; infinite where there are too few images to know.
+    freedom : degrees of freedom of the covariances; infinite where there are too few images to know. Standard
+        deviations that are quoted count them in (`widening`).
     views : the views used, in the order given.
     dropped : (image, reason) of what was not used; of images with views only something in them.
     outliers : corners left out of views that were used.
@@ -370,8 +372,13 @@ class Calibration:
 
     @property
     def parameter_sigmas(self) -> FloatArray:
-        """Standard deviations of `camera.parameters`, (P,)."""
-        return np.sqrt(np.diag(self.covariance))
+        """Standard deviations of `camera.parameters`, (P,): two hold 95 % of errors, however few images there are."""
+        return self.widening * np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def widening(self) -> float:
+        """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
+        return widening(self.freedom, self.overdispersion, len(self.covariance))
 
     @property
     def images_left_out(self) -> int:

@@ -69,7 +69,8 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     if np.isinf(range_mm):
         found = far.covariance(flat)
     else:
-        found = _propagated(calibration.frame_covariance, projection_design(calibration.camera, flat, range_mm))
+        known = calibration.widening**2 * calibration.frame_covariance
+        found = _propagated(known, projection_design(calibration.camera, flat, range_mm))
         found += far.beyond_model(flat, projection_design(calibration.camera, flat))
     covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
@@ -125,7 +126,8 @@ class FarProjection:
             rays, valid = points / np.linalg.norm(points, axis=-1, keepdims=True), np.ones(len(points), dtype=bool)
         p = camera.parameters.size
         # Parameters have units of their own: in standard deviations they can be compared.
-        sigmas = np.sqrt(np.maximum(np.diag(calibration.covariance), 0.0))
+        known = calibration.widening**2 * calibration.covariance
+        sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
         design = projection_design(camera, rays)
         departures, pixels = Departures.of(calibration), camera.project(rays)[0]
         left = np.concatenate([sigmas[:, None] * design[:, :p], departures.left_over(pixels, design)], axis=1)
@@ -139,7 +141,7 @@ class FarProjection:
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         return cls(
             camera=camera,
-            correlation=calibration.covariance / np.outer(safe, safe),
+            correlation=known / np.outer(safe, safe),
             sigmas=sigmas,
             rays_valid=valid,
             rays=rays,

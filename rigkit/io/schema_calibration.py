@@ -57,7 +57,9 @@ _MADE = obj(
     },
     "by what, when, and from what it was made",
 )
-_FREEDOM = said(nullable(NUMBER), "degrees of freedom of the covariances; null: too few images to know")
+_FREEDOM = said(
+    nullable(NUMBER), "degrees of freedom of the covariances, which are Student's; null: too few images to know"
+)
 _HELDOUT = said(
     nullable(NUMBER), "the headline: RMS over images that took no part, the lens frozen and only poses fitted"
 )

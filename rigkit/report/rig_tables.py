@@ -47,7 +47,7 @@ def _cameras(rig: RigCalibration) -> Table:
 
 def _intrinsics(rig: RigCalibration) -> Table:
     """Return the intrinsics as the joint solution has them, a column a camera."""
-    sigmas = np.sqrt(np.diag(rig.covariance))
+    sigmas = rig.sigmas
     own_words: list[dict[str, str]] = []
     start = 0
     for camera in rig.cameras:
@@ -68,7 +68,7 @@ def _intrinsics(rig: RigCalibration) -> Table:
 
 def _mounts(rig: RigCalibration) -> Table:
     """Return how the cameras stand against the first one."""
-    sigmas = np.sqrt(np.diag(rig.covariance))
+    sigmas = rig.sigmas
     heads = (Column("camera"), *(Column(f"turned about {a}", "deg") for a in "xyz"))
     heads += tuple(Column(f"moved along {a}", "mm") for a in "xyz")
     rows = []

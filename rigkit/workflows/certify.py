@@ -90,7 +90,7 @@ def load_instrument(
         if cameras is not None:
             raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
         calibration = load_calibration(path)
-        known = uncertain_camera(calibration)
+        known = uncertain_camera(calibration, quoted=False)
         return Instrument(
             names=(Path(path).stem,),
             cameras=(known.camera,),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.calibration.clustered import with_block
+from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.usable import views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -154,13 +155,14 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
             boards = tuple(shape.board for shape in calibration.boards)
         return watched_camera(calibration, source.stem), boards
     rig = load_saved_rig(source)
-    if rig.covariance is None or rig.sigma_px is None:
+    lenses, covariance = rig.with_departures
+    if covariance is None or rig.sigma_px is None:
         raise InputError(f"'{source}': the file does not say how sure the rig is; calibrate it with rigkit")
     return Watched(
         names=tuple(rig.cameras),
-        cameras=tuple(camera for camera, _ in rig.cameras.values()),
+        cameras=lenses,
         cam_from_rig=tuple(pose for _, pose in rig.cameras.values()),
-        covariance=rig.covariance,
+        covariance=covariance,
         sigma_px=rig.sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
@@ -280,20 +282,22 @@ def _cost(watched: Watched, task: Task) -> Goal:
 def fixed_text(source: Path, check: SentinelCheck) -> str:
     """Return the file `source` with the change that explains the pictures, and a finding that says so."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
-    fixed, n = check.fixed, check.watched.size
+    fixed, own = check.fixed, check.watched.of_models
     said = Finding(
         severity=Severity.LOOK,
         message=f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
         remedy="calibrate anew when there is time",
     )
+    # What the lenses may do beyond their models the file says by itself.
+    covariance = np.array(data["covariance"]) + (check.covariance - check.watched.covariance)[np.ix_(own, own)]
     if "cameras" in data:
         for entry, camera, pose in zip(data["cameras"], fixed.cameras, fixed.cam_from_rig, strict=True):
-            entry["camera"] = camera_to_json(camera)
+            entry["camera"] = camera_to_json(lens_of(camera))
             entry["cam_from_rig"] = pose.matrix()[:3].tolist()
     else:
-        data["camera"] = camera_to_json(fixed.cameras[0])
+        data["camera"] = camera_to_json(lens_of(fixed.cameras[0]))
         frame = np.array(data["frame_covariance"], dtype=np.float64)
-        data["frame_covariance"] = with_block(frame, check.covariance[:n, :n], 1.0).tolist()
-    data["covariance"] = check.covariance.tolist()
+        data["frame_covariance"] = with_block(frame, covariance, 1.0).tolist()
+    data["covariance"] = covariance.tolist()
     data["verdicts"] = [*findings_to_json([said]), *data.get("verdicts", [])]
     return json.dumps(data, indent=1, allow_nan=False) + "\n"

@@ -53,7 +53,9 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
             "the same model and degree to compare them number by number, or see `rigkit diff`"
         )
     with about(new, reference):
-        check = judge_evidence(watched_camera(before, reference.stem), lambda watched: _as_evidence(watched, now))
+        # Both follow what the lens does beyond its model.
+        watched = watched_camera(before, reference.stem, beyond_model=False)
+        check = judge_evidence(watched, lambda watched: _as_evidence(watched, now))
     entry = HistoryEntry.of_check(check, new, kind="calibration", temperature_c=temperature_c)
     add_entry(register, entry)
 

@@ -59,7 +59,7 @@ def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     amount = rng.standard_normal((cause.directions.shape[1],))
     if what == "distortion":
         amount[1:] = 0.0
-    step = cause.directions @ amount
+    step = (cause.directions @ amount)[: full.camera.parameters.size]
     weight = projection_goal(full.camera).weight
     return full.camera.with_parameters(full.camera.parameters + step * CHANGED_PX / np.sqrt(step @ weight @ step))
 

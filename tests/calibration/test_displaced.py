@@ -10,7 +10,7 @@ from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_view
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, Rival
 from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -26,6 +26,7 @@ from rigkit.workflows.next_views import next_views
 DEPARTS = np.zeros(DISPLACEMENTS)
 DEPARTS[5:7] = 0.3, -0.2
 """Decentring, px in the corners."""
+LIKELY = 0.3
 
 
 def displaced(name: str, *, amounts: tuple[float, float]) -> DisplacedCamera:
@@ -116,3 +117,26 @@ def test_what_is_known_with_departures_is_their_joint_covariance() -> None:
     # What the lens does beyond its model is left when its parameters are known.
     assert one.views[0].error > 1.2 * two.views[0].error
     assert one.error > two.error
+
+
+def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
+    """Displacements of a hundred pixels that the parameters and a turned camera take up again show a rival at first
+    order; the camera that is really moved so far shows something else, and stated normals were fifty times too wide."""
+    views, _, _ = random_views(lens("wide"), 14, np.random.default_rng(5), reach_deg=REACH_DEG["wide"], noise_px=0.02)
+    found, other = (calibrate(views, SIZE, model="scaramuzza", degree=k, board="flat", folds=0) for k in (6, 7))
+    calibration = replace(found, rivals=(Rival("scaramuzza 7", other.camera, LIKELY),))
+    alone, beside = (
+        float(np.linalg.norm(FarProjection.of(one).hides_departures @ lens_modes(one).modes))
+        for one in (found, calibration)
+    )
+    assert lens_modes(calibration).modes.size > lens_modes(found).modes.size > 0
+    assert beside == pytest.approx(alone, rel=0.1)
+    # One sigma of everything: what is left open at first order is what the moved cameras show.
+    known = uncertain_camera(calibration)
+    pixels = grid_pixels(SIZE, (12, 9)).reshape(-1, 2)
+    rays, valid = found.camera.unproject(pixels)
+    pixels, rays = pixels[valid], rays[valid]
+    shown = np.array([camera.project(rays)[0] - pixels for camera in known.moved()])
+    design = known.camera.project_with_jacobians(rays)[3]
+    linear = np.einsum("nip,pq,niq->n", design, known.covariance, design)
+    assert (shown**2).sum(axis=(0, 2)) == pytest.approx(linear, rel=0.2)

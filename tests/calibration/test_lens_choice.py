@@ -11,9 +11,9 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_differe
 from rigkit.calibration import calibrate as module
 from rigkit.calibration.between_models import rival_fits
 from rigkit.calibration.calibrate import calibrate, calibrate_together
-from rigkit.calibration.choice import HeldOut, Option
+from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
 from rigkit.calibration.fit import Fit, fit_model
-from rigkit.calibration.lens_choice import Lenses, choose_lenses, settled, twins
+from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved
@@ -108,6 +108,11 @@ def test_a_lens_whose_solver_was_stopped_is_none_where_another_one_is_found(
     creeping = replace(other, fit=replace(other.fit, convergence=stopped))
     assert settled([creeping, one]) == [one]
     assert settled([creeping]) == [creeping]
+    assert creeping.heldout is not None
+    better = replace(creeping, heldout=0.5 * creeping.heldout)
+    assert choose(fits["ucm"][0], [better, one]) is one
+    assert HeldOut.of([[better, one]]).names == [one.name]
+    assert described([better, one], one)[0].reason == "its solver was stopped before it converged"
 
 
 def test_another_lens_is_followed_where_the_model_can() -> None:

@@ -19,6 +19,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
 
 MODELS = {"reg": "brown", "wide": "kannala_brandt", "fish": "kannala_brandt"}
+FRAMES = 6
+"""That are repeated three times each."""
 
 
 def assert_true_mounts(rig: RigCalibration) -> None:
@@ -167,3 +169,26 @@ def test_a_rig_without_a_common_trigger_is_said_to_be_bad_and_its_sigmas_hold(rn
         assert abs(length - np.linalg.norm(mounts()[name][1].translation_mm)) < SIGMAS * sigma
         # What it says of itself is of the size of the disagreement, not of the corners' noise.
         assert sigma > 0.1
+
+
+def test_frames_that_repeat_others_are_held_out_with_them(rng: np.random.Generator) -> None:
+    """Else those that are left out would be known from their copies, and neither the headline nor the sigmas would be
+    true."""
+
+    def once_more(view: BoardView, k: int) -> BoardView:
+        noisy = view.pixels + 0.02 * rng.normal(size=view.pixels.shape)
+        return replace(view, image=f"{k} {view.image}", pixels=np.clip(noisy, 0.0, np.array(sizes()["reg"]) - 1.0))
+
+    def bent(pixels: np.ndarray) -> np.ndarray:
+        """What the corners of a frame have in common is what another frame does not tell."""
+        return np.clip(pixels + 0.5 * np.sin(pixels / 150.0 + rng.uniform(0.0, 6.0, 2)), 0.0, None)
+
+    views = {
+        name: [(f, replace(v, pixels=bent(v.pixels))) for f, v in own] for name, own in rig_views(rng, FRAMES).items()
+    }
+    copied = {name: [(f"{f} {k}", once_more(v, k)) for f, v in own for k in range(3)] for name, own in views.items()}
+    once, thrice = (calibrate_rig(own, sizes(), model=MODELS) for own in (views, copied))
+    assert once.heldout_rms_px is not None and thrice.heldout_rms_px is not None
+    assert thrice.heldout_rms_px > 0.9 * once.heldout_rms_px
+    assert thrice.freedom < FRAMES
+    assert np.median(thrice.sigmas / once.sigmas) > 0.75

@@ -55,7 +55,8 @@ def observed_over_predicted(
         # The lens is known to be of the model here: what it may do beyond that is no part of the scatter.
         there = result.camera.unproject(pixels)[0]
         beyond = FarProjection.of(result).beyond_model(there, projection_design(result.camera, there))
-        predicted.append(projection_uncertainty(result, pixels, range_mm=range_mm).covariance - beyond)
+        quoted = projection_uncertainty(result, pixels, range_mm=range_mm).covariance - beyond
+        predicted.append(quoted / result.widening**2)
     scatter = np.array(moved)
     second = np.einsum("rni,rnj->nij", scatter, scatter) / runs
     covariance = np.mean(predicted, axis=0)

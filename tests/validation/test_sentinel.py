@@ -10,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import BOARD, lens
+from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -22,6 +23,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
 from rigkit.io.history_file import HistoryEntry, add_entry, load_history
+from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
@@ -39,6 +41,7 @@ NOISE_PX = 0.03
 CHANGED_PX = 0.25
 """Change of the projection, rms after the best rotation: what three views show beyond doubt."""
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
+DEPARTURE_PX, LONGER = 0.1, 1.01
 POWER_DRAWS, POWER_NOISE_PX = 30, 0.04
 UNSURE = 16.0
 POWER_WITHIN = 0.27
@@ -105,7 +108,9 @@ def test_what_changed_is_found_named_and_undone(
     assert not check.holds and check.chance < 1e-3
     assert check.change is not None and check.change.cause.kind == kind
     goal = projection_goal(camera)
-    before, after = (c.parameters - camera.parameters for c in (check.watched.cameras[0], check.fixed.cameras[0]))
+    before, after = (
+        lens_of(c).parameters - camera.parameters for c in (check.watched.cameras[0], check.fixed.cameras[0])
+    )
     assert goal.weight @ after @ after < 0.25 * (goal.weight @ before @ before)
     assert check.rms_fixed_px < check.rms_px
     assert kind.split()[0] in check_page(check, "t", {})
@@ -173,6 +178,35 @@ def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration
     alone = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate(views)])
     beside = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate([*views, box])])
     assert beside.holds and beside.rms_px == pytest.approx(alone.rms_px, rel=0.05)
+
+
+def test_what_a_lens_does_beyond_its_model_is_no_change() -> None:
+    """A lens that no model is, calibrated where boards were left of the middle, is quiet right of it; a longer focal
+    length is found there, too."""
+    camera = lens("wide")
+    rng = np.random.default_rng([9, 5])
+    amounts = DEPARTURE_PX * rng.normal(size=DISPLACEMENTS)
+
+    def beyond(model: Camera) -> Camera:
+        return DisplacedCamera(model.size_px, np.append(model.parameters, amounts), model, np.eye(DISPLACEMENTS))
+
+    views, rotations, translations = random_views(
+        beyond(camera), 90, rng, reach_deg=0.95 * REACH_DEG["wide"], noise_px=NOISE_PX
+    )
+    width = camera.size_px[0]
+    left = [view for view in views if view.pixels[:, 0].max() < 0.6 * width][:14]
+    right = [k for k, view in enumerate(views) if view.pixels[:, 0].min() > 0.5 * width][:3]
+    known = calibrate(left, camera.size_px, model=camera.model, board="flat", folds=0)
+    same = [FreshView(f"{k}", 0, views[k]) for k in right]
+    longer = beyond(camera.with_parameters(camera.parameters * [LONGER, LONGER, 1, 1, 1, 1, 1, 1]))
+    poses = [Rigid3(rotations[k], translations[k]) for k in right]
+    other = [FreshView(f"{k}", 0, _view(longer, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
+    assert not check_views(watched_camera(known, "cam", beyond_model=False), same).holds
+    watched = watched_camera(known, "cam")
+    check, changed = check_views(watched, same), check_views(watched, other)
+    assert check.holds and not changed.holds
+    assert len(watched.of_models) == camera.parameters.size < watched.size
+    assert np.array_equal(np.delete(changed.step, watched.of_models), np.zeros(watched.size - len(watched.of_models)))
 
 
 def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:
@@ -360,7 +394,7 @@ def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, 
     save_calibration(path, calibration)
     path.write_text(fixed_text(path, check))
     fixed = load_calibration(path)
-    assert fixed.camera.parameters == pytest.approx(check.fixed.cameras[0].parameters)
+    assert fixed.camera.parameters == pytest.approx(lens_of(check.fixed.cameras[0]).parameters)
     assert "focus" in fixed.verdicts[0].message
     assert fixed.covariance[0, 0] > calibration.covariance[0, 0]
     assert calibration_text(fixed) != calibration_text(calibration)

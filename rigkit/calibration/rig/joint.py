@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.disagree import (
     DISAGREES,
@@ -77,10 +78,18 @@ class JointRig:
 
     @property
     def frames(self) -> IntArray:
-        """Number of the frame of every pose, (F,)."""
+        """Number of the frame of every pose, (F,); frames in which all cameras see what they saw in an earlier one
+        have its number."""
         frame = {entry.key: entry.frame for own in self.seen for entry in own.values()}
-        number = {name: i for i, name in enumerate(sorted(set(frame.values())))}
-        return np.array([number[frame[key]] for key in self.observations.keys], dtype=np.int64)
+        names = [frame[key] for key in self.observations.keys]
+        shown = [
+            (names[f], f"{c} {view.board.board_id}", view.pixels)
+            for c, (own, of_views) in enumerate(zip(self.observations.cameras, self.observations.frame, strict=True))
+            for view, f in zip(own.views, of_views.tolist(), strict=True)
+        ]
+        frames, boards, pixels = zip(*sorted(shown, key=lambda of: of[0]), strict=True)
+        number = dict(zip(frames, cluster_numbers(frames, boards, pixels).tolist(), strict=True))
+        return np.array([number[name] for name in names], dtype=np.int64)
 
     @property
     def shared_count(self) -> int:

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rigkit.calibration.clustered import widening
 from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
@@ -48,12 +49,13 @@ class RigCalibration:
     heldout_rms_px : the headline. The same over frames that took no part: k-fold over frames, all intrinsics, mounts
         and places of boards frozen, only one pose a target refitted, by all cameras at once. None with too few frames.
     covariance : of all intrinsics, camera by camera, then of the mounts of all cameras but the first: left perturbation
-        (rad) and translation (mm), six each.
+        (rad) and translation (mm), six each. Student's, with `freedom` degrees of freedom.
     sigma_px : standard deviation of a corner per coordinate, of median quality.
     overdispersion : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of
         standard deviations: 1 where the errors of a frame's corners are independent. All covariances rest on the
         frames, and count in by how much cameras and mounts would move if the boards' corners were free.
-    freedom : degrees of freedom of the covariances; infinite where there are too few frames to know.
+    freedom : degrees of freedom of the covariances; infinite where there are too few frames to know. Standard
+        deviations that are quoted count them in (`widening`).
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
     corner_count : corners used.
@@ -129,16 +131,38 @@ class RigCalibration:
         for k, sign in ((first, -1.0), (second, 1.0)):
             if k > 0:
                 row[self.mount(k)] += sign * (difference / length @ self._centre_jacobian(k))
-        variance = float(row @ self.covariance @ row)
+        variance = self.widening**2 * float(row @ self.covariance @ row)
         variance += sum(float(((row @ own.moves) ** 2).sum()) for own in self.departures)
         return length, float(np.sqrt(max(variance, 0.0) + (length * self.scale_sigma) ** 2))
 
     @cached_property
+    def widening(self) -> float:
+        """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
+        return widening(self.freedom, self.overdispersion, len(self.covariance))
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations of what `covariance` is of, with what the lenses may do beyond their models: two hold
+        95 % of errors, however few frames there are."""
+        variance = self.widening**2 * np.diag(self.covariance)
+        for own in self.departures:
+            variance += (own.moves**2).sum(axis=1)
+        return np.sqrt(variance)
+
+    @cached_property
+    def quoted(self) -> tuple[tuple[Camera, ...], FloatArray]:
+        """The same as `with_departures`, with the covariance widened as it is quoted."""
+        return self._with_departures(self.widening**2 * self.covariance)
+
+    @cached_property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray]:
         """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
-        these, camera by camera, and of the mounts."""
+        these, camera by camera, and of the mounts: Student's."""
+        return self._with_departures(self.covariance)
+
+    def _with_departures(self, covariance: FloatArray) -> tuple[tuple[Camera, ...], FloatArray]:
         cameras = tuple(c.camera for c in self.cameras)
-        return with_modes(cameras, self.covariance, self.departures) if self.departures else (cameras, self.covariance)
+        return with_modes(cameras, covariance, self.departures) if self.departures else (cameras, covariance)
 
     def mount(self, k: int) -> slice:
         """Return where the mount of camera `k` > 0 stands in the covariance."""

@@ -58,7 +58,7 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
     """Return the covariance (N, 2, 2), px^2, of where `points` (N, 3) mm in camera `a` appear in camera `b`, their
     pixels in `a` and their distances given, and whether they do (N,)."""
     i, j = rig.index(a), rig.index(b)
-    cameras, known = rig.with_departures
+    cameras, known = rig.quoted
     first, second = cameras[i], cameras[j]
     motion = rig.cam2_from_cam1(a, b)
     there = motion.apply(points)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
@@ -102,7 +103,9 @@ def turn_weight(camera: Camera) -> FloatArray:
 def _lens_directions(camera: Camera) -> FloatArray:
     """Return the changes of the parameters (P, 6) that scale the image by a hundredth, move it by a pixel right and
     down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius: as near as the model
-    comes."""
+    comes, whatever the lens may do beyond it."""
+    out = np.zeros((camera.parameters.size, 6))
+    camera = lens_of(camera)
     pixels = grid_pixels(camera.size_px, FIELD_GRID).reshape(-1, 2)
     rays, valid = camera.unproject(pixels)
     axis, seen = camera.project(np.array([0.0, 0.0, 1.0]))
@@ -124,7 +127,8 @@ def _lens_directions(camera: Camera) -> FloatArray:
     design = projection_design(camera, rays[valid])[:, :p].transpose(2, 0, 1).reshape(-1, p)
     scale = np.linalg.norm(design, axis=0)
     safe = np.where(scale > 0.0, scale, 1.0)
-    return np.asarray(np.linalg.lstsq(design / safe, wanted, rcond=FIT_RANK)[0] / safe[:, None])
+    out[:p] = np.linalg.lstsq(design / safe, wanted, rcond=FIT_RANK)[0] / safe[:, None]
+    return out
 
 
 def _mount_directions(watched: Watched, c: int) -> FloatArray:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
+from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.fit import inliers, sigma_of
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
@@ -41,7 +42,8 @@ class Watched:
 
     Attributes
     ----------
-    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame.
+    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame. What a lens may do beyond its
+        model is among the parameters of a camera (`rigkit.calibration.displaced`), after those of the model.
     covariance : (T, T) of theta.
     sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
     freedom : degrees of freedom of the covariance.
@@ -78,6 +80,15 @@ class Watched:
     def size(self) -> int:
         """How many numbers theta has."""
         return sum(camera.parameters.size for camera in self.cameras) + 6 * (len(self.cameras) - 1)
+
+    @property
+    def of_models(self) -> IntArray:
+        """Where in theta the parameters of the lenses' models and the mounts stand."""
+        amounts = np.zeros(self.size, dtype=bool)
+        for c, camera in enumerate(self.cameras):
+            own = self.lens(c)
+            amounts[own.start + lens_of(camera).parameters.size : own.stop] = True
+        return np.flatnonzero(~amounts)
 
     def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
         """Return camera `c` before boards in these poses, with the shapes that are known of them."""

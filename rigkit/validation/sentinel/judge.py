@@ -16,13 +16,14 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import fdtrc
 
+from rigkit.calibration.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import Goal
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
 from rigkit.validation.sentinel.power import Power, powers_of
-from rigkit.validation.sentinel.whitened import LARGE_FREEDOM, NULL_RANK, Whitened
+from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
 Look: TypeAlias = Callable[[Watched], FreshEvidence]
 """What fresh frames say, given cameras and mounts."""

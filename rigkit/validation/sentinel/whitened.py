@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.clustered import effective_freedom
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
@@ -22,8 +23,6 @@ about half of it, as a mean square of so many values does."""
 NULL_RANK = 1e-9
 MAX_CONDITION_NUMBER = 1e15
 """Of a covariance that rounding leaves something of."""
-LARGE_FREEDOM = 1e6
-"""As good as infinite, which the F distribution does not take."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -58,13 +57,8 @@ class Whitened:
                 "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
                 "covariance, or the lens); calibrate again"
             )
-        return cls(own, covariance, left.T, min(_freedom(watched, len(own)), _freedom(evidence, len(own))))
-
-
-def _freedom(known: Watched | FreshEvidence, directions: int) -> float:
-    """Return the degrees of freedom of the variance in one direction (Satterthwaite): what corners scatter is known
-    from all directions of all images; of what images disagree beyond it, only the mean over the directions is."""
-    beyond = max(0.0, 1.0 - 1.0 / known.overdispersion**2) if known.overdispersion > 0.0 else 0.0
-    unsure = beyond**2 * (1.0 / known.freedom + 1.0 / COMMON_FREEDOM)
-    unsure += (1.0 - beyond) ** 2 / (known.freedom * directions)
-    return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
+        freedom = min(
+            effective_freedom(known.freedom, known.overdispersion, len(own), COMMON_FREEDOM)
+            for known in (watched, evidence)
+        )
+        return cls(own, covariance, left.T, freedom)

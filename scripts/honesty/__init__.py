@@ -1,0 +1,1 @@
+"""The small sessions of `measure_honesty.py`."""

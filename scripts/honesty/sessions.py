@@ -1,0 +1,144 @@
+"""Small sessions: the stated sigmas of lens, mounts and baseline after three images, or after twenty.
+
+Corners are simulated: each with an error of its own, and with a smooth one that an image's corners have in common, as
+blur, light or a board that bends leave it. Boards are seen whole, or in part as ChArUco boards are: what lies on one
+side of a line across them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import best_rotation, grid_pixels
+from rigkit.core.arrays import FloatArray
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
+
+from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
+
+LENSES = ("reg", "wide", "fish")
+"""Of 60, 110 and 185 degrees."""
+IMAGES = (3, 4, 5, 7, 10, 20)
+COMMON_PX = (0.0, 0.02, 0.05)
+CORNERS_PX = 0.03
+SHOWN = (0.4, 1.0)
+"""Part of a board that is seen where boards are seen in part."""
+GRID = (24, 18)
+MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.005])), [-120.0, 3.0, 8.0])
+SECOND_CENTRE = np.array([800.0, 622.0])
+PLACED_TRIES = 20000
+
+Errors = dict[str, list[float]]
+"""Of every quantity, errors in stated sigmas."""
+
+
+def disturbed(view: BoardView, common_px: float, whole: bool, rng: np.random.Generator) -> BoardView:
+    """Return an exact view as detection would have it."""
+    x, y = (view.grid / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0).T
+    fields = np.stack([x * x, x * y, y * y, x * x * y, x * y * y], axis=-1)
+    error = common_px * fields @ rng.normal(size=(5, 2)) + CORNERS_PX * rng.normal(size=view.pixels.shape)
+    pixels = np.clip(view.pixels + error, -0.5, np.array(SIZE) - 0.5)
+    seen = np.ones(len(pixels), dtype=bool)
+    if not whole:
+        about = rng.uniform(0.0, 2.0 * np.pi)
+        across = np.cos(about) * x + np.sin(about) * y
+        seen = across <= np.quantile(across, rng.uniform(*SHOWN))
+    sigma = np.full(int(seen.sum()), CORNERS_PX)
+    return replace(view, pixels=pixels[seen], grid=view.grid[seen], sigma_px=sigma)
+
+
+def lens_in_sigmas(found: Calibration, truth: Camera) -> list[float]:
+    """Return the errors of the projection where boards were, after the rotation that no camera knows, (u and v)."""
+    pixels = grid_pixels(SIZE, GRID).reshape(-1, 2)
+    rays, known = truth.unproject(pixels)
+    told = covered_by_boards(found, pixels) & known & found.camera.unproject(pixels)[1]
+    pixels, rays = pixels[told], rays[told]
+    turn = best_rotation(rays, pixels, np.ones(len(pixels)), found.camera)
+    error = found.camera.project(rays @ turn.T)[0] - pixels
+    variance = np.diagonal(projection_uncertainty(found, pixels).covariance, axis1=1, axis2=2)
+    return (error / np.sqrt(variance)).ravel().tolist()
+
+
+def camera_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
+    truth = lens(name)
+    views, _, _ = random_views(truth, images, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
+    views = [disturbed(view, common_px, whole, rng) for view in views]
+    return {"lens": lens_in_sigmas(calibrate(views, SIZE, model=truth.model), truth)}
+
+
+def pair_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
+    cameras = {"left": (lens(name), Rigid3.identity()), "right": (lens(name, SECOND_CENTRE), MOUNT)}
+    views = _frames(cameras, images, common_px, whole, rng)
+    rig = calibrate_rig(views, dict.fromkeys(cameras, SIZE), model=lens(name).model)
+    length, sigma = rig.baseline_mm("left", "right")
+    mount = rig.cameras[1].cam_from_rig
+    off = [*log_so3(mount.rotation @ MOUNT.rotation.T), *(mount.translation_mm - MOUNT.translation_mm)]
+    lenses = [lens_in_sigmas(rig.cameras[k].calibration, camera) for k, (camera, _) in enumerate(cameras.values())]
+    return {
+        "lenses of a pair": [*lenses[0], *lenses[1]],
+        "mount": (np.array(off) / rig.sigmas[rig.mount(1)]).tolist(),
+        "baseline": [(length - float(np.linalg.norm(MOUNT.translation_mm))) / sigma],
+    }
+
+
+def _frames(
+    cameras: dict[str, tuple[Camera, Rigid3]], images: int, common_px: float, whole: bool, rng: np.random.Generator
+) -> dict[str, list[tuple[str, BoardView]]]:
+    """Return what each camera sees of a board that all see whole, frame by frame."""
+    out: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in cameras}
+    taken = 0
+    for _ in range(PLACED_TRIES):
+        pose = _placed(rng)
+        seen = {name: (c, *c.project((m @ pose).apply(BOARD.points()))) for name, (c, m) in cameras.items()}
+        if not all(valid.all() and c.on_image(pixels).all() for c, pixels, valid in seen.values()):
+            continue
+        for name, (_, pixels, _) in seen.items():
+            view = BoardView(f"{name}{taken}.png", BOARD, BOARD.grid(), pixels, np.full(len(pixels), CORNERS_PX))
+            out[name].append((f"{taken:03d}", disturbed(view, common_px, whole, rng)))
+        taken += 1
+        if taken == images:
+            return out
+    raise DegenerateError("honesty: no board was placed where both cameras see it")
+
+
+def _placed(rng: np.random.Generator) -> Rigid3:
+    axis, tilt = rng.uniform(-np.pi, np.pi), np.radians(rng.uniform(10.0, 45.0))
+    turned = exp_so3(tilt * np.array([np.cos(axis), np.sin(axis), 0.0]))
+    turned = turned @ exp_so3(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+    away = rng.uniform(330.0, 750.0)
+    middle = np.array([rng.uniform(-0.55, 0.55) * away, rng.uniform(-0.42, 0.42) * away, away])
+    return Rigid3(turned, middle - turned @ BOARD.points().mean(axis=0))
+
+
+def sessions(images: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
+    """Return the errors in stated sigmas of sessions of so many images, by quantity and by how boards are seen."""
+    errors: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for whole in (True, False):
+        for common_px in COMMON_PX:
+            for seed in range(seeds):
+                for k, name in enumerate(LENSES):
+                    for make in (camera_session, *((pair_session,) if name == "reg" else ())):
+                        rng = np.random.default_rng([seed, images, k, int(1e3 * common_px), whole])
+                        try:
+                            found = make(name, images, common_px, whole, rng)
+                        except RigkitError as error:
+                            print(f"{images} images, {name}: {error}", flush=True)
+                            continue
+                        for what, own in found.items():
+                            errors[what, "whole" if whole else "in part"] += own
+    return {key: np.abs(own) for key, own in errors.items()}
