@@ -31,7 +31,9 @@ def usable_path(path: str | Path) -> Path:
     if max(names, default=0) > MAX_NAME_BYTES or len(os.fsencode(text)) > MAX_PATH_BYTES:
         raise InputError(f"{shown}: a name is longer than {MAX_NAME_BYTES} bytes; give a shorter path")
     try:
-        Path(text).resolve()
+        Path(text).resolve(strict=True)  # from Python 3.13 on, only this meets links in a circle
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        pass  # for those who read or write it to say
     except (RuntimeError, OSError) as error:
         raise InputError(f"{shown} cannot be followed: its links lead to each other; correct the path") from error
     return Path(text)
