@@ -14,6 +14,7 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
+from rigkit.kernels.brown import brown_derivatives
 
 FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
@@ -201,43 +202,7 @@ class Brown(Camera):
         d_pixels_d_point: FloatArray,
         d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        inverse, plane, squares, t, valid = self._plane(x, y, z)
-        factor, denominator = self._radial(t)
-        m, tangential = self._distort(plane, squares, factor)
-        slope = self._slope(plane, squares, t, factor, denominator)
-        fx, fy, cx, cy = self.parameters[:4].tolist()
-        for row, focal in enumerate((fx, fy)):
-            scale = focal * inverse
-            by_x, by_y, by_z = d_pixels_d_point[row]
-            np.multiply(scale, slope[row], out=by_x)
-            np.multiply(scale, slope[row + 1], out=by_y)
-            np.multiply(by_x, plane[0], out=by_z)
-            by_z += by_y * plane[1]
-            np.negative(by_z, out=by_z)
-        if d_pixels_d_parameters is not None:
-            d_pixels_d_parameters[0, 0], d_pixels_d_parameters[1, 1] = m
-            d_pixels_d_parameters[0, 2] = d_pixels_d_parameters[1, 3] = 1.0
-            # Rows of p1, p2: (2 x y, t + 2 x^2) and (t + 2 y^2, 2 x y).
-            np.multiply(fx, tangential[1::-1], out=d_pixels_d_parameters[0, 6:8])
-            np.multiply(fy, tangential[:0:-1], out=d_pixels_d_parameters[1, 6:8])
-            for ray, out in ((fx * plane[0], d_pixels_d_parameters[0]), (fy * plane[1], d_pixels_d_parameters[1])):
-                _fill_radial(out, ray, t, factor, denominator)
-        return fx * m[0] + cx, fy * m[1] + cy, valid
-
-
-def _fill_radial(
-    out: FloatArray, ray: FloatArray, t: FloatArray, factor: FloatArray, denominator: FloatArray | float
-) -> None:
-    """Write d u / d k into `out` (P, N) where `ray` (N,) is fx x, and the same for v."""
-    if len(out) > 9:
-        ray = ray / denominator
-        np.multiply(ray, -factor * t, out=out[9])
-        np.multiply(out[9], t, out=out[10])
-        np.multiply(out[10], t, out=out[11])
-    np.multiply(ray, t, out=out[4])
-    np.multiply(out[4], t, out=out[5])
-    if len(out) > 8:
-        np.multiply(out[5], t, out=out[8])
+        return brown_derivatives((x, y, z), self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -266,6 +266,24 @@ EXPORT void cover_pixels(
     ARRAY(const int64_t, counts, views), int64_t views, double squares, ARRAY(const double, pixels, asked, 2), int64_t asked,
     ARRAY(uint8_t, covered, asked));
 
+/* brown.c */
+
+/* Points in the camera frame and a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero where it has less of them. Of
+ * derivatives by parameters so many `rows` are written, none or those that the camera has; zeros are not. */
+typedef struct {
+    ARRAY(const double, x, count);
+    ARRAY(const double, y, count);
+    ARRAY(const double, z, count);
+    ARRAY(const double, parameters, 12);
+    int64_t count, rows, rational;
+    double max_r;
+} brown_points_t;
+
+EXPORT void differentiate_brown(
+    const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, 3, points.count),
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
+    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+
 /* monotone.c */
 
 /* Functions linear x + factor P(x) - offset that increase from `low` to `high`, and a table of their roots, even in a target
