@@ -253,10 +253,13 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
     for start in range(0, n, block):
         rows = slice(start, min(start + block, n))
         similarity = first.descriptors[rows] @ second.descriptors.T
-        top = np.argpartition(-similarity, RIVALS, axis=1)[:, :RIVALS]
-        values = np.take_along_axis(similarity, top, axis=1)
-        order = np.argsort(-values, axis=1)
-        top, values = np.take_along_axis(top, order, axis=1), np.take_along_axis(values, order, axis=1)
+        each = np.arange(len(similarity))
+        top, values = np.empty((len(each), RIVALS), np.int64), np.empty((len(each), RIVALS), np.float32)
+        # The largest one after the other: a partition of the rows takes twenty times as long.
+        for k in range(RIVALS):
+            top[:, k] = similarity.argmax(axis=1)
+            values[:, k] = similarity[each, top[:, k]]
+            similarity[each, top[:, k]] = -np.inf
         distance = np.sqrt(np.maximum(2.0 - 2.0 * values, 0.0))
         apart = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
         other = np.where(apart, distance, np.inf).min(axis=1)

@@ -96,7 +96,7 @@ def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray,
     u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
     residuals = corners.residuals_px[used]
     # Corners that do not project tell nothing.
-    told = valid & np.isfinite(residuals).all(axis=1)
+    told = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
     rows = LensCorners.make(by_point, by_parameters, sigmas, lever, (u, v), residuals, told, count, camera.size_px)
     with_pose, out = rows.products()
     coupling = with_pose[:, POSE:]

@@ -72,7 +72,8 @@ def _partners(
     ends = (rotation.reshape(-1, 3) @ seen_from.reshape(-1, 3).T).reshape(len(centre), 3, len(starts), len(frame))
     ends = ends.transpose(2, 0, 3, 1) + centre[:, None]
     chosen = (number[starts, None] != number) & (boards[starts, None] == boards)
-    chosen &= ((ends - usual) ** 2).sum(axis=-1).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
+    off = ends - usual
+    chosen &= np.einsum("svkc,svkc->svk", off, off).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
     i, j = np.nonzero(chosen)
     i, ends = starts[i], ends[chosen]
     flat = ends.reshape(-1, 12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -237,7 +238,14 @@ def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.G
     assert all(words in str(result.verdicts) for result in named), [str(result.verdicts[0]) for result in named]
 
 
-def test_boards_in_hand_that_move_while_rows_are_read(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param({"model": "brown", "board": "flat", "folds": 0}, id="brown"),
+        pytest.param({}, id="default", marks=pytest.mark.thorough),
+    ],
+)
+def test_boards_in_hand_that_move_while_rows_are_read(how: dict[str, Any], rng: np.random.Generator) -> None:
     """Moved by 3 to 24 px, poses follow so much of it that columns fit nearly as well as rows: it is named all the same
     in half of the sessions, and never something else."""
     camera, named = Pinhole(SIZE, np.array([1364.0, 1364.0, 815.0, 617.0])), 0
@@ -251,7 +259,7 @@ def test_boards_in_hand_that_move_while_rows_are_read(rng: np.random.Generator) 
                 pixels, _ = camera.project(points + (pixels[:, 1:] / SIZE[1] - 0.5) * move)
             noisy = np.clip(pixels + 0.02 * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
             views.append(replace(view, pixels=noisy))
-        found = changing_in(calibrate(views, SIZE))
+        found = changing_in(calibrate(views, SIZE, **how))
         assert all("(rolling shutter)" in finding.message for finding in found)
         named += len(found)
     assert named >= 4

@@ -18,7 +18,7 @@ from rigkit.io.calibration_file import camera_to_json
 from rigkit.io.ply import read_ply
 from rigkit.workflows.reconstruct_rig import near_pairs
 
-CAMERA = Pinhole((320, 240), np.array([280.0, 280.0, 159.5, 119.5]))
+CAMERA = Pinhole((240, 180), np.array([210.0, 210.0, 119.5, 89.5]))
 TURNS = ((0.0, 0.0, 0.0), (0.02, -0.12, 0.05), (0.03, -0.2, 0.02))
 PLACES_MM = ((0.0, 0.0, 0.0), (150.0, -50.0, 30.0), (260.0, 20.0, 40.0))
 POSES = tuple(

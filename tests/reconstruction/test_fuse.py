@@ -18,7 +18,7 @@ from rigkit.reconstruction.growing.fuse import PosedCloud, fuse_clouds
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 
-CAMERA = Pinhole((400, 300), np.array([350.0, 350.0, 199.5, 149.5]))
+CAMERA = Pinhole((300, 225), np.array([262.5, 262.5, 149.5, 112.0]))
 TURNS = ((0.0, 0.0, 0.0), (0.05, -0.25, 0.1), (0.02, -0.12, 0.05))
 PLACES_MM = ((0.0, 0.0, 0.0), (320.0, -60.0, 60.0), (150.0, -90.0, 30.0))
 CAM_FROM_WORLD = tuple(
