@@ -29,7 +29,8 @@ class HistoryEntry:
     ----------
     date : when, UTC, ISO 8601.
     kind : "check", or "calibration" for one made anew.
-    source : the file that was checked.
+    source : the file that was checked, as seen from the register's folder.
+    reference : of a calibration made anew the one that it is a change of; "" else.
     holds, chance, verdict : whether it still held, the p-value, and what was said.
     frames : how many there were.
     rms_px : of the fresh corners.
@@ -45,8 +46,20 @@ class HistoryEntry:
     verdict: str
     frames: int
     rms_px: float
+    reference: str = ""
     temperature_c: float | None = None
     amounts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def moment(self) -> datetime:
+        """The date; UTC where it names no zone."""
+        moment = datetime.fromisoformat(self.date)
+        return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
+
+    @property
+    def watched(self) -> str:
+        """The file of which the amounts are changes."""
+        return self.reference or self.source
 
     @classmethod
     def of_check(
@@ -54,11 +67,11 @@ class HistoryEntry:
         check: SentinelCheck,
         source: Path,
         *,
-        kind: str = "check",
+        reference: Path | None = None,
         temperature_c: float | None = None,
         now: datetime | None = None,
     ) -> HistoryEntry:
-        """Return the entry of a check made `now`."""
+        """Return the entry of a check made `now`; with `reference`, of the calibration `source` made anew."""
         amounts: dict[str, tuple[float, float]] = {}
         for change in check.tried:
             cause = change.cause
@@ -71,8 +84,9 @@ class HistoryEntry:
         moment = now or datetime.now(UTC)
         return cls(
             date=moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-            kind=kind,
-            source=source.name,
+            kind="check" if reference is None else "calibration",
+            source=source.as_posix(),
+            reference="" if reference is None else reference.as_posix(),
             holds=check.holds,
             chance=check.chance,
             verdict="holds" if check.holds else str(check.change or "nothing that moved explains it"),
@@ -81,6 +95,15 @@ class HistoryEntry:
             temperature_c=temperature_c,
             amounts=amounts,
         )
+
+
+def as_seen_from(register: Path, source: Path) -> Path:
+    """Return the path of `source` from the folder of a register: both may be moved together."""
+    try:
+        return Path(os.path.relpath(source.resolve(), register.resolve().parent))
+    except ValueError:
+        # On another drive.
+        return source.resolve()
 
 
 def ensure_register(path: Path, inputs: Iterable[Path] = ()) -> None:
@@ -122,7 +145,8 @@ def add_entry(path: Path, entry: HistoryEntry) -> None:
 
 
 def load_history(path: str | Path) -> tuple[HistoryEntry, ...]:
-    """Return the entries of a register by date; raises InputError, with the line, for another or a damaged file."""
+    """Return the entries of a register in its order; raises InputError, with the line, for another or a damaged
+    file."""
     entries = []
     for number, line in enumerate(read_text(path, "register").splitlines(), start=1):
         if line.strip():
@@ -136,7 +160,7 @@ def load_history(path: str | Path) -> tuple[HistoryEntry, ...]:
                 ) from error
     if not entries:
         raise InputError(f"register '{path}': nothing in it; `rigkit check --register` adds to it")
-    return tuple(sorted(entries, key=lambda entry: entry.date))
+    return tuple(entries)
 
 
 def _entry(data: Any) -> HistoryEntry:
@@ -146,8 +170,9 @@ def _entry(data: Any) -> HistoryEntry:
     if not (0.0 <= chance <= 1.0 and isinstance(holds, bool)):
         raise ValueError("chance is from 0 to 1, holds true or false")
     texts = {name: data.pop(name) for name in ("date", "kind", "source", "verdict")}
+    texts["reference"] = data.pop("reference", "")
     if not all(isinstance(text, str) for text in texts.values()):
-        raise ValueError("date, kind, source and verdict are words")
+        raise ValueError("date, kind, source, reference and verdict are words")
     if not datetime.fromisoformat(texts["date"]).year > 1:
         raise ValueError("its date is of the year 1")
     entry = HistoryEntry(

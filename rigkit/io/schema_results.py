@@ -174,7 +174,7 @@ HISTORY_FILE = file(
     "rigkit.history/1",
     "One line of a register of checks (JSON lines)",
     {
-        **optional(of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c"),
+        **optional(of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c", "reference"),
         "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
     },
 )

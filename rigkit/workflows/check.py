@@ -23,7 +23,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import board_pose
 from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
 from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register
+from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
 from rigkit.io.images import read_image_of
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
@@ -124,7 +124,8 @@ def check_pictures(
     if files:
         write_together(files, force=options.force)
     if options.history is not None:
-        entry = HistoryEntry.of_check(check, source, temperature_c=options.temperature_c)
+        place = as_seen_from(options.history, source)
+        entry = HistoryEntry.of_check(check, place, temperature_c=options.temperature_c)
         add_entry(options.history, entry)
     written = (*files, *([options.history] if options.history is not None else []))
     return CheckedPictures(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import logging
+from datetime import timedelta
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from rigkit.cameras.convert import refit_camera
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.history_file import HistoryEntry, add_entry, ensure_register, load_history
+from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
 from rigkit.io.reading import about
 from rigkit.report.check_page import history_page
 from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
@@ -21,18 +24,30 @@ from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.provenance import digest_line, software_facts
 
 RECALIBRATION_GRID = (40, 30)
+CLOCKS_APART = timedelta(days=1)
+"""Machines of one lab may differ by less: their zones, or how well their clocks are set."""
+_log = logging.getLogger(__name__)
 
 
 def show_history(
     register: Path, *, report: Path | None = None, force: bool = False
 ) -> tuple[tuple[HistoryEntry, ...], tuple[Path, ...]]:
-    """Return the entries of a register and the files written: a page, where one is asked for.
+    """Return the entries of a register by date and the files written: a page, where one is asked for.
 
     Raises InputError for another file, or a page that cannot be written.
     """
     if report is not None:
         ensure_writable([report], force=force, inputs=[register])
-    entries = load_history(register)
+    kept = load_history(register)
+    earlier = sum(one.moment - two.moment > CLOCKS_APART for one, two in pairwise(kept))
+    if earlier:
+        _log.warning(
+            "register '%s': %s follow one of a later day: a clock was wrong, or registers were joined; they are shown "
+            "by their dates",
+            register,
+            "1 entry" if earlier == 1 else f"{earlier} entries",
+        )
+    entries = tuple(sorted(kept, key=lambda entry: entry.moment))
     if report is None:
         return entries, ()
     facts = software_facts() | {register.name: digest_line(register)}
@@ -56,7 +71,8 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
         # Both follow what the lens does beyond its model.
         watched = watched_camera(before, reference.stem, beyond_model=False)
         check = judge_evidence(watched, lambda watched: _as_evidence(watched, now))
-    entry = HistoryEntry.of_check(check, new, kind="calibration", temperature_c=temperature_c)
+    places = as_seen_from(register, new), as_seen_from(register, reference)
+    entry = HistoryEntry.of_check(check, places[0], reference=places[1], temperature_c=temperature_c)
     add_entry(register, entry)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 
@@ -22,20 +24,20 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
-from rigkit.io.history_file import HistoryEntry, add_entry, load_history
+from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.report.check_page import check_page, check_words, history_page
+from rigkit.report.check_page import check_page, check_words, drift_svg, history_facts, history_page
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views, judge_evidence
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
-from rigkit.workflows.history import add_calibration
+from rigkit.workflows.history import add_calibration, show_history
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
@@ -416,6 +418,57 @@ def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Pat
     register.write_text(register.read_text() + json.dumps({"schema": "other"}) + "\n")
     with pytest.raises(InputError, match=r"line 4.*another schema"):
         load_history(register)
+
+
+def test_a_register_of_months(calibration: Calibration, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Two cameras, more and fewer pictures, clocks that went back, dates of other zones and files that moved."""
+    check = _checked(calibration, lens("reg"), np.random.default_rng(3))
+    register = tmp_path / "lab" / "register.jsonl"
+    for camera, day in (("left", 3), ("right", 4), ("left", 1), ("left", 5)):
+        source = as_seen_from(register, tmp_path / "lab" / camera / "calibration.json")
+        add_entry(register, HistoryEntry.of_check(check, source, now=datetime(2026, 3, day, tzinfo=UTC)))
+    save_calibration(tmp_path / "c.json", calibration)
+    add_calibration(register, tmp_path / "c.json", tmp_path / "c.json", temperature_c=19.0)
+    # Two hours east, this is before the entry of 3 March; a former version said nothing of the reference.
+    older = json.loads(register.read_text().splitlines()[0]) | {"date": "2026-03-03T01:00:00+02:00"}
+    del older["reference"]
+    register.write_text(register.read_text() + json.dumps(older) + "\n")
+    entries, _ = show_history(register, report=tmp_path / "page.html")
+    assert [entry.date[5:10] for entry in entries[:5]] == ["03-01", "03-03", "03-03", "03-04", "03-05"]
+    assert entries[1].date.endswith("+02:00") and entries[-1].reference == "../c.json" == entries[-1].source
+    assert {entry.source for entry in entries[:5]} == {"left/calibration.json", "right/calibration.json"}
+    assert "2 entries follow one of a later day" in caplog.text
+    page = (tmp_path / "page.html").read_text()
+    assert history_facts(entries).passed and "of each file holds" in history_facts(entries).headline
+    alarm = replace(entries[3], holds=False)
+    assert "of right/calibration.json is an alarm" in history_facts([*entries[:3], alarm, *entries[4:]]).headline
+    # The amounts of one camera are no drift of another.
+    assert page.count("<svg") == 18 and page.count("left/calibration.json: focus, %") == 1
+
+
+def test_every_entry_has_its_own_control_limits(calibration: Calibration) -> None:
+    check = _checked(calibration, lens("reg"), np.random.default_rng(3))
+    one = HistoryEntry.of_check(check, Path("c.json"), now=datetime(2026, 3, 1, tzinfo=UTC))
+    value, sigma = one.amounts["focus, %"]
+    unsure = replace(one, date="2026-03-09T00:00:00Z", amounts={"focus, %": (value, 4.0 * sigma)})
+    drawn = re.findall(r'<path d="M([^"]*)"[^>]*dasharray="5 4"', drift_svg([one, unsure], "focus, %"))
+    heights = [float(point.split()[1]) for point in drawn[0].split("L")]
+    assert len(drawn) == 2 and heights[0] == heights[1] > heights[2] == heights[3]
+    middle = 0.5 * (heights[0] + float(drawn[1].split("L")[0].split()[1]))
+    assert middle - heights[2] == pytest.approx(4.0 * (middle - heights[0]), abs=0.2)
+
+
+def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration: Calibration) -> None:
+    def several(p: np.ndarray) -> np.ndarray:
+        return p * [1.004, 1.004, 1, 1, 1.1, 1, 1, 1, 1] + [0, 0, 9.0, -7.0, 0, 0, 0, 0, 0]
+
+    usual = lens("reg").parameters
+    much = lens("reg").with_parameters(usual + 6.0 * (_changed(several).parameters - usual))
+    check = _checked(calibration, much, np.random.default_rng(1))
+    assert check.change is not None and check.change.cause.kind == "lens" and not check.holds
+    words = check_words(check)
+    assert re.search(r"changed in several ways: by [\d.]+ px rms in all$", words.headline)
+    assert re.search(r"\d+% of what is seen is explained by this alone: the ", words.sentences[1])
 
 
 def test_the_same_calibration_again_is_no_change(calibration: Calibration, tmp_path: Path) -> None:

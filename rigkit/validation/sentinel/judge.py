@@ -72,6 +72,9 @@ class Change:
         return np.sqrt(np.diag(self.covariance))
 
     def __str__(self) -> str:
+        if self.cause.kind == "lens":
+            # Its amounts make up for each other: each by itself would say far more than happened.
+            return f"{self.cause.words}: by {self.size_px:.2g} px rms in all"
         values = ", ".join(
             f"{a:+.3g} +- {s:.2g} {unit}"
             for a, s, unit in zip(self.amounts, self.sigmas, self.cause.units, strict=True)
