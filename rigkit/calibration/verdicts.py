@@ -30,6 +30,9 @@ CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
 MAX_RATIO_OF_MEDIANS = 2.5
 """A view whose median residual is this many times the usual one, there in the image."""
+UNLIKE = 3.5
+"""One with more may be of another camera, or of another setting of its lens: in 15 real captures no image of the camera
+itself has more than 2.9, one of another camera put among them has 1.5 to 7.6."""
 RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 MAX_OUTLIER_SHARE = 0.2
@@ -81,11 +84,14 @@ def judge(
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed = two_cameras(calibration, clusters)
+    # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
+    unlike, unclear = ([], []) if mixed else _views(calibration)
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
         *([] if mixed else changing(calibration, correlation)),
+        *unlike,
         *judge_capture(calibration, extent, far, clusters),
         *(finding for finding in also if finding.severity is Severity.BAD and not mixed),
     ]
@@ -95,9 +101,8 @@ def judge(
         *_coverage(calibration),
     ]
     if not mixed:
-        # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
         found += [
-            *_views(calibration),
+            *unclear,
             *_pattern(calibration, correlation, in_force),
             *_overfit(calibration),
             *_boards(calibration),
@@ -209,9 +214,10 @@ def _cell(c: Calibration, pixel: FloatArray) -> str:
     return f"{NAMES_V[j]} {NAMES_U[i]}"
 
 
-def _views(c: Calibration) -> list[Finding]:
+def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
+    """Name the views that are unlike the others: those that may be of another camera, and the rest."""
     if len(c.views) < 3:
-        return []
+        return [], []
     lengths = c.corners.count
     out = np.bincount(c.corners.view[~c.corners.kept], minlength=len(lengths))
     # Of all corners: a view that is bad throughout has its worst corners among the outliers.
@@ -225,7 +231,7 @@ def _views(c: Calibration) -> list[Finding]:
         for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
             there[ring] = max(float(np.median(residual[ring])), usual)
         times = _medians(residual / there, lengths)
-    found = []
+    unlike, found = list[Finding](), list[Finding]()
     for i in np.flatnonzero((times > MAX_RATIO_OF_MEDIANS) | (out > MAX_OUTLIER_SHARE * lengths)).tolist():
         view = c.views[i]
         far = int((~view.kept & ~(np.linalg.norm(view.residuals_px, axis=1) <= SMALL_PX)).sum())
@@ -235,9 +241,12 @@ def _views(c: Calibration) -> list[Finding]:
             what = f"has {far} outliers among its {lengths[i]} corners"
         else:
             continue
-        remedy = "look whether the board or the camera moved, and retake it"
-        found.append(_look(f"image '{view.image}' {what}", remedy, view.image))
-    return found
+        other = times[i] > UNLIKE and middle[i] > SMALL_PX
+        remedy = "look whether the board or the camera moved" + (", or another camera took it" if other else "")
+        (unlike if other else found).append(
+            _look(f"image '{view.image}' {what}", f"{remedy}, and retake it", view.image)
+        )
+    return unlike, found
 
 
 def _medians(values: FloatArray, count: IntArray) -> FloatArray:

@@ -74,7 +74,8 @@ def session_views(
     for name, item in found.items():
         if item.size_px != size_px:
             width, height = item.size_px
-            dropped.append((name, f"{width}x{height} px, most images have {size_px[0]}x{size_px[1]}"))
+            turned = ", turned by some program" if item.size_px == size_px[::-1] else ""
+            dropped.append((name, f"{width}x{height} px{turned}, most images have {size_px[0]}x{size_px[1]}"))
             continue
         own, reason = views_of_image(name, boards[name], session.boards)
         views += own

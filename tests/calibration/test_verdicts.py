@@ -165,6 +165,19 @@ def test_repeated_images_are_held_out_together(rng: np.random.Generator) -> None
     assert once is not None and thrice is not None and thrice > 0.9 * once
 
 
+def test_an_image_of_another_camera_is_named_first(rng: np.random.Generator) -> None:
+    """Of a lens that bends the board a little otherwise."""
+    views, *_ = random_views(lens("reg"), 12, rng, reach_deg=33.0, noise_px=0.05)
+    bent = views[5].pixels + 0.25 * np.sin(views[5].pixels / 60.0)
+    foreign = replace(views[5], image="of another.png", pixels=bent)
+    own, mixed = (
+        calibrate(some, SIZE, model="brown", board="flat") for some in (views, [*views[:5], foreign, *views[6:]])
+    )
+    assert not any(finding.image for finding in own.verdicts)
+    assert mixed.verdicts[0].image == "of another.png" and "of another.png" in mixed.verdicts[0].message
+    assert "another camera took it" in (mixed.verdicts[0].remedy or "")
+
+
 def test_two_images_are_not_good(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 3, rng, reach_deg=33.0)
     result = calibrate(views, SIZE, model="brown", board="flat")
