@@ -8,13 +8,16 @@ from rigkit.kernels.coverage import covered_pixels
 
 
 def test_covered_pixels_are_as_defined(rng: np.random.Generator) -> None:
-    """Boards of several sizes, of a single row too, each bent a little by its perspective."""
+    """Boards of several sizes, each bent a little by its perspective: whole, a single row, cut off along a diagonal,
+    that diagonal alone, and a single corner, which covers no more than itself."""
     views = []
-    for columns, rows in ((9, 6), (4, 3), (7, 1), (1, 5)):
+    for columns, rows, part in ((9, 6, 0), (4, 3, 0), (7, 1, 0), (1, 5, 0), (8, 7, 1), (6, 6, 2), (1, 1, 0)):
         grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1).reshape(-1, 2)
+        along = grid[:, 0] - grid[:, 1]
+        grid = grid[(along >= 0) if part == 1 else (along == 0) if part == 2 else slice(None)]
         affine, place = rng.normal(0.0, 12.0, (2, 2)), rng.uniform(100.0, 500.0, 2)
         views.append((grid, place + grid @ affine.T + rng.normal(0.0, 0.5, grid.shape)))
-    pixels = rng.uniform(0.0, 600.0, (4000, 2))
+    pixels = np.concatenate([rng.uniform(0.0, 600.0, (4000, 2)), views[-1][1]])
     expected = np.zeros(len(pixels), dtype=bool)
     for grid, corners in views:
         off = grid - grid.mean(axis=0)
