@@ -40,6 +40,7 @@ from scipy.optimize import minimize
 from rigkit.benchmark.blanks import BLANKS, blank
 from rigkit.benchmark.scenes import CONDITIONS, LENSES, one_board
 from rigkit.core.arrays import FloatArray
+from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.evidence import (
     MIN_BLUR,
     MIN_EXPECTED_CORNERS,
@@ -93,7 +94,8 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """A lattice that reached the judgement: which kind of image it is from, and whether that shows boards."""
+    """A lattice that reached the judgement: which kind of image it is from, whether that shows boards, and whether the
+    lattice is seen to end where it does."""
 
     kind: str
     image: str
@@ -102,6 +104,7 @@ class Candidate:
     size: tuple[int, int]
     cell_px: float
     evidence: Evidence
+    ends: bool
 
     def measures(self) -> list[float]:
         """Return the logarithms that are weighed."""
@@ -204,10 +207,19 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
     size_px = (grey.shape[1], grey.shape[0])
     fitted = refine(grey, candidates(grey, MIN_CORNERS, promising))
     kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
+    mine = [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
     return [
-        Candidate(kind, image, board, item.lattice.count, item.lattice.size, _cell_px(item.lattice), Evidence.of(item))
-        for item in kept
-        if not board or any(_of_board(item.lattice, corners) for corners in boards)
+        Candidate(
+            kind=kind,
+            image=image,
+            board=board,
+            corners=item.lattice.count,
+            size=item.lattice.size,
+            cell_px=_cell_px(item.lattice),
+            evidence=Evidence.of(item),
+            ends=ends_quietly(grey, item.lattice),
+        )
+        for item in mine
     ]
 
 
@@ -266,6 +278,10 @@ def print_sizes(found: list[Candidate]) -> None:
         short, long = min(size), max(size)
         print(f"  {long} x {short}: {count}, {np.log(len(large) / count):.1f}")
     print(f"  none of another size: {np.log(max(len(large), 1)):.1f} and more; in use: {OF_EXPECTED_SIZE}")
+    near = [c for c in found if c.corners >= MIN_EXPECTED_CORNERS and -OF_EXPECTED_SIZE < c.evidence.score <= 0.0]
+    for board, what in ((True, "boards"), (False, "other patterns")):
+        ends = [c.ends for c in near if c.board is board]
+        print(f"  {sum(ends)} of the {len(ends)} {what} whose size would decide are seen to end")
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.checks.validate import (
@@ -87,7 +88,7 @@ def fitted(
     out = []
     least_score = -MORE_EVIDENCE - (OF_EXPECTED_SIZE if sizes else 0.0)
     refined = refine(grey, boards, lambda item: Evidence.of(item).score > least_score)
-    for item in _confirmed(boards, refined, min_corners, sizes):
+    for item in _confirmed(grey, boards, refined, min_corners, sizes):
         own = without_outliers(item, size_px)
         parts = (
             split_at_discontinuities(own, several=too_large(own.lattice, sizes))
@@ -104,13 +105,17 @@ def fitted(
 
 
 def _confirmed(
-    boards: Sequence[Lattice], refined: Sequence[RefinedLattice], min_corners: int, sizes: Sequence[tuple[int, int]]
+    grey: GreyImage,
+    boards: Sequence[Lattice],
+    refined: Sequence[RefinedLattice],
+    min_corners: int,
+    sizes: Sequence[tuple[int, int]],
 ) -> list[RefinedLattice]:
     """Return those of `refined` (what the fit left of `boards`) that are boards.
 
     Where fewer are seen than may be there, lattices with the rows and columns of those that may be there are believed
-    more; their corners may be uncertain, and their sigmas say so. Beside boards that are sure such a lattice would be
-    something else: a board in the background, or a mirror image.
+    more if they are seen to end there; their corners may be uncertain, and their sigmas say so. Beside boards that are
+    sure such a lattice would be something else: a board in the background, or a mirror image.
     """
     every = list(zip(boards, refined, strict=True))
     sure = [after for before, after in every if trustworthy(after, before.count, min_corners)]
@@ -124,6 +129,7 @@ def _confirmed(
         for before, after in rest
         if after.lattice.count >= MIN_EXPECTED_CORNERS and frozenset(after.lattice.size) in asked
         if trustworthy(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
+        if ends_quietly(grey, after.lattice)
     ]
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
 

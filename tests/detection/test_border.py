@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera
+from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.checks.border import Side, sides
+from rigkit.detection.checks.border import Side, ends_quietly, sides
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image
@@ -144,3 +144,14 @@ def test_a_board_cut_on_two_sides_stays_a_part_where_two_places_are_left(rng: np
     (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [square])
     assert (found.columns, found.rows) == (8, 8)
     assert rightly_placed(found, scene.truth()[0])
+
+
+@pytest.mark.parametrize("blur_px", [0.7, 5.0])
+def test_a_board_ends_quietly_and_a_part_of_it_does_not(blur_px: float) -> None:
+    scene = one_board(np.random.default_rng(1))
+    truth = scene.truth()[0]
+    image = grey_image(scene.render(rng=np.random.default_rng(1), blur_px=blur_px, noise_levels=2.0))
+    (found,) = find_lattices(image, 12, [(truth.columns, truth.rows)])
+    assert ends_quietly(image, found.lattice)
+    for part in ((slice(None), slice(1, None)), (slice(0, -1), slice(None))):
+        assert not ends_quietly(image, found.lattice.cut(*part))

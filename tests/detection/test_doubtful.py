@@ -67,6 +67,12 @@ def test_a_blurred_board_of_a_declared_size_is_kept_with_sigmas_that_hold(seed: 
     assert not detect_boards(image, [other])
 
 
+def test_a_patch_of_cloth_of_a_declared_size_is_no_board() -> None:
+    """47 of 8 x 6 corners; but it is not seen to end there as boards do."""
+    cloth = cv2.GaussianBlur(blank("gingham", np.random.default_rng(47)), (0, 0), 6.0)
+    assert not detect_boards(cloth, [Board("b", 8, 6, 30.0, 30.0)])
+
+
 @pytest.mark.parametrize("name", ["left03.jpg", "left04.jpg", "left05.jpg"])
 def test_a_board_in_the_background_takes_no_name_from_one_that_is_sure(name: str) -> None:
     """A second board of that size, of squares of 5 px, stands beside the window."""
