@@ -148,10 +148,16 @@ def fit_corners(
 def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
     """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
     if isinstance(board.pattern, Charuco):
-        white = 0.5 * (1.0 - board.pattern.marker_mm / np.array(board.squares_mm))
-        gap = (white * np.linalg.norm(sides, axis=2)).min(axis=1)
+        gap = gap_to_markers(board, sides)
         blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
     return np.clip(blur, *BLUR_RANGE)
+
+
+def gap_to_markers(board: Board, sides: FloatArray) -> FloatArray:
+    """Return how far it is (N,), px, from the lines of a ChArUco `board` to its markers; `sides` (N, 2, 2) are px."""
+    assert isinstance(board.pattern, Charuco)
+    white = 0.5 * (1.0 - board.pattern.marker_mm / np.array(board.squares_mm))
+    return np.asarray((white * np.linalg.norm(sides, axis=2)).min(axis=1))
 
 
 def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:

@@ -17,14 +17,19 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
-from rigkit.detection.guided.guided import completed, fit_corners
+from rigkit.detection.guided.guided import MARKER_BLURS, completed, fit_corners, gap_to_markers
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
+from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
+from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import homographies, transferred
+from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
 
 SAME_CELLS = 0.2
@@ -32,6 +37,9 @@ SAME_CELLS = 0.2
 
 MIN_VOTES, AGREEING_VOTES = 3, 0.7
 """Corners, and which part of them, that must give a lattice the same place in the board."""
+
+WIPES = 2
+"""Times that markers are wiped out and corners fitted anew: the second time from corners without their ink."""
 
 SEED_CONTRAST = 100.0
 """Contrast that a corner starts with, grey levels: the fit measures it."""
@@ -195,11 +203,33 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
 
 def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
     """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
-    lattice = refined.lattice
-    known = lattice.known
+    known = refined.lattice.known
     if not known.any():
         return refined
-    shape, blur = fit_cells(lattice.pixels, known), float(np.median(refined.blur_px[known]))
+    shape, blur = fit_cells(refined.lattice.pixels, known), float(np.median(refined.blur_px[known]))
+    narrow = _fitted(image, refined, board, blur)
+    if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
+        return narrow
+    # Their ink reaches into any window.
+    empty = replace(board, pattern=Chessboard())
+    every = (slice(0, known.shape[0]), slice(0, known.shape[1]))
+    for _ in range(WIPES):
+        wiped = without_markers(image, narrow, board, blur)
+        if wiped is None:
+            return narrow
+        narrow = placed_together(wiped, _fitted(wiped, narrow, empty, blur))
+        blur = float(np.median(narrow.blur_px[narrow.lattice.known]))
+    # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
+    alone = narrow.sigma_px / narrow.scatter
+    scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
+    return replace(narrow, sigma_px=scatter * alone, scatter=scatter)
+
+
+def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> RefinedLattice:
+    """Return the corners of `refined` fitted anew on `image`, from edges of s `blur`, without those that fail."""
+    lattice = refined.lattice
+    known = lattice.known
+    shape = fit_cells(lattice.pixels, known)
     fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur)
 
     def spread(values: FloatArray) -> FloatArray:
@@ -207,16 +237,19 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> 
         out[known] = values
         return out
 
-    narrow = replace(
+    fitted = replace(
         refined,
         lattice=Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising),
         sigma_px=spread(fit.sigma_px),
         blur_px=spread(fit.blur),
         residual=spread(fit.residual),
+        noise=spread(fit.noise),
+        scatter=1.0,
+        correlated=1.0,
     )
     drop = known.copy()
     drop[known] = ~fit.valid | (fit.contrast <= 0.0)
-    return narrow.without(drop)
+    return fitted.without(drop)
 
 
 def _detection(refined: RefinedLattice, board: Board) -> BoardDetection:

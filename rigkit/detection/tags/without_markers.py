@@ -1,0 +1,138 @@
+"""An image of a board without the markers in its squares: what their ink takes from it is given back.
+
+Blur brings the ink of markers into the windows of the corners beside them, and what lies there pulls corners by more
+than their sigmas say. But a board that is known says where its ink is, and how much light ink takes shows in the
+squares around: without it the image is that of a chessboard.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.boards import Board
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.board_window import extended
+from rigkit.detection.subpixel.edge_model import WINDOW_REACH
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.whole_board import (
+    AROUND,
+    MAP_RINGS,
+    MAX_HOLES,
+    SHARP_PX,
+    TAIL_SIGMAS,
+    spline_coefficients,
+)
+from rigkit.kernels.boards import Picture, board_picture, board_places
+
+DRAWN_PX = 3.0
+"""Ink is drawn on the board with so many samples a px of the image, in the largest squares."""
+
+MAX_SQUARE = 64
+"""Samples a square at most: sharp images do not ask for this."""
+
+MIN_LINES = 3
+"""Steps between corners have neighbours: of fewer rows and columns nobody says where their squares end."""
+
+SHADE_SQUARES = 1.0
+"""Black and white are asked of the pixels around, weighted by a Gaussian of this standard deviation, squares."""
+
+STEPS_OF_SHADE = 4.0
+"""They are asked at places so many to such a standard deviation."""
+
+LEAST_CONTRAST = 1e-3
+"""Of pixels weighted, the least variance of the board's picture (1 and -1) in which black and white are told apart."""
+
+
+def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> GreyImage | None:
+    """Return `image` as if the squares of a ChArUco `board` were empty; None where too little of it is seen.
+
+    Parameters
+    ----------
+    image : grey.
+    refined : the corners, on the grid of the board; those unknown are foretold by the others.
+    blur : s of the edges, px.
+    """
+    known, pixels = refined.lattice.known, refined.lattice.pixels
+    if min(known.shape) < MIN_LINES or np.count_nonzero(~known) > MAX_HOLES * known.size:
+        return None
+    if not known.all():
+        pixels = pixels.copy()
+        pixels[~known] = fit_cells(pixels, ~known, degree=2, ridge=(1e-3, 1.0)).pixels
+    around = extended(pixels, MAP_RINGS)
+    if not np.isfinite(around).all():
+        return None
+    left, top, width, height = box = _box(image, around, TAIL_SIGMAS * blur)
+    places = board_places(spline_coefficients(around), box, AROUND) - MAP_RINGS
+    square_px = float(np.median(fit_cells(pixels, np.ones_like(known), degree=1).cell_px()))
+    rest_blur = float(np.sqrt(max(blur**2 - SHARP_PX**2, 0.25)))
+    size = (board.rows, board.columns)
+    ends = np.array([[-1.0, board.columns], [-1.0, board.rows]])
+    ink = board.ink()
+    white = -1.0 if ink.first_black else 1.0
+    squares = _blurred(board_picture(places, size, ends, np.zeros(4), SHARP_PX)[0], rest_blur)
+    marks = _blurred(_ink(board, places, square_px), rest_blur)
+    part = image[top : top + height, left : left + width].astype(np.float32)
+    with np.errstate(invalid="ignore"):
+        near = (places > -WINDOW_REACH) & (places < np.array(board.size) - 1.0 + WINDOW_REACH)
+    used = np.asarray(near.all(axis=2))
+    taken = marks * _contrast(part, white * squares - 2.0 * marks, used, SHADE_SQUARES * square_px)
+    out = image.astype(np.float32)
+    out[top : top + height, left : left + width] += 2.0 * taken
+    return out
+
+
+def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int, int, int]:
+    """Return the first column and row, width and height of what shows a `lattice` (R, C, 2) and its surroundings."""
+    around = lattice[1:-1, 1:-1].reshape(-1, 2)
+    last = np.array(image.shape[::-1]) - 1.0
+    low = np.clip(np.floor(around.min(axis=0) - margin), 0.0, last)
+    high = np.clip(np.ceil(around.max(axis=0) + margin), 0.0, last)
+    (left, top), (right, bottom) = low.astype(int).tolist(), high.astype(int).tolist()
+    return left, top, right - left + 1, bottom - top + 1
+
+
+def _ink(board: Board, places: FloatArray, square_px: float) -> Picture:
+    """Return how much of each pixel at `places` (H, W, 2) is ink of markers, blurred by SHARP_PX."""
+    each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
+    columns, rows = board.size
+    sheet = np.zeros(((rows + 1) * each, (columns + 1) * each), np.float32)
+    scale = np.tile(each / np.array(board.squares_mm), 2)
+    for x, y, wide, high in board.ink().rectangles * scale:
+        # Sides of modules fall between samples.
+        down, across = _covered(sheet.shape[0], y + each, high), _covered(sheet.shape[1], x + each, wide)
+        sheet[down[0], across[0]] += np.outer(down[1], across[1]).astype(np.float32)
+    sharp = SHARP_PX * each / square_px
+    smooth = _blurred(sheet, sharp)
+    where = np.where(np.isfinite(places), (places + 1.0) * each - 0.5, -2.0 * each).astype(np.float32)
+    return np.asarray(cv2.remap(smooth, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+
+
+def _covered(length: int, start: float, extent: float) -> tuple[slice, FloatArray]:
+    """Return which samples, of a row of `length`, lie between `start` and `extent` beyond it, and by which part."""
+    first, last = max(int(np.floor(start)), 0), min(int(np.ceil(start + extent)), length)
+    samples = np.arange(first, last)
+    part = np.minimum(samples + 1.0, start + extent) - np.maximum(samples, start)
+    return slice(first, last), np.clip(part, 0.0, 1.0)
+
+
+def _contrast(image: Picture, picture: Picture, used: BoolArray, reach_px: float) -> Picture:
+    """Return by how much `image` grows with the `picture`, where it is `used`, in the pixels around each."""
+    # What changes so slowly is asked of means of many pixels.
+    step = max(int(reach_px / STEPS_OF_SHADE), 1)
+    size = (-(-image.shape[1] // step), -(-image.shape[0] // step))
+    weight = used.astype(np.float32)
+    planes = (weight, weight * image, weight * picture, weight * picture**2, weight * picture * image)
+    means = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in planes)
+    total, seen, drawn, squared, both = (_blurred(np.asarray(plane), reach_px / step) for plane in means)
+    total = np.maximum(total, 1e-6)
+    variance = squared / total - (drawn / total) ** 2
+    slope = (both / total - seen * drawn / total**2) / np.maximum(variance, LEAST_CONTRAST)
+    slope = np.where(variance > LEAST_CONTRAST, slope, 0.0).astype(np.float32)
+    return np.asarray(cv2.resize(slope, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def _blurred(plane: Picture, sigma_px: float) -> Picture:
+    return np.asarray(cv2.GaussianBlur(plane, (0, 0), sigma_px, borderType=cv2.BORDER_CONSTANT))
