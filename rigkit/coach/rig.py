@@ -53,11 +53,13 @@ class RigGuide:
         self.lenses = tuple(CaptureGuide(options) for _ in names)
         self.frames: list[tuple[Glance, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}
+        self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
 
     def add(self, glances: Sequence[Glance]) -> None:
         """Take a frame of every camera."""
         self.frames.append(tuple(glances))
         self._shared.clear()
+        self._asked.clear()
         for lens, glance in zip(self.lenses, glances, strict=True):
             if glance.view is not None:
                 lens.add(glance.view, glance.size_px)
@@ -85,7 +87,9 @@ class RigGuide:
             words = f"{self.names[speaks]}: {words}"
         if lenses[speaks].enough and open_mounts:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
-            words, targets = self._shared_target(speaks, glances)
+            if speaks not in self._asked:
+                self._asked[speaks] = self._shared_target(speaks)
+            words, targets = self._asked[speaks]
             worth = self._shared_worth(speaks, glances)
         take = good and worth >= WORTH_TAKING and not enough
         if take:
@@ -155,11 +159,11 @@ class RigGuide:
         usual = 1.0 - np.sqrt(len(shared.in_a) / (len(shared.in_a) + 1.0))
         return float((before - after) / max(before * usual, 1e-12))
 
-    def _shared_target(self, c: int, glances: Sequence[Glance]) -> tuple[str, list[Pixels | None]]:
+    def _shared_target(self, c: int) -> tuple[str, list[Pixels | None]]:
         """Return where to hold the board for the mount of camera `c`, in words and outlines: where both see all of it,
         and it tells most."""
         a, shared = self._partner(c), self._shared_of(c)
-        targets: list[Pixels | None] = [None] * len(glances)
+        targets: list[Pixels | None] = [None] * len(self.names)
         words = f"Hold the board where {self.names[a]} and {self.names[c]} both see it"
         if shared is None:
             return words, targets
