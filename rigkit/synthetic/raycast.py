@@ -57,6 +57,9 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
     board = placed.board
     low, high = placed.edge_squares()
     scale, ink = np.array(board.squares_mm), board.ink()
+    # White circles lie on black ground on white paper; of all else black and white are exchanged, with the paper.
+    discs = bool(len(ink.circles))
+    white, black = (placed.black, placed.white) if ink.inverted and not discs else (placed.white, placed.black)
     # Behind the paper there is no pattern.
     front = float(cam_from_board.rotation[:, 2] @ cam_from_board.translation_mm) > 0.0
     centre = cam_from_board.apply(board.points()).mean(axis=0)
@@ -65,14 +68,14 @@ def board_surface(placed: PlacedBoard, cam_from_world: Rigid3) -> Surface:
         low=low,
         high=high,
         cells=board.size if front and ink.first_black is not None else None,
-        white=placed.white,
-        black=placed.black,
+        white=white,
+        black=black,
         first_black=bool(ink.first_black) and placed.first_black,
         distance_mm=float(np.linalg.norm(centre)),
         marks=ink.rectangles / np.tile(scale, 2) if front and len(ink.rectangles) else None,
-        discs=ink.circles if front and len(ink.circles) else None,
+        discs=ink.circles if front and discs else None,
         squares_mm=board.squares_mm,
-        ground=board.pattern.outline(*board.size) if front and ink.inverted else None,
+        ground=board.pattern.outline(*board.size) if front and ink.inverted and discs else None,
     )
 
 

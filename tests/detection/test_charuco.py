@@ -183,6 +183,16 @@ def test_a_board_whose_markers_blur_into_its_edges_is_found_whole(seed: int) -> 
     assert 0.5 < np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2)) < 1.5
 
 
+def test_an_inverted_board_out_of_focus_is_placed_as_finely() -> None:
+    """It is rendered, too, with black and white exchanged."""
+    rng = np.random.default_rng(0)
+    board = Board("c", 7, 5, 30.0, 30.0, pattern=Charuco("DICT_4X4_50", 22.5, inverted=True))
+    scene = one_board(rng, board=board, square_px=52.0)
+    (found,) = detect_boards(scene.render(blur_px=1.5, noise_levels=2.0, rng=rng), [board])
+    assert found.complete
+    assert np.abs(errors(found, scene.truth()[0])).max() < BLURRED_PX
+
+
 def test_boards_alike_in_one_image_are_told() -> None:
     grid = Board("g", 6, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
     for board in (BOARD, grid):
