@@ -416,6 +416,9 @@ EXPORT void board_places(
 EXPORT void board_picture(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
     ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp, ARRAY(float, out, BOARD_PLANES, height, width));
+
+/* board_changes.c */
+
 EXPORT void board_shares(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing,
     double most, int64_t cubic, int64_t margin, ARRAY(int32_t, nodes, height, width, 2),

@@ -1,4 +1,4 @@
-"""The kernels in boards.c: the picture of a whole chessboard, and how it changes as corners move."""
+"""The kernels in boards.c and board_changes.c: the picture of a whole board, and how it changes as corners move."""
 
 from __future__ import annotations
 
