@@ -13,7 +13,9 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.detection.detect import detect_boards
-from rigkit.detection.guided.guided import complete_boards
+from rigkit.detection.guided.board_guide import BoardState
+from rigkit.detection.guided.guided import _together, complete_boards
+from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.photometry import develop
@@ -189,3 +191,24 @@ def test_a_blurred_board_is_placed_together_with_a_camera_too() -> None:
     # Fitted alone, corners have 1.9 times the error of those placed together in a regular lens, 3.5 times here.
     assert off < 1.1 * best
     assert np.sqrt(np.mean(judged(guided, scene)[2] ** 2)) < 1.3
+
+
+def test_a_corner_without_a_fit_of_its_own_does_not_spoil_the_others() -> None:
+    scene = one_board(np.random.default_rng(1), board=BOARD)
+    image = develop(scene.radiance(Optics(4.0)), BENCH_PHOTOMETRY, np.random.default_rng(1))
+    pixels = scene.truth()[0].lattice()
+    row, column = np.indices(pixels.shape[:2])
+    every = np.ones(pixels.shape[:2])
+    state = BoardState(
+        pixels,
+        100.0 * every,
+        20.0 * every,
+        every,
+        0.05 * every,
+        4.0 * every,
+        signs=np.where((row + column) % 2, 1.0, -1.0),
+    )
+    state.sigma_px[2, 4] = state.blur[2, 4] = np.nan
+    placed = _together(grey_image(image), BOARD, state)
+    assert placed.together
+    assert np.argwhere(~placed.known).tolist() == [[2, 4]]

@@ -320,6 +320,8 @@ def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
     """
     if isinstance(board.pattern, Charuco):
         return state
+    # A corner whose own fit came to nothing has neither blur nor sigma.
+    state = state.without(~np.isfinite(state.sigma_px) | ~np.isfinite(state.blur))
     lattice = Lattice(state.pixels, state.contrast, bool(state.signs[0, 0] > 0.0))
     alone = RefinedLattice(lattice, state.sigma_px, state.blur, state.residual, state.noise)
     placed = placed_together(image, alone)
