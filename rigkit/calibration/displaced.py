@@ -158,7 +158,10 @@ def with_modes(
     cameras: Sequence[Camera], covariance: FloatArray, modes: Sequence[LensModes]
 ) -> tuple[tuple[Camera, ...], FloatArray]:
     """Return cameras with the amounts of their modes as further parameters, and the covariance of all that was solved
-    for: of the parameters, camera by camera, then of the rest, as `covariance` (G, G) has it without modes."""
+    for: of the parameters, camera by camera, then of the rest, as `covariance` (G, G) has it without modes. No
+    modes at all: of models that are followed."""
+    if not modes:
+        return tuple(cameras), covariance
     out: list[Camera] = []
     known, amounts, end = [], [], 0
     for camera, own in zip(cameras, modes, strict=True):

@@ -62,9 +62,7 @@ class SavedRig:
         """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
         these, camera by camera, and of the mounts; None where the file does not say it."""
         cameras = tuple(camera for camera, _ in self.cameras.values())
-        if self.covariance is None or not self.departures:
-            return cameras, self.covariance
-        return with_modes(cameras, self.covariance, self.departures)
+        return (cameras, None) if self.covariance is None else with_modes(cameras, self.covariance, self.departures)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -52,7 +53,7 @@ TRIED = 6
 """Of few targets that all look bad, the worst ones are left out for trial, one by one."""
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class JointRig:
     """A solved rig.
 
@@ -76,7 +77,7 @@ class JointRig:
     notes: tuple[Finding, ...]
     known: KnownCameras | None = None
 
-    @property
+    @cached_property
     def frames(self) -> IntArray:
         """Number of the frame of every pose, (F,); frames in which all cameras see what they saw in an earlier one
         have its number."""

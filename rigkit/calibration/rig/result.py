@@ -161,8 +161,7 @@ class RigCalibration:
         return self._with_departures(self.covariance)
 
     def _with_departures(self, covariance: FloatArray) -> tuple[tuple[Camera, ...], FloatArray]:
-        cameras = tuple(c.camera for c in self.cameras)
-        return with_modes(cameras, covariance, self.departures) if self.departures else (cameras, covariance)
+        return with_modes([c.camera for c in self.cameras], covariance, self.departures)
 
     def mount(self, k: int) -> slice:
         """Return where the mount of camera `k` > 0 stands in the covariance."""

@@ -141,3 +141,9 @@ def _local_fit(rows: FloatArray) -> LocalFit:
     """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
     sides, bends = rows[:, 2:6].reshape(-1, 2, 2), rows[:, 6:10].reshape(-1, 2, 2)
     return LocalFit(rows[:, :2], sides, bends, rows[:, 10], rows[:, 11])
+
+
+def foretold(lattice: FloatArray, cells: BoolArray) -> LocalFit:
+    """Return the fit that says where unknown corners (`cells`) are: of second degree and so damped that a few corners
+    on one side are enough."""
+    return fit_cells(lattice, cells, degree=2, ridge=(1e-3, 1.0))

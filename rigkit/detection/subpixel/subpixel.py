@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_curvature import line_curvature
@@ -254,7 +254,7 @@ def _with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray
         holes &= around >= MIN_NEIGHBOURS
     if not holes.any():
         return lattice, holes
-    shape = fit_cells(lattice.pixels, holes, degree=2, ridge=(1e-3, 1.0))
+    shape = foretold(lattice.pixels, holes)
     pixels = lattice.pixels.copy()
     pixels[holes] = shape.pixels
     return Lattice(pixels, lattice.contrast, lattice.rising), holes

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, MAX_BLUR_CHANGE, MAX_MOVE_PX, ROUNDING_VARIANCE
@@ -140,7 +140,7 @@ def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
     outer[known] = outer_squares(image, geometry, *fitted).reshape(-1, 4)
     if not known.all():
         start = start.copy()
-        start[~known] = fit_cells(start, ~known, degree=2, ridge=(1e-3, 1.0)).pixels
+        start[~known] = foretold(start, ~known).pixels
     around = Surroundings.read(outer, start, blur, ~known)
     alone, noise = (float(np.sqrt(np.mean(part[known] ** 2))) for part in (item.residual, item.noise))
     pixels, sigma_px = lattice.pixels.copy(), item.sigma_px / item.scatter

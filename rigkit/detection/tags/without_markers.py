@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
-from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import extended
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
@@ -60,7 +60,7 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
         return None
     if not known.all():
         pixels = pixels.copy()
-        pixels[~known] = fit_cells(pixels, ~known, degree=2, ridge=(1e-3, 1.0)).pixels
+        pixels[~known] = foretold(pixels, ~known).pixels
     around = extended(pixels, MAP_RINGS)
     if not np.isfinite(around).all():
         return None
