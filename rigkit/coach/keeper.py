@@ -81,7 +81,17 @@ class Keeper:
         """Set a frame aside: it stays on disk, under a name that no session reads."""
         for path in (place / name for place in self._places):
             if path.exists():
-                path.rename(path.with_suffix(".png.dropped"))
+                path.rename(_aside(path))
+
+
+def _aside(path: Path) -> Path:
+    """Return a name for a frame set aside that no other has: after it is undone, the next one is called as it was."""
+    aside = path.with_suffix(".png.dropped")
+    again = 1
+    while aside.exists():
+        again += 1
+        aside = path.with_suffix(f".png.dropped-{again}")
+    return aside
 
 
 def _number(name: str) -> int:

@@ -31,6 +31,7 @@ class HistoryEntry:
     kind : "check", or "calibration" for one made anew.
     source : the file that was checked, as seen from the register's folder.
     reference : of a calibration made anew the one that it is a change of; "" else.
+    digest : SHA-256 of the file of which the amounts are changes, as it was then; "" of registers that are older.
     holds, chance, verdict : whether it still held, the p-value, and what was said.
     frames : how many there were.
     rms_px : of the fresh corners.
@@ -47,6 +48,7 @@ class HistoryEntry:
     frames: int
     rms_px: float
     reference: str = ""
+    digest: str = ""
     temperature_c: float | None = None
     amounts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -68,10 +70,12 @@ class HistoryEntry:
         source: Path,
         *,
         reference: Path | None = None,
+        digest: str = "",
         temperature_c: float | None = None,
         now: datetime | None = None,
     ) -> HistoryEntry:
-        """Return the entry of a check made `now`; with `reference`, of the calibration `source` made anew."""
+        """Return the entry of a check made `now`; with `reference`, of the calibration `source` made anew. `digest` is
+        the SHA-256 of the file of which it tells the changes."""
         amounts: dict[str, tuple[float, float]] = {}
         for change in check.tried:
             cause = change.cause
@@ -87,6 +91,7 @@ class HistoryEntry:
             kind="check" if reference is None else "calibration",
             source=source.as_posix(),
             reference="" if reference is None else reference.as_posix(),
+            digest=digest,
             holds=check.holds,
             chance=check.chance,
             verdict="holds" if check.holds else str(check.change or "nothing that moved explains it"),
@@ -95,6 +100,39 @@ class HistoryEntry:
             temperature_c=temperature_c,
             amounts=amounts,
         )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Edition:
+    """A calibration's file `watched` for as long as it stayed the same, `digest` its SHA-256 ("" where nothing tells),
+    with the entries of its changes by date, and whether it is one of `several` under one name."""
+
+    watched: str
+    digest: str
+    entries: tuple[HistoryEntry, ...]
+    several: bool
+
+    @property
+    def name(self) -> str:
+        """The file, and since when it is as it was, where it was overwritten."""
+        return f"{self.watched} as of {self.entries[0].date[:16].replace('T', ' ')}" if self.several else self.watched
+
+
+def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
+    """Return the calibrations of which entries (by date) are changes: a file that was overwritten is another one.
+    Entries that do not say what it held are taken for changes of what it held before, or first."""
+    found: dict[tuple[str, str], list[HistoryEntry]] = {}
+    latest: dict[str, str] = {}
+    for entry in entries:
+        before = latest.get(entry.watched, "")
+        now = latest[entry.watched] = entry.digest or before
+        if before == "" and (entry.watched, "") in found:
+            found[entry.watched, now] = found.pop((entry.watched, ""))
+        found.setdefault((entry.watched, now), []).append(entry)
+    files = [watched for watched, _ in found]
+    return tuple(
+        Edition(watched, digest, tuple(own), files.count(watched) > 1) for (watched, digest), own in found.items()
+    )
 
 
 def as_seen_from(register: Path, source: Path) -> Path:
@@ -170,9 +208,9 @@ def _entry(data: Any) -> HistoryEntry:
     if not (0.0 <= chance <= 1.0 and isinstance(holds, bool)):
         raise ValueError("chance is from 0 to 1, holds true or false")
     texts = {name: data.pop(name) for name in ("date", "kind", "source", "verdict")}
-    texts["reference"] = data.pop("reference", "")
+    texts |= {name: data.pop(name, "") for name in ("reference", "digest")}
     if not all(isinstance(text, str) for text in texts.values()):
-        raise ValueError("date, kind, source, reference and verdict are words")
+        raise ValueError("date, kind, source, reference, digest and verdict are words")
     if not datetime.fromisoformat(texts["date"]).year > 1:
         raise ValueError("its date is of the year 1")
     entry = HistoryEntry(

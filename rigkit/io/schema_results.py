@@ -174,7 +174,9 @@ HISTORY_FILE = file(
     "rigkit.history/1",
     "One line of a register of checks (JSON lines)",
     {
-        **optional(of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c", "reference"),
+        **optional(
+            of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c", "reference", "digest"
+        ),
         "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
     },
 )

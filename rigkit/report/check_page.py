@@ -1,10 +1,9 @@
-"""A check of a calibration in words, as a table and as a page; a register of checks as drift plots."""
+"""A check of a calibration in words, as a table and as a page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -12,22 +11,19 @@ import numpy as np
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import without_nan
 from rigkit.core.tables import Cell, Table, cells, columns
-from rigkit.io.history_file import HistoryEntry
 from rigkit.report import svg
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
-DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
+DRAWN_WIDTH = 600.0
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05
 """The largest arrow is as long as this part of the image's width."""
-CONTROL_SIGMAS = 3.0
-"""Control limits: what one amount of unchanged cameras leaves in one of 370 checks."""
 PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "rotation": "moved", "shift": "moved"}
 """What changes in several ways are made of."""
-LINE, LIMIT, ALARM, GRID = "#1f4e8c", "#b3261e", "#b3261e", "#e3e7ee"
+LINE = "#1f4e8c"
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,94 +209,3 @@ def change_svg(check: SentinelCheck, c: int) -> str:
         f'<path d="{svg.dots(zoom * start)}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
         f'</svg><p class="foot">{words}</p>'
     )
-
-
-def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
-    """Return what the page of a register says."""
-    alarms = sum(not entry.holds for entry in entries)
-    told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
-    count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
-    first, last = entries[0].date[:10], entries[-1].date[:10]
-    lead = f"{count}, of {last}." if first == last else f"{count}, from {first} to {last}."
-    newest = {entry.watched: entry.holds for entry in entries}
-    bad = [file for file, holds in newest.items() if not holds]
-    if len(newest) == 1:
-        headline = f"The last entry {'is an alarm' if bad else 'holds'}"
-    else:
-        headline = (
-            f"The last entry of {' and of '.join(bad)} is an alarm" if bad else "The last entry of each file holds"
-        )
-    return PageFacts(
-        headline=f"{headline}; {lead}",
-        badge="does not hold" if bad else "holds",
-        passed=not bad,
-        sentences=(
-            "Each amount as if it alone had changed since the calibration, with its standard deviation. Dashed: "
-            "control limits, three standard deviations of each entry. Red: entries that raised an alarm.",
-        ),
-        tables=(_history_table(entries),),
-    )
-
-
-def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
-    """Return the register as a page: of each calibration a drift plot for each thing that may change, then every
-    entry."""
-    watched = list(dict.fromkeys(entry.watched for entry in entries))
-    drawings = []
-    for file in watched:
-        own = [entry for entry in entries if entry.watched == file]
-        whose = f"{file}: " if len(watched) > 1 else ""
-        names = dict.fromkeys(name for entry in own for name in entry.amounts)
-        drawings += [(f"{whose}{name}", drift_svg(own, name)) for name in names]
-    return build_facts_page(title, history_facts(entries), provenance, drawings=drawings)
-
-
-def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
-    """Draw one amount over time with its standard deviations, zero (as calibrated), and the control limits."""
-    own = [entry for entry in entries if name in entry.amounts]
-    days = np.array([entry.moment.timestamp() / 86400.0 for entry in own])
-    value, sigma = np.array([entry.amounts[name] for entry in own]).T
-    limit = CONTROL_SIGMAS * sigma
-    top = 1.1 * max(float(limit.max()), float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
-    span = max(float(np.ptp(days)), 1e-9)
-    x = MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * ((days - days[0]) / span if len(own) > 1 else np.full(1, 0.5))
-    middle = 0.5 * (DRIFT_HEIGHT - 24.0)
-    y = middle * (1.0 - value / top)
-    out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
-    # One picture tells less than three: every entry has its own limits, up to halfway to its neighbours.
-    ends = np.concatenate([[MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
-    for side, colour, dash in ((0.0, "#8a94a3", ""), (1.0, LIMIT, "5 4"), (-1.0, LIMIT, "5 4")):
-        height = np.repeat(middle * (1.0 - side * limit / top), 2)
-        steps = svg.line(np.stack([np.repeat(ends, 2)[1:-1], height], axis=-1))
-        out.append(
-            f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>'
-            f"{svg.words(MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
-        )
-    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
-    for a, b, s, entry in zip(x, y, middle * sigma / top, own, strict=True):
-        colour = LINE if entry.holds else ALARM
-        out.append(
-            f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
-            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
-            f"<title>{escape(_of(entry, name))}</title></circle>"
-        )
-    dates = [(x[0], own[0], "start"), (x[-1], own[-1], "end")]
-    for a, entry, anchor in dates if len(own) > 1 else [(x[0], own[0], "middle")]:
-        out.append(svg.words(a, DRIFT_HEIGHT - 6, entry.date[:10], anchor))
-    return "".join([*out, "</svg>"])
-
-
-def _of(entry: HistoryEntry, name: str) -> str:
-    value, sigma = entry.amounts[name]
-    heat = "" if entry.temperature_c is None else f", {entry.temperature_c:g} °C"
-    return f"{entry.date[:16]}{heat}: {value:+.3g} ± {sigma:.2g}; {entry.verdict}"
-
-
-def _history_table(entries: Sequence[HistoryEntry]) -> Table:
-    heads = columns("date | what | frames .0 | rms [px] | p | temperature [°C] .1 | verdict")
-    rows = tuple(
-        cells(e.date[:16].replace("T", " "), f"{e.kind} of {e.source}", e.frames, e.rms_px, f"{e.chance:.2g}")
-        + cells(e.temperature_c, Cell(e.verdict, failed=not e.holds))
-        for e in entries
-    )
-    return Table("entries", "Entries", heads, rows)

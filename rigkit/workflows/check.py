@@ -37,7 +37,7 @@ from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.next_views import goal_of
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +125,7 @@ def check_pictures(
         write_together(files, force=options.force)
     if options.history is not None:
         place = as_seen_from(options.history, source)
-        entry = HistoryEntry.of_check(check, place, temperature_c=options.temperature_c)
+        entry = HistoryEntry.of_check(check, place, digest=digest_of(source), temperature_c=options.temperature_c)
         add_entry(options.history, entry)
     written = (*files, *([options.history] if options.history is not None else []))
     return CheckedPictures(

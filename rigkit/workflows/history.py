@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
 from datetime import timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -15,13 +16,13 @@ from rigkit.cameras.convert import refit_camera
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
+from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, editions, ensure_register, load_history
 from rigkit.io.reading import about
-from rigkit.report.check_page import history_page
+from rigkit.report.history_page import history_page, overwritten
 from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
 RECALIBRATION_GRID = (40, 30)
 CLOCKS_APART = timedelta(days=1)
@@ -48,11 +49,25 @@ def show_history(
             "1 entry" if earlier == 1 else f"{earlier} entries",
         )
     entries = tuple(sorted(kept, key=lambda entry: entry.moment))
+    for said in (*overwritten(editions(entries)), *_since(register, entries)):
+        _log.warning("register '%s': %s", register, said)
     if report is None:
         return entries, ()
     facts = software_facts() | {register.name: digest_line(register)}
     write_atomic(report, history_page(entries, f"History: {register.stem}", facts), force=force)
     return entries, (report,)
+
+
+def _since(register: Path, entries: Sequence[HistoryEntry]) -> Iterator[str]:
+    """Yield which calibrations were overwritten since their last entry."""
+    last = {entry.watched: entry for entry in entries if entry.digest}
+    for watched, entry in last.items():
+        file = register.parent / watched
+        if file.is_file() and digest_of(file) != entry.digest:
+            yield (
+                f"{watched} was overwritten since its last entry of {entry.date[:10]}: the entries are changes of "
+                "another calibration"
+            )
 
 
 def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c: float | None = None) -> None:
@@ -72,7 +87,9 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
         watched = watched_camera(before, reference.stem, beyond_model=False)
         check = judge_evidence(watched, lambda watched: _as_evidence(watched, now))
     places = as_seen_from(register, new), as_seen_from(register, reference)
-    entry = HistoryEntry.of_check(check, places[0], reference=places[1], temperature_c=temperature_c)
+    entry = HistoryEntry.of_check(
+        check, places[0], reference=places[1], digest=digest_of(reference), temperature_c=temperature_c
+    )
     add_entry(register, entry)
 
 

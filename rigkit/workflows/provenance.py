@@ -38,10 +38,14 @@ def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
 
 def digest_line(source: Path | str | bytes) -> str:
     """Return the SHA-256 of a file, of a text as UTF-8, or of bytes, in words."""
+    return f"SHA-256 {digest_of(source)}"
+
+
+def digest_of(source: Path | str | bytes) -> str:
+    """Return the SHA-256 of a file, of a text as UTF-8, or of bytes."""
     if isinstance(source, Path):
         source = source.read_bytes()
-    data = source.encode() if isinstance(source, str) else source
-    return f"SHA-256 {hashlib.sha256(data).hexdigest()}"
+    return hashlib.sha256(source.encode() if isinstance(source, str) else source).hexdigest()
 
 
 def digest_of_many(hashes: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:

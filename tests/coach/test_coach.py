@@ -175,7 +175,11 @@ def test_killed_and_started_again_nothing_is_lost(pictures: list[np.ndarray], tm
     assert again.keeper.frames[-1] == "frame-0006.png"
     again.undo()
     assert len(again.guide.frames) == len(again.keeper.frames) == 5
-    assert (tmp_path / "images/frame-0006.png.dropped").exists()
+    # The next frame has its name, and set aside, too, takes nothing from it.
+    again.look([pictures[4]], take=Take.YES)
+    again.undo()
+    aside = [tmp_path / f"images/frame-0006.png.dropped{more}" for more in ("", "-2")]
+    assert len({path.read_bytes() for path in aside}) == 2
     with pytest.raises(InputError, match="says something else"):
         open_coach(CoachOptions(folder=tmp_path, boards=("8x5x20",), guide=options(tmp_path).guide))
 

@@ -30,7 +30,8 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.report.check_page import check_page, check_words, drift_svg, history_facts, history_page
+from rigkit.report.check_page import check_page, check_words
+from rigkit.report.history_page import drift_svg, history_facts, history_page
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views, judge_evidence

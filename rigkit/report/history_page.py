@@ -1,0 +1,210 @@
+"""A register of checks over months as a page: drift plots, the same over the temperature, every entry."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.core.tables import Cell, Table, cells, columns
+from rigkit.io.history_file import Edition, HistoryEntry, editions
+from rigkit.report import svg
+from rigkit.report.facts_page import build_facts_page
+from rigkit.report.page_facts import PageFacts
+from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
+from rigkit.validation.sentinel.judge import ALARM_CHANCE
+
+DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
+MIDDLE = 0.5 * (DRIFT_HEIGHT - 24.0)
+CONTROL_SIGMAS = 3.0
+"""Control limits: what one amount of unchanged cameras leaves in one of 370 checks."""
+LINE, LIMIT, ALARM, ZERO = "#1f4e8c", "#b3261e", "#b3261e", "#8a94a3"
+
+
+def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
+    """Return what the page of a register says."""
+    alarms = sum(not entry.holds for entry in entries)
+    told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
+    count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
+    first, last = entries[0].date[:10], entries[-1].date[:10]
+    lead = f"{count}, of {last}." if first == last else f"{count}, from {first} to {last}."
+    kept = editions(entries)
+    newest = {entry.watched: entry.holds for entry in entries}
+    bad = [file for file, holds in newest.items() if not holds]
+    if len(newest) == 1:
+        headline = f"The last entry {'is an alarm' if bad else 'holds'}"
+    else:
+        headline = (
+            f"The last entry of {' and of '.join(bad)} is an alarm" if bad else "The last entry of each file holds"
+        )
+    return PageFacts(
+        headline=f"{headline}; {lead}",
+        badge="does not hold" if bad else "holds",
+        passed=not bad,
+        sentences=(
+            "Each amount as if it alone had changed since the calibration, with its standard deviation. Dashed: "
+            "control limits, three standard deviations of each entry. Red: entries that raised an alarm.",
+            *overwritten(kept),
+        ),
+        tables=(*_heat_tables(kept), _history_table(entries)),
+    )
+
+
+def overwritten(kept: Sequence[Edition]) -> tuple[str, ...]:
+    """Return which calibrations were replaced by others of the same name, in sentences."""
+    said = []
+    for watched in dict.fromkeys(edition.watched for edition in kept if edition.several):
+        own = [edition for edition in kept if edition.watched == watched]
+        since = " and ".join(edition.entries[0].date[:10] for edition in own[1:])
+        said.append(
+            f"{watched} is another file since the entry of {since}: amounts are changes of what it held then, and each "
+            "is drawn by itself."
+        )
+    return tuple(said)
+
+
+def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
+    """Return the register as a page: of each calibration a drift plot for each thing that may change, over time and,
+    where temperatures differ, over these; then every entry."""
+    kept = editions(entries)
+    drawings = []
+    for edition in kept:
+        whose = f"{edition.name}: " if len(kept) > 1 else ""
+        for name in _names(edition):
+            drawings.append((f"{whose}{name}", drift_svg(edition.entries, name)))
+            heat = _heat_of(edition, name)
+            if heat is not None:
+                own = _warm(edition, name)
+                drawings.append((f"{whose}{name}: over the temperature", heat_svg(own, name, heat)))
+    return build_facts_page(title, history_facts(entries), provenance, drawings=drawings)
+
+
+def _names(edition: Edition) -> list[str]:
+    return list(dict.fromkeys(name for entry in edition.entries for name in entry.amounts))
+
+
+def _warm(edition: Edition, name: str) -> list[HistoryEntry]:
+    """Return the entries that say an amount and the temperature, by temperature."""
+    own = [entry for entry in edition.entries if name in entry.amounts and entry.temperature_c is not None]
+    return sorted(own, key=lambda entry: entry.temperature_c or 0.0)
+
+
+def _heat_of(edition: Edition, name: str) -> HeatDrift | None:
+    own = _warm(edition, name)
+    if not own:
+        return None
+    value, sigma = np.array([entry.amounts[name] for entry in own]).T
+    return heat_drift(_celsius(own), value, sigma)
+
+
+def _celsius(entries: Sequence[HistoryEntry]) -> FloatArray:
+    return np.array([entry.temperature_c for entry in entries], dtype=np.float64)
+
+
+def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
+    """Return how amounts go with the temperature, where entries tell."""
+    rows: list[tuple[Cell, ...]] = []
+    for edition in kept:
+        for name in _names(edition):
+            heat, own = _heat_of(edition, name), _warm(edition, name)
+            if heat is not None:
+                low, high = own[0].temperature_c, own[-1].temperature_c
+                what, _, unit = name.rpartition(", ")
+                said = f"{heat.per_degree:+.2g} ± {heat.sigma:.1g} {unit} per °C"
+                rows.append(
+                    cells(f"{edition.name}: {what}" if len(kept) > 1 else what)
+                    + cells(Cell(said, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
+                    + cells(f"{low:g} to {high:g}", len(own))
+                )
+    heads = columns("amount | with the temperature | chance if it does nothing | from, to [°C] | entries .0")
+    return (Table("heat", "Over the temperature", heads, tuple(rows)),) if rows else ()
+
+
+def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
+    """Draw one amount over time with its standard deviations, zero (as calibrated), and the control limits."""
+    own = [entry for entry in entries if name in entry.amounts]
+    days = np.array([entry.moment.timestamp() / 86400.0 for entry in own])
+    value, sigma = np.array([entry.amounts[name] for entry in own]).T
+    limit = CONTROL_SIGMAS * sigma
+    top = _top(float(limit.max()), value, sigma)
+    x = _across(days)
+    out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
+    # One picture tells less than three: every entry has its own limits, up to halfway to its neighbours.
+    ends = np.concatenate([[MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
+    for side, colour, dash in ((0.0, ZERO, ""), (1.0, LIMIT, "5 4"), (-1.0, LIMIT, "5 4")):
+        height = np.repeat(MIDDLE * (1.0 - side * limit / top), 2)
+        steps = svg.line(np.stack([np.repeat(ends, 2)[1:-1], height], axis=-1))
+        out.append(
+            f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>'
+            f"{svg.words(MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
+        )
+    y = MIDDLE * (1.0 - value / top)
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
+    return "".join([*out, *_points(own, name, x, top), *_below(x, [entry.date[:10] for entry in own]), "</svg>"])
+
+
+def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str:
+    """Draw one amount over the temperature of entries (by it), with its standard deviations and the line through it."""
+    celsius = _celsius(entries)
+    value, sigma = np.array([entry.amounts[name] for entry in entries]).T
+    top = _top(0.0, value, sigma)
+    x, y = _across(celsius), MIDDLE * (1.0 - heat.at(celsius) / top)
+    out = [svg.opened(f"{name} over the temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
+    for amount in (-top / 1.1, 0.0, top / 1.1):
+        height = MIDDLE * (1.0 - amount / top)
+        ends = svg.line([np.array([MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])
+        stroke = ZERO if amount == 0.0 else svg.RIM_COLOUR
+        out.append(f'<path d="{ends}" stroke="{stroke}"/>{svg.words(MARGIN - 5, height + 4, f"{amount:.2g}", "end")}')
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.6"/>')
+    told = [f"{c:g} °C" for c in celsius]
+    return "".join([*out, *_points(entries, name, x, top), *_below(x, told), "</svg>"])
+
+
+def _top(least: float, value: FloatArray, sigma: FloatArray) -> float:
+    """Return the amount at the upper rim of a drawing."""
+    return 1.1 * max(least, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
+
+
+def _across(values: FloatArray) -> FloatArray:
+    """Return where values are between the left and the right of a drawing; one alone in the middle."""
+    part = (values - values[0]) / max(float(np.ptp(values)), 1e-9) if len(values) > 1 else np.full(1, 0.5)
+    return np.asarray(MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * part)
+
+
+def _below(x: FloatArray, told: Sequence[str]) -> list[str]:
+    """Return the words below the first and the last of the points at `x`."""
+    if len(told) == 1:
+        return [svg.words(x[0], DRIFT_HEIGHT - 6, told[0], "middle")]
+    return [svg.words(x[k], DRIFT_HEIGHT - 6, told[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
+
+
+def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: float) -> list[str]:
+    """Return the amount of each entry at `x` with its standard deviation."""
+    out = []
+    for a, entry in zip(x, entries, strict=True):
+        value, sigma = entry.amounts[name]
+        b, s, colour = MIDDLE * (1.0 - value / top), MIDDLE * sigma / top, LINE if entry.holds else ALARM
+        out.append(
+            f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
+            f"<title>{escape(_of(entry, name))}</title></circle>"
+        )
+    return out
+
+
+def _of(entry: HistoryEntry, name: str) -> str:
+    value, sigma = entry.amounts[name]
+    heat = "" if entry.temperature_c is None else f", {entry.temperature_c:g} °C"
+    return f"{entry.date[:16]}{heat}: {value:+.3g} ± {sigma:.2g}; {entry.verdict}"
+
+
+def _history_table(entries: Sequence[HistoryEntry]) -> Table:
+    heads = columns("date | what | frames .0 | rms [px] | p | temperature [°C] .1 | verdict")
+    rows = tuple(
+        cells(e.date[:16].replace("T", " "), f"{e.kind} of {e.source}", e.frames, e.rms_px, f"{e.chance:.2g}")
+        + cells(e.temperature_c, Cell(e.verdict, failed=not e.holds))
+        for e in entries
+    )
+    return Table("entries", "Entries", heads, rows)

@@ -1,0 +1,50 @@
+"""How an amount that was watched over months goes with the temperature."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+
+MIN_ENTRIES = 3
+"""Two points lie on a line, whatever they err by."""
+MIN_RANGE_C = 1.0
+"""Temperatures that differ by less are those of one room."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeatDrift:
+    """The straight line amount = `at_mean` + `per_degree` (T - `mean_c`), with the standard deviation of its slope, and
+    the chance of such a slope where the temperature changes nothing."""
+
+    mean_c: float
+    at_mean: float
+    per_degree: float
+    sigma: float
+    chance: float
+
+    def at(self, temperature_c: FloatArray) -> FloatArray:
+        """Return the amounts on the line."""
+        return np.asarray(self.at_mean + self.per_degree * (temperature_c - self.mean_c))
+
+
+def heat_drift(temperature_c: FloatArray, value: FloatArray, sigma: FloatArray) -> HeatDrift | None:
+    """Return the line through amounts (N,) with their standard deviations, by weighted least squares; None where fewer
+    than three, or temperatures within a degree, tell of none. Where the amounts scatter about it more than they state,
+    this scatter counts."""
+    if len(value) < MIN_ENTRIES or np.ptp(temperature_c) < MIN_RANGE_C or not (sigma > 0.0).all():
+        return None
+    # Imported here: registers without temperatures are shown without it.
+    from scipy.special import stdtr
+
+    weight = sigma**-2.0
+    mean, middle = (float((weight * x).sum() / weight.sum()) for x in (temperature_c, value))
+    away = temperature_c - mean
+    spread = float((weight * away**2).sum())
+    slope = float((weight * away * value).sum()) / spread
+    freedom = len(value) - 2
+    excess = float((weight * (value - middle - slope * away) ** 2).sum()) / freedom
+    own = float(np.sqrt(max(excess, 1.0) / spread))
+    return HeatDrift(mean, middle, slope, own, float(2.0 * stdtr(freedom, -abs(slope) / own)))
