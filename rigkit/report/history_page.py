@@ -11,16 +11,17 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
+from rigkit.report.check_page import DRAWN_WIDTH, LINE
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 
-DRAWN_WIDTH, DRIFT_HEIGHT, MARGIN = 600.0, 190.0, 56.0
+DRIFT_HEIGHT, MARGIN = 190.0, 56.0
 MIDDLE = 0.5 * (DRIFT_HEIGHT - 24.0)
 CONTROL_SIGMAS = 3.0
 """Control limits: what one amount of unchanged cameras leaves in one of 370 checks."""
-LINE, LIMIT, ALARM, ZERO = "#1f4e8c", "#b3261e", "#b3261e", "#8a94a3"
+LIMIT, ALARM, ZERO = "#b3261e", "#b3261e", "#8a94a3"
 
 
 def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
