@@ -23,7 +23,7 @@ ARROW_LENGTH = 0.05
 """The largest arrow is as long as this part of the image's width."""
 PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "rotation": "moved", "shift": "moved"}
 """What changes in several ways are made of."""
-LINE = "#1f4e8c"
+STROKE = "#1f4e8c"
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +205,7 @@ def change_svg(check: SentinelCheck, c: int) -> str:
     return (
         svg.opened(words, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + 2:.1f}")
         + f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}" stroke="{svg.RIM_COLOUR}"/>'
-        f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{LINE}" stroke-width="1.3" fill="none"/>'
-        f'<path d="{svg.dots(zoom * start)}" stroke="{LINE}" stroke-width="3" stroke-linecap="round"/>'
+        f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{STROKE}" stroke-width="1.3" fill="none"/>'
+        f'<path d="{svg.dots(zoom * start)}" stroke="{STROKE}" stroke-width="3" stroke-linecap="round"/>'
         f'</svg><p class="foot">{words}</p>'
     )

@@ -11,7 +11,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
-from rigkit.report.check_page import DRAWN_WIDTH, LINE
+from rigkit.report.check_page import DRAWN_WIDTH, STROKE
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
@@ -142,7 +142,7 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
             f"{svg.words(MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
         )
     y = MIDDLE * (1.0 - value / top)
-    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.4"/>')
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{STROKE}" stroke-opacity="0.4"/>')
     return "".join([*out, *_points(own, name, x, top), *_below(x, [entry.date[:10] for entry in own]), "</svg>"])
 
 
@@ -158,7 +158,7 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
         ends = svg.line([np.array([MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])
         stroke = ZERO if amount == 0.0 else svg.RIM_COLOUR
         out.append(f'<path d="{ends}" stroke="{stroke}"/>{svg.words(MARGIN - 5, height + 4, f"{amount:.2g}", "end")}')
-    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{LINE}" stroke-opacity="0.6"/>')
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{STROKE}" stroke-opacity="0.6"/>')
     told = [f"{c:g} °C" for c in celsius]
     return "".join([*out, *_points(entries, name, x, top), *_below(x, told), "</svg>"])
 
@@ -186,7 +186,7 @@ def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: floa
     out = []
     for a, entry in zip(x, entries, strict=True):
         value, sigma = entry.amounts[name]
-        b, s, colour = MIDDLE * (1.0 - value / top), MIDDLE * sigma / top, LINE if entry.holds else ALARM
+        b, s, colour = MIDDLE * (1.0 - value / top), MIDDLE * sigma / top, STROKE if entry.holds else ALARM
         out.append(
             f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
             f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'
