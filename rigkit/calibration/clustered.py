@@ -74,20 +74,13 @@ def effective_freedom(
     return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
 
 
-def widening(freedom: float, overdispersion: float, directions: int) -> float:
-    """Return by how much standard deviations are widened when they are quoted: two then hold what two of a normal
-    distribution do, and one more than 68 %: 80 with three effective degrees of freedom, 72 with ten.
-
-    Parameters
-    ----------
-    freedom, overdispersion : as in `Clustered`.
-    directions : how many unknowns there are.
-    """
+def widening(freedom: float) -> float:
+    """Return by how much standard deviations with so many `effective_freedom` are widened when they are quoted: two
+    then hold what two of a normal distribution do, and one more than 68 %: 80 with three of them, 72 with ten."""
     # Imported here: a camera is read, and used, without it.
     from scipy.special import ndtr, stdtrit
 
-    known = effective_freedom(freedom, overdispersion, directions)
-    return float(stdtrit(known, ndtr(QUOTED))) / QUOTED if known < LARGE_FREEDOM else 1.0
+    return float(stdtrit(freedom, ndtr(QUOTED))) / QUOTED if freedom < LARGE_FREEDOM else 1.0
 
 
 def reduced_by_cluster(

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.clustered import Clustered, clustered_covariance, effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.detections import BoardView
@@ -26,7 +27,6 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
-from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_POSES = 3
 MAX_MISMATCH_RAD = np.radians(1.0)
@@ -36,7 +36,6 @@ MAX_SIGMA_OF_DISTANCE = 0.1
 along that axis. Turns about a second one, however few, count by how certain they make it."""
 OPEN_PART = 1e-12
 """A direction of which the corners know this part of what they know of the best is open: it is rounding."""
-RESAMPLES = 300
 HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
 HAND_EYE_STOP = Stop(steps=60, promise=1e-14)
 UNKNOWNS = 12
@@ -51,8 +50,9 @@ class HandEye:
     Attributes
     ----------
     cam_from_mount, stand_from_board : the two unknown poses, mm.
-    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. By
-        resampling the images: what the robot does not tell exactly is in it.
+    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. By what
+        the images disagree: what the robot does not tell exactly is in it.
+    freedom : its degrees of freedom; deviations that are quoted count them in (`widening`).
     rms_px : 2-D RMS of all corners.
     image_rms_px : by image.
     apart_mm, apart_rad : (N,) of the images used, in their order: how far the middle of the board, and its turn, as the
@@ -63,6 +63,7 @@ class HandEye:
     cam_from_mount: Rigid3
     stand_from_board: Rigid3
     covariance: FloatArray
+    freedom: float
     rms_px: float
     image_rms_px: dict[str, float]
     apart_mm: FloatArray
@@ -72,14 +73,13 @@ class HandEye:
     __repr__ = brief
 
     def sigmas(self) -> tuple[FloatArray, FloatArray]:
-        """Return standard deviations (2, 3) of the turns (rad) and of the translations (mm) of both poses."""
-        deviations = np.sqrt(np.diag(self.covariance)).reshape(2, 2, 3)
+        """Return standard deviations (2, 3) of the turns (rad) and of the translations (mm) of both poses: two
+        hold 95 % of errors, however few images there are."""
+        deviations = widening(self.freedom) * np.sqrt(np.diag(self.covariance)).reshape(2, 2, 3)
         return deviations[:, 0], deviations[:, 1]
 
 
-def hand_eye(
-    camera: Camera, views: Sequence[BoardView], mount_from_stand: Sequence[Rigid3], *, seed: int = 0
-) -> HandEye:
+def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Sequence[Rigid3]) -> HandEye:
     """Return where the camera and the board are, from views of one board and what the robot says at each.
 
     Raises
@@ -106,8 +106,8 @@ def hand_eye(
     start = _linear([seen[i] for i in use], problem.robot)
     found = minimise(start, problem.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
     _refuse_inverse(problem, [seen[i] for i in use], found.problem.cost)
-    covariance = _resampled(found.problem, problem.image, np.random.default_rng(seed))
-    _refuse_open(covariance, [seen[i] for i in use])
+    known = _by_image(found.problem, problem.image)
+    _refuse_open(known.covariance, [seen[i] for i in use])
     squared = found.problem.residual.reshape(-1, 2) ** 2 * problem.sigma[:, None] ** 2
     by_image = {
         problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
@@ -117,7 +117,9 @@ def hand_eye(
     return HandEye(
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
-        covariance=covariance,
+        covariance=known.covariance,
+        # A pose has six numbers: as many images as the unknowns take up say nothing of how images disagree.
+        freedom=effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
         rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
         image_rms_px=by_image,
         apart_mm=apart_mm,
@@ -237,27 +239,19 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
         )
 
 
-def _resampled(problem: DenseProblem, image: IntArray, rng: np.random.Generator) -> FloatArray:
-    """Return the covariance (12, 12) of the solution when images are drawn anew with replacement: one Gauss-Newton step
-    each from the sums of every image, enlarged by n / (n - 1) and by the unknowns that each image's share must give.
-    Infinite where the corners leave an unknown open."""
+def _by_image(problem: DenseProblem, image: IntArray) -> Clustered:
+    """Return the covariance (12, 12) of the solution with the image as the unit that is independent: what the robot
+    does not tell exactly shifts all corners of an image. Infinite where the corners leave an unknown open."""
     count = int(image.max()) + 1
-    rows = problem.jacobian.reshape(-1, 2, UNKNOWNS)
-    residual = problem.residual.reshape(-1, 2)
+    rows, residual = problem.jacobian.reshape(-1, 2, UNKNOWNS), problem.residual.reshape(-1, 2)
     information, score = np.zeros((count, UNKNOWNS, UNKNOWNS)), np.zeros((count, UNKNOWNS))
     np.add.at(information, image, np.einsum("nka,nkb->nab", rows, rows))
     np.add.at(score, image, np.einsum("nka,nk->na", rows, residual))
-    weights = rng.multinomial(count, np.full(count, 1.0 / count), RESAMPLES).astype(np.float64)
-    # A draw of too few different images determines nothing: the whole holds it in place, as one image in all would.
     total = information.sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(total), np.finfo(float).tiny))
-    if not np.linalg.eigvalsh(total / np.outer(scale, scale))[0] > OPEN_PART:
-        return np.diag(np.full(UNKNOWNS, np.inf))
-    steps = -np.linalg.solve(
-        np.einsum("rn,nab->rab", weights, information) + total / count, (weights @ score)[..., None]
-    )[..., 0]
-    centred = steps - np.median(steps, axis=0)
-    spread = SIGMA_OF_MEDIAN * np.median(np.abs(centred), axis=0)
-    kept = (np.abs(centred) <= 6.0 * np.maximum(spread, 1e-300)).all(axis=1)
-    freedom = max(count - UNKNOWNS / 6.0, 1.0)
-    return np.asarray(np.cov(steps[kept].T) * count / freedom)
+    scaled = total / np.outer(scale, scale)
+    if not np.linalg.eigvalsh(scaled)[0] > OPEN_PART:
+        return Clustered(np.diag(np.full(UNKNOWNS, np.inf)), 1.0, float("inf"))
+    unit = np.linalg.inv(scaled) / np.outer(scale, scale)
+    sigma = float(np.sqrt((residual**2).sum() / max(residual.size - UNKNOWNS, 1)))
+    return clustered_covariance(unit, information, score, np.zeros_like(total), sigma)

@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.clustered import widening
+from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
 from rigkit.core.boards import Board
@@ -378,7 +378,7 @@ class Calibration:
     @cached_property
     def widening(self) -> float:
         """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
-        return widening(self.freedom, self.overdispersion, len(self.covariance))
+        return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
 
     @property
     def images_left_out(self) -> int:

@@ -189,6 +189,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
             {
                 "image_count": rig.image_count,
                 "scale_sigma": rig.scale_sigma,
+                "freedom": rig.freedom if math.isfinite(rig.freedom) else None,
                 "angles": [
                     {"a": a, "b": b, "value_deg": value, "sigma_deg": sigma}
                     for a, b in combinations(rig.names, 2)
@@ -227,7 +228,9 @@ def _mount(rig: dict[str, Any], path: str | Path) -> BoardRig:
     if len(set(names)) < max(len(names), 2):
         raise ValueError(f"a mount has two boards or more, each with another name, here {', '.join(names)}")
     covariance = as_covariance(rig["covariance"], "covariance", 6 * (len(boards) - 1))
-    return BoardRig(boards, covariance, whole(rig["image_count"]), real(rig["scale_sigma"]))
+    images = whole(rig["image_count"])
+    known = freedom(rig["freedom"]) if "freedom" in rig else float(max(images - 1, 1))
+    return BoardRig(boards, covariance, images, real(rig["scale_sigma"]), known)
 
 
 def _placed(entry: dict[str, Any], path: str | Path) -> MountedBoard:

@@ -157,6 +157,7 @@ BOARD_RIG_FILE = file(
             {
                 "image_count": said(INTEGER, "images that show several of them"),
                 "scale_sigma": said(NUMBER, "relative standard deviation of all lengths"),
+                "freedom?": _FREEDOM,
                 "angles?": rows({"a": TEXT, "b": TEXT, "value_deg": NUMBER, "sigma_deg": NUMBER}, "between the boards"),
                 "boards": rows(
                     {

@@ -190,6 +190,7 @@ HAND_EYE_FILE = file(
         "cam_from_base?": said(_POSE, "of a camera that stands before a robot"),
         "hand_from_board?": said(_POSE, "with it"),
         "covariance": said(matrix(), "of both poses (rad, mm), twelve by twelve"),
+        "freedom?": said(nullable(NUMBER), "degrees of freedom of the covariance, which is Student's; null: infinite"),
         "rms_px": NUMBER,
         "image_rms_px?": said(table(NUMBER), "by image"),
         "median_apart_mm?": said(NUMBER, "of the boards' middles as seen from where the robot has them, median"),

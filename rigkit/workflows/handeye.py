@@ -208,6 +208,7 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         first: result.cam_from_mount.matrix()[:3].tolist(),
         second: result.stand_from_board.matrix()[:3].tolist(),
         "covariance": result.covariance.tolist(),
+        "freedom": result.freedom,
         "rms_px": result.rms_px,
         "image_rms_px": result.image_rms_px,
         "median_apart_mm": float(np.median(result.apart_mm)),

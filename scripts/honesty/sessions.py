@@ -1,4 +1,5 @@
-"""Small sessions: the stated sigmas of lens, mounts and baseline after three images, or after twenty.
+"""Small sessions: the stated sigmas of lens, mounts and baseline after three images, or after twenty; of boards
+mounted to each other, and of a camera on a robot's hand.
 
 Corners are simulated: each with an error of its own, and with a smooth one that an image's corners have in common, as
 blur, light or a board that bends leave it. Boards are seen whole, or in part as ChArUco boards are: what lies on one
@@ -10,12 +11,14 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.hand_eye import hand_eye
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.uncertainty import projection_uncertainty
@@ -24,11 +27,13 @@ from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, log_so3
+from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
 
+from helpers.board_rig_scenes import DIFFERENT, corner_of_a_room, target_views
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 LENSES = ("reg", "wide", "fish")
@@ -42,6 +47,11 @@ GRID = (24, 18)
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.005])), [-120.0, 3.0, 8.0])
 SECOND_CENTRE = np.array([800.0, 622.0])
 PLACED_TRIES = 20000
+TARGET_AWAY_MM = 1000.0
+CAM_FROM_HAND = Rigid3(exp_so3(np.array([0.3, -1.2, 0.4])), [30.0, -60.0, 90.0])
+BASE_FROM_BOARD = Rigid3(exp_so3(np.array([2.0, 0.4, -0.3])), [400.0, 120.0, -15.0])
+ROBOT_RAD, ROBOT_MM = 2e-4, 0.1
+"""What a robot's pose is off by, each number."""
 
 Errors = dict[str, list[float]]
 """Of every quantity, errors in stated sigmas."""
@@ -96,6 +106,45 @@ def pair_session(name: str, images: int, common_px: float, whole: bool, rng: np.
     }
 
 
+def boards_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
+    room = corner_of_a_room(rng, DIFFERENT)
+    camera = {name: (lens(name), Rigid3.identity())}
+    exact = target_views(rng, camera, DIFFERENT, room, images, noise_px=0.0, distance_mm=TARGET_AWAY_MM)
+    seen = {k: [(frame, disturbed(view, common_px, whole, rng)) for frame, view in own] for k, own in exact.items()}
+    ids = [board.board_id for board in DIFFERENT]
+    found = calibrate_rig(seen, {name: SIZE}, model=lens(name).model, rigid_boards=[ids]).board_rigs[0]
+    middle = {board.board_id: room[board.board_id].apply(board.points().mean(axis=0)) for board in DIFFERENT}
+    out: Errors = {"boards, angles": [], "boards, distances": []}
+    for a, b in combinations(ids, 2):
+        angle, sigma = found.angle_deg(a, b)
+        between = angle_between(room[a].rotation[:, 2], room[b].rotation[:, 2])
+        out["boards, angles"].append((angle - 180.0 + float(np.degrees(between))) / sigma)
+        length, sigma = found.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
+        out["boards, distances"].append((length - float(np.linalg.norm(middle[a] - middle[b]))) / sigma)
+    return out
+
+
+def hand_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
+    exact, rotations, translations = random_views(lens(name), images, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
+    told = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        true = CAM_FROM_HAND.inverse() @ Rigid3(rotation, translation) @ BASE_FROM_BOARD.inverse()
+        turn = exp_so3(ROBOT_RAD * rng.normal(size=3))
+        told.append(Rigid3(turn @ true.rotation, true.translation_mm + ROBOT_MM * rng.normal(size=3)))
+    found = hand_eye(lens(name), [disturbed(view, common_px, whole, rng) for view in exact], told)
+    turns, moves = found.sigmas()
+    out: Errors = {"hand-eye, turns": [], "hand-eye, places": []}
+    pairs = ((found.cam_from_mount, CAM_FROM_HAND), (found.stand_from_board, BASE_FROM_BOARD))
+    for (pose, true), turn, move in zip(pairs, turns, moves, strict=True):
+        out["hand-eye, turns"] += (log_so3(pose.rotation @ true.rotation.T) / turn).tolist()
+        out["hand-eye, places"] += ((pose.translation_mm - true.translation_mm) / move).tolist()
+    return out
+
+
+ONE_LENS = (pair_session, boards_session, hand_session)
+"""What is tried with the first lens alone."""
+
+
 def _frames(
     cameras: dict[str, tuple[Camera, Rigid3]], images: int, common_px: float, whole: bool, rng: np.random.Generator
 ) -> dict[str, list[tuple[str, BoardView]]]:
@@ -132,7 +181,7 @@ def sessions(images: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
         for common_px in COMMON_PX:
             for seed in range(seeds):
                 for k, name in enumerate(LENSES):
-                    for make in (camera_session, *((pair_session,) if name == "reg" else ())):
+                    for make in (camera_session, *(ONE_LENS if name == LENSES[0] else ())):
                         rng = np.random.default_rng([seed, images, k, int(1e3 * common_px), whole])
                         try:
                             found = make(name, images, common_px, whole, rng)

@@ -159,6 +159,20 @@ def test_sigmas_of_angles_and_distances_follow_the_covariance(rng: np.random.Gen
         assert quantity(rig(np.zeros(12)))[1] == pytest.approx(np.linalg.norm(slope @ root), rel=1e-5)
 
 
+def test_sigmas_that_few_images_tell_are_widened() -> None:
+    places = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 1.5, 0.0])), [300.0, 0.0, 0.0]))
+    placed = tuple(MountedBoard(b, b.points(), p) for b, p in zip(DIFFERENT[:2], places, strict=True))
+    names = [b.board_id for b in DIFFERENT[:2]]
+    of_many, of_few = (BoardRig(placed, 1e-6 * np.eye(6), 5, 0.0, freedom) for freedom in (float("inf"), 4.0))
+    ends = [Feature(name, centre=True) for name in names]
+    # Two standard deviations of a normal distribution are 2.87 of Student's with four degrees of freedom.
+    for quoted, known in (
+        (of_few.angle_deg(*names), of_many.angle_deg(*names)),
+        (of_few.distance_mm(*ends), of_many.distance_mm(*ends)),
+    ):
+        assert quoted[0] == known[0] and quoted[1] == pytest.approx(1.4347 * known[1], rel=1e-3)
+
+
 def test_one_image_is_as_good_as_three_boards_alone(rng: np.random.Generator) -> None:
     """With one image there is nothing to tie: as many unknowns, the same camera; and the boards' geometry."""
     room = corner_of_a_room(rng, DIFFERENT)

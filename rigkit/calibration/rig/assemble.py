@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, motion_of_world
-from rigkit.calibration.clustered import with_block
+from rigkit.calibration.clustered import Clustered, effective_freedom, with_block
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
@@ -84,7 +84,7 @@ def assemble_rig(
         left_out=joint.left_out,
         scale_sigma=scale,
         departures=lens_modes(observations, joint.solution, far, last.stop),
-        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale),
+        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale, clustered),
     )
     return rig, far
 
@@ -197,9 +197,11 @@ def _board_rigs(
     shapes: dict[str, FloatArray],
     covariance: FloatArray,
     scale: float,
+    clustered: Clustered,
 ) -> tuple[BoardRig, ...]:
     state = joint.solution.state
     index = {b.board_id: i for i, b in enumerate(boards)}
+    freedom = effective_freedom(clustered.freedom, clustered.overdispersion, len(clustered.covariance))
     out = []
     for target in dict.fromkeys(target for target, _ in places.values()):
         names = sorted((n for n, (t, _) in places.items() if t == target and n in index), key=lambda n: n != target)
@@ -217,5 +219,5 @@ def _board_rigs(
                 if entry.key[1] == target and entry.board_id in names:
                     scenes[(c, entry.frame)] = scenes.get((c, entry.frame), 0) + 1
         count = sum(n > 1 for n in scenes.values())
-        out.append(BoardRig(placed, covariance[np.ix_(chosen, chosen)], count, scale))
+        out.append(BoardRig(placed, covariance[np.ix_(chosen, chosen)], count, scale, freedom))
     return tuple(out)

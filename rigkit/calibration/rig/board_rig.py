@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.clustered import widening
 from rigkit.core.arrays import FloatArray, Points, as_array
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -53,6 +54,7 @@ class BoardRig:
     ----------
     boards : with their places; the first one's is the identity.
     covariance : (6 (n - 1), 6 (n - 1)) of the places of all boards but the first: left perturbation (rad), mm.
+        Student's, with `freedom` degrees of freedom; deviations that are quoted count them in (`widening`).
     image_count : images that show at least two of them.
     scale_sigma : relative standard deviation of all lengths, from how well the squares were measured.
     """
@@ -61,6 +63,7 @@ class BoardRig:
     covariance: FloatArray
     image_count: int
     scale_sigma: float = 0.0
+    freedom: float = float("inf")
 
     def __post_init__(self) -> None:
         size = 6 * (len(self.boards) - 1)
@@ -129,4 +132,4 @@ class BoardRig:
         return row
 
     def _sigma(self, row: FloatArray) -> float:
-        return float(np.sqrt(max(float(row @ self.covariance @ row), 0.0)))
+        return widening(self.freedom) * float(np.sqrt(max(float(row @ self.covariance @ row), 0.0)))

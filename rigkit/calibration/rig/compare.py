@@ -115,8 +115,7 @@ def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDiffere
             f"other boards: {', '.join(a.names)} and {', '.join(b.names)}; compare mounts of the same boards"
         )
     off = [_off(p.target_from_board, q.target_from_board) for p, q in zip(a.boards[1:], b.boards[1:], strict=True)]
-    freedom = tuple(float(max(rig.image_count - 1, 1)) for rig in (a, b))
-    known = _known((a.covariance, b.covariance), freedom, seed)
+    known = _known((a.covariance, b.covariance), (a.freedom, b.freedom), seed)
     return _difference(a.names[1:], np.concatenate([np.zeros(0), *off]), known)
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.clustered import widening
+from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
@@ -138,7 +138,7 @@ class RigCalibration:
     @cached_property
     def widening(self) -> float:
         """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
-        return widening(self.freedom, self.overdispersion, len(self.covariance))
+        return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
 
     @property
     def sigmas(self) -> FloatArray:
