@@ -16,6 +16,7 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
+from rigkit.detection.tags.in_squares import beside_markers
 from rigkit.detection.targets.charuco import _between_markers, _marked_corners
 from rigkit.detection.twins import alike_boards
 from rigkit.geometry.rigid3 import Rigid3
@@ -99,6 +100,49 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     assert len(off) > 20
     assert np.median(off) < 0.03
     assert off.max() < 1.0
+
+
+def test_markers_too_faint_for_outlines_are_read_in_their_squares(rng: np.random.Generator) -> None:
+    """Ten grey levels between ink and paper: OpenCV finds no marker."""
+    scene = one_board(rng, board=BOARD, max_tilt_deg=30.0)
+    image = scene.render(photometry=Photometry(exposure=0.05, noise_levels=0.7), rng=rng)
+    assert not len(_marked_corners(image, BOARD)[0])
+    (found,) = detect_boards(image, [BOARD])
+    assert found.board_id == "c" and found.complete
+    assert np.abs(errors(found, scene.truth()[0])).max() < 0.5
+
+
+def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng: np.random.Generator) -> None:
+    scene = one_board(rng, board=BOARD, max_tilt_deg=30.0)
+    cover = Panel(scene.boards[0].world_from_board @ Rigid3(np.eye(3), np.array([180.0, 60.0, -2.0])), 70.0, 70.0, 0.4)
+    scene = replace(scene, occluders=(cover,))
+    truth = scene.truth()[0].lattice()
+    part = truth.copy()
+    part[:, 4:] = np.nan
+    grown = beside_markers(grey_image(scene.render(noise_levels=2.0, rng=rng)), part, BOARD)
+    added = np.isfinite(grown[..., 0])
+    # At its corners hardly more than the tip of a marker is covered.
+    assert not added[1:4, 6].any() and not added[2, 5:8].any()
+    assert np.count_nonzero(added) >= 36
+    assert np.nanmax(np.linalg.norm(grown - truth, axis=2)) < 2.0
+
+
+@pytest.mark.parametrize("declared", [Charuco("DICT_5X5_100", 21.0, legacy=True), Charuco("DICT_6X6_100", 21.0)])
+def test_squares_of_another_board_name_none(declared: Charuco, rng: np.random.Generator) -> None:
+    board = replace(BOARD, rows=5)
+    image = one_board(rng, board=board, max_tilt_deg=20.0).render(noise_levels=2.0, rng=rng)
+    assert not any(item.board_id for item in detect_boards(image, [replace(board, pattern=declared)]))
+
+
+def test_parts_of_boards_alike_are_not_taken_for_one() -> None:
+    """Each is cut by the frame, so that each lacks what the other shows."""
+    camera = bench_camera("regular")
+    places = [Rigid3(np.eye(3), np.array([x_mm, -80.0, 600.0])) for x_mm in (-420.0, 150.0)]
+    scene = BenchScene("alike", tuple(PlacedBoard(BOARD, place) for place in places), (), camera)
+    found = [item for item in detect_boards(scene.render(), [BOARD]) if item.board_id]
+    assert len(found) == 1
+    truth = [t.lattice()[found[0].grid[:, 1], found[0].grid[:, 0]] for t in scene.truth()]
+    assert min(np.nanmax(np.abs(found[0].pixels - one)) for one in truth) < 0.2
 
 
 def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.Generator) -> None:

@@ -21,8 +21,9 @@ MIN_LIKENESS = 0.7
 """Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
 in some thousand squares; blur as wide as a module still leaves 0.8."""
 
-MIN_CODE_CONTRAST = 4.0
-"""Standard deviation of the modules' brightness, grey levels: less is paper, or a black square."""
+MIN_CODE_CONTRAST = 1.5
+"""Standard deviation of the modules' brightness, grey levels: less is paper, or a black square. Ink ten levels
+darker than paper makes 4."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -74,26 +74,42 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
 
 def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> tuple[int, int, IntArray] | None:
     """Return how many tags say it, quarter turns and shift (2,) that take the lattice to the board's grid."""
-    corners = lattice.pixels
-    quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
-    # Dark squares: brightness falls with the angle across the edge from their first corner along the row.
-    dark = np.isfinite(quads).all(axis=(2, 3)) & (lattice.signs()[:-1, :-1] < 0.0)
-    row, column = np.nonzero(dark)
-    tags = read_tags(image, quads[row, column], board.codes)
+    quads, cells = squares_of(lattice, dark=True)
+    tags = read_tags(image, quads, board.codes)
     sure = np.flatnonzero(tags.read)
     if not len(sure):
         return None
-    # A tag that stands upright in the lattice turned back stands on the board.
-    turns, cells = -tags.turns[sure] % 4, np.stack([column, row], axis=-1)[sure]
-    columns, rows = lattice.size
-    turned = np.array([grid_turned(cells, (columns - 1, rows - 1), k) for k in range(4)])[turns, np.arange(len(sure))]
-    shift = board.corner_of(tags.number[sure]) - turned
-    places, votes = np.unique(np.column_stack([turns, shift]), axis=0, return_counts=True)
-    most = int(votes.argmax())
+    votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.corner_of(tags.number[sure]))
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
-    turn, shift_most = int(places[most, 0]), places[most, 1:]
-    every = grid_turned(np.stack([column, row], axis=-1), (columns - 1, rows - 1), turn) + shift_most
+    columns, rows = lattice.size
+    every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
     own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
-    if votes[most] * bits < MIN_BITS or votes[most] < AGREEING_TAGS * np.count_nonzero(own):
+    if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
         return None
-    return int(votes[most]), turn, shift_most
+    return votes, turn, shift
+
+
+def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
+    """Return the dark or the bright squares of a lattice: corners (N, 4, 2) in order of growing angle from u to v, and
+    the (column, row) of their first corners (N, 2)."""
+    corners = lattice.pixels
+    quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
+    # Brightness falls with the angle across the edge from a dark square's first corner along the row.
+    wanted = np.isfinite(quads).all(axis=(2, 3)) & ((lattice.signs()[:-1, :-1] < 0.0) == dark)
+    row, column = np.nonzero(wanted)
+    return quads[row, column], np.stack([column, row], axis=-1)
+
+
+def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntArray) -> tuple[int, int, IntArray]:
+    """Return how many tags agree most, and on which quarter turns and shift (2,) from a lattice to the board's grid.
+
+    The tags lie in the squares `cells` (N, 2) of the lattice, turned by `turns` (N,) quarter turns against it, and in
+    those `places` (N, 2) of the board.
+    """
+    columns, rows = lattice.size
+    # A tag that stands upright in the lattice turned back stands on the board.
+    back = -turns % 4
+    turned = np.array([grid_turned(cells, (columns - 1, rows - 1), k) for k in range(4)])[back, np.arange(len(cells))]
+    seats, votes = np.unique(np.column_stack([back, places - turned]), axis=0, return_counts=True)
+    most = int(votes.argmax())
+    return int(votes[most]), int(seats[most, 0]), seats[most, 1:]

@@ -1,8 +1,8 @@
-"""ChArUco boards: the corners of our own detector, with their places in the board from OpenCV's markers.
+"""ChArUco boards: the corners of our own detector, with their places in the board from its markers.
 
-OpenCV reads the markers and says roughly where which corner is. Those corners name the lattices found in the image
-(turn and shift by vote, so that a misread marker does nothing), fill in what a lattice has missed, and stand in for it
-where none was found. Where the corners are exactly, the edge model says, as for any board.
+The markers in the squares of a lattice say where in the board it lies (turn and shift by vote, so that a misread marker
+does nothing). Where they do not, OpenCV finds markers by their outlines: the corners beside them name lattices, fill in
+what these have missed, and stand in for them. Where the corners are exactly, the edge model says, as for any board.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import homographies, transferred
+from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
 
@@ -72,24 +73,53 @@ def _charuco_boards(
     eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
     out = []
     for board in boards:
-        grid, pixels = max((_marked_corners(picture, board) for picture in eight_bit), key=lambda seen: len(seen[0]))
-        if not len(grid):
+        whole, left = _by_squares(image, rest, board)
+        if not whole.count:
+            whole, left = _by_outlines(eight_bit, rest, board)
+        if not whole.count:
             continue
-        whole = _empty(board)
-        left = []
-        for item in rest:
-            placed = _placed(item.lattice, grid, pixels, board)
-            if placed is None:
-                left.append(item)
-            else:
-                whole = _united(whole, placed)
-        whole = _united(whole, _of(board, grid, pixels))
         (refined,) = refine(image, [whole])
         refined = _beside_markers(image, refined, board)
         if refined.lattice.count >= search.min_corners:
             out.append(_detection(refined, board))
             rest = left
     return out, rest
+
+
+def _by_squares(
+    image: GreyImage, lattices: Sequence[RefinedLattice], board: Board
+) -> tuple[Lattice, list[RefinedLattice]]:
+    """Return the corners of a board that the markers in squares of lattices name, and the lattices that have none."""
+    whole, left = _empty(board), []
+    for item in sorted(lattices, key=lambda item: -item.lattice.count):
+        place = place_by_markers(image, item.lattice, board)
+        part = _empty(board) if place is None else _onto(item.lattice.turned(place[0]), place[1], board)
+        # Two parts of one board share no place: what lies where another does is a board alike.
+        if not part.count or (part.known & whole.known).any():
+            left.append(item)
+        else:
+            whole = _united(whole, part)
+    if not whole.count:
+        return whole, left
+    pixels = beside_markers(image, whole.pixels, board)
+    seeds = np.where(np.isfinite(pixels[..., 0]), SEED_CONTRAST, np.nan)
+    return _united(whole, Lattice(pixels, seeds, whole.rising)), left
+
+
+def _by_outlines(
+    pictures: Sequence[np.ndarray], lattices: Sequence[RefinedLattice], board: Board
+) -> tuple[Lattice, list[RefinedLattice]]:
+    """Return the corners of a board beside markers whose outlines are seen, those of lattices that have them first,
+    and the lattices that have none."""
+    whole, left = _empty(board), []
+    grid, pixels = max((_marked_corners(picture, board) for picture in pictures), key=lambda seen: len(seen[0]))
+    for item in lattices:
+        placed = _placed(item.lattice, grid, pixels, board) if len(grid) else None
+        if placed is None:
+            left.append(item)
+        else:
+            whole = _united(whole, placed)
+    return _united(whole, _of(board, grid, pixels)), left
 
 
 def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArray]:

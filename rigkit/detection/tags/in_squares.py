@@ -1,0 +1,104 @@
+"""Where a lattice lies in a ChArUco board, by the markers in its squares.
+
+The lattice says where the squares are, so that no marker's outline need be found: what blur, faint light or few pixels
+leave of a code is compared with those of the board.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.boards import Board
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.local_fit import foretold
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
+from rigkit.detection.tags.placing import squares_of, voted_place
+
+MIN_MARKERS, AGREEING_MARKERS = 3, 0.7
+"""Markers, and which part of those read, that give a lattice the same place: of a board of the other pattern, or with
+other columns, the markers of every second row do."""
+
+MAX_FORETOLD_GAIN = 8.0
+"""Corners beyond those known are foretold up to this standard deviation, for corners of standard deviation 1."""
+
+MARKERS_BESIDE = 2
+"""Markers that touch a corner within the board."""
+
+MAX_MARKER_ROUNDS = 40
+"""Rounds in which squares beside known ones are read: more than any board has rows or columns."""
+
+
+def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
+    """Return quarter turns and the shift (2,) that take a lattice to the grid of a ChArUco board; None where its
+    markers do not say it with one voice."""
+    squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
+    if len(squares) < MIN_MARKERS:
+        return None
+    tags = _read(image, squares, board)
+    sure = np.flatnonzero(tags.read)
+    if len(sure) < MIN_MARKERS:
+        return None
+    at = _places(board)[tags.number[sure] - _pattern(board).first_marker] - 1
+    votes, turns, shift = voted_place(lattice, cells[sure], tags.turns[sure], at)
+    return (turns, shift) if votes >= max(MIN_MARKERS, AGREEING_MARKERS * len(sure)) else None
+
+
+def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
+    """Return rough corners (R, C, 2) of a ChArUco board, NaN where unknown, with those between two markers that are
+    read where the known corners foretell them: what covers a corner covers one of the two."""
+    places = _places(board)
+    # The squares of the outermost markers end where the board does.
+    grown = np.pad(pixels, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
+    rows, columns = places[:, 1, None] + np.array([0, 0, 1, 1]), places[:, 0, None] + np.array([0, 1, 1, 0])
+    read = np.zeros(len(places), np.bool_)
+    for _ in range(MAX_MARKER_ROUNDS):
+        missing = np.isnan(grown[..., 0])
+        beside = np.flatnonzero((~missing)[rows, columns].any(axis=1) & ~read)
+        wanted = np.zeros_like(missing)
+        wanted[rows[beside], columns[beside]] = True
+        wanted &= missing
+        guess, ahead = grown.copy(), foretold(grown, wanted)
+        guess[wanted] = np.where(ahead.gain[:, None] < MAX_FORETOLD_GAIN, ahead.pixels, np.nan)
+        quads = guess[rows[beside], columns[beside]]
+        usable = np.isfinite(quads).all(axis=(1, 2))
+        beside, quads = beside[usable], quads[usable]
+        tags = _read(image, quads, board)
+        own = beside[
+            (tags.likeness >= MIN_MARKER_LIKENESS)
+            & (tags.number == _pattern(board).first_marker + beside)
+            & (tags.turns == 0)
+        ]
+        if not len(own):
+            break
+        read[own] = True
+        grown[rows[own], columns[own]] = guess[rows[own], columns[own]]
+    markers = np.zeros(grown.shape[:2], np.int64)
+    np.add.at(markers, (rows[read], columns[read]), 1)
+    grown[(markers < MARKERS_BESIDE) & np.isnan(np.pad(pixels[..., 0], 1, constant_values=np.nan))] = np.nan
+    return grown[1:-1, 1:-1]
+
+
+def _pattern(board: Board) -> Charuco:
+    pattern = board.pattern
+    assert isinstance(pattern, Charuco)
+    return pattern
+
+
+def _places(board: Board) -> IntArray:
+    return _pattern(board).places(*board.size)
+
+
+def _read(image: GreyImage, squares: FloatArray, board: Board) -> TagCode:
+    """Return the codes in the squares (N, 4, 2) of a board."""
+    pattern = _pattern(board)
+    numbers = pattern.first_marker + np.arange(len(_places(board)))
+    codes = Codes.of(AprilGrid(1.0, pattern.dictionary, 1, numbering="opencv"), numbers)
+    margin = 0.5 * (1.0 - pattern.marker_mm / np.array(board.squares_mm))
+    unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    quads = transferred(homographies(squares), margin + unit * (1.0 - 2.0 * margin))
+    return read_tags(255 - image if pattern.inverted else image, quads, codes)
