@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +13,9 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.tags.codes import Codes, read_tags
+from rigkit.detection.tags.codes import MIN_LIKENESS, Codes, read_tags
+from rigkit.detection.tags.in_squares import marker_codes
+from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.quads import quadrilaterals
 
 ALIKE_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
@@ -44,20 +45,14 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
     """Return the corners (N, 4, 2) of the marks of a board that are seen, and their numbers (N,)."""
     pattern = board.pattern
     if isinstance(pattern, AprilGrid):
-        quads = quadrilaterals(grey)
-        tags = read_tags(grey, quads, Codes.of(pattern, pattern.numbers(*board.size).ravel()))
-        return quads[tags.read], tags.number[tags.read]
-    assert isinstance(pattern, Charuco)
-    eight_bit = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, pattern.dictionary))
-    seen, numbers, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(
-        255 - eight_bit if pattern.inverted else eight_bit
-    )
-    if numbers is None:
-        return np.zeros((0, 4, 2)), np.zeros(0, np.int64)
-    number = np.asarray(numbers, np.int64).ravel() - pattern.first_marker
-    own = (number >= 0) & (number < len(pattern.places(*board.size)))
-    return np.array(seen, np.float64).reshape(-1, 4, 2)[own], number[own]
+        codes, least = Codes.of(pattern, pattern.numbers(*board.size).ravel()), MIN_LIKENESS
+    else:
+        codes, least = marker_codes(board), MIN_MARKER_LIKENESS
+        grey = 255 - grey if isinstance(pattern, Charuco) and pattern.inverted else grey
+    quads = quadrilaterals(grey)
+    tags = read_tags(grey, quads, codes)
+    seen = tags.likeness >= least
+    return quads[seen], tags.number[seen]
 
 
 def _twins(quads: FloatArray, numbers: IntArray) -> int:

@@ -380,8 +380,7 @@ EXPORT void surest_polynomial(
 EXPORT void read_modules(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
     ARRAY(const double, maps, count, 3, 3), int64_t count, int64_t side,
-    ARRAY(const double, patterns, patterns_count, side * side), int64_t patterns_count, ARRAY(double, bright, side * side),
-    ARRAY(double, spread, count), ARRAY(double, likeness, count, patterns_count));
+    ARRAY(double, bright, count, side * side), ARRAY(double, spread, count));
 
 /* tags.c */
 

@@ -309,10 +309,10 @@ INLINE double grey_at(const void *grey, int64_t bytes, int64_t width, int64_t he
 
 FOR_EACH_PROCESSOR void read_modules(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double *maps, int64_t count, int64_t side,
-    const double *patterns, int64_t patterns_count, double *bright, double *spread, double *likeness)
+    double *bright, double *spread)
 {
     const int64_t modules = side * side;
-    for (int64_t n = 0; n < count; n++) {
+    for (int64_t n = 0; n < count; n++, bright += modules) {
         const double *h = maps + 9 * n;
         double mean = 0.0, square = 0.0;
         for (int64_t k = 0; k < modules; k++) {
@@ -328,13 +328,7 @@ FOR_EACH_PROCESSOR void read_modules(
         }
         spread[n] = sqrt(square / (double)modules);
         const double scale = square > 1e-18 ? 1.0 / sqrt(square) : 0.0;
-        for (int64_t p = 0; p < patterns_count; p++) {
-            const double *pattern = patterns + p * modules;
-            double sum = 0.0;
-#pragma omp simd reduction(+ : sum)
-            for (int64_t k = 0; k < modules; k++)
-                sum += bright[k] * pattern[k];
-            likeness[n * patterns_count + p] = sum * scale;
-        }
+        for (int64_t k = 0; k < modules; k++)
+            bright[k] *= scale;
     }
 }

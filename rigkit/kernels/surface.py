@@ -98,19 +98,19 @@ class Polynomials:
 
 
 def read_modules(
-    image: NDArray[np.uint8] | NDArray[np.float32], maps: FloatArray, patterns: FloatArray, side: int
+    image: NDArray[np.uint8] | NDArray[np.float32], maps: FloatArray, side: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the correlation of N tags with the P `patterns` (P, side * side), (N, P), and the standard deviation of
-    their modules' brightness, (N,).
+    """Return the brightness of the modules of N tags, of mean 0 and length 1, (N, side * side), and its standard
+    deviation before, (N,).
 
     `maps` (N, 3, 3) take the unit square to each tag; brightness is bilinear at the middles of `side` x `side` modules,
-    that of the border beyond it. Patterns have mean 0 and length 1.
+    that of the border beyond it.
     """
     grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
-    spread, likeness = np.empty(len(maps)), np.empty((len(maps), len(patterns)))
+    spread, bright = np.empty(len(maps)), np.empty((len(maps), side * side))
     height, width = grey.shape
     kernels().read_modules(
         *(grey, grey.dtype == np.uint8, width, height, np.ascontiguousarray(maps, np.float64), len(maps), side),
-        *(np.ascontiguousarray(patterns, np.float64), len(patterns), np.empty(side * side), spread, likeness),
+        *(bright, spread),
     )
-    return likeness, spread
+    return bright, spread

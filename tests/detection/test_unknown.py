@@ -138,9 +138,7 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
 def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyPatch) -> None:
     def repeated(_: GreyImage, quads: np.ndarray, codes: Codes) -> TagCode:
         count = len(quads)
-        return TagCode(
-            codes.numbers[4 * (np.arange(count) % 3)], np.zeros(count, np.int64), np.ones(count), np.ones(count)
-        )
+        return TagCode(codes.numbers[4 * (np.arange(count) % 3)], np.zeros(count, np.int64), np.ones(count))
 
     monkeypatch.setattr(unknown_tags, "read_tags", repeated)
     monkeypatch.setattr(TagSightings, "look_alone", lambda *_: False)

@@ -68,13 +68,11 @@ class TagCode:
     number : (N,) tag that it is most like.
     turns : (N,) quarter turns by which the tag is turned against the quadrilateral's first corner.
     likeness : (N,) correlation, 0 where there is nothing to read.
-    margin : (N,) by which that of the next best tag is less.
     """
 
     number: IntArray
     turns: IntArray
     likeness: FloatArray
-    margin: FloatArray
 
     @property
     def read(self) -> BoolArray:
@@ -84,14 +82,12 @@ class TagCode:
 def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
     """Return the codes in the quadrilaterals (N, 4, 2), corners in order of growing angle from u to v."""
     if not len(quads):
-        return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
-    likeness, spread = read_modules(image, homographies(quads), codes.patterns, codes.modules)
-    likeness[spread < MIN_CODE_CONTRAST] = 0.0
+        return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    bright, spread = read_modules(image, homographies(quads), codes.modules)
+    likeness = bright @ codes.patterns.T
     best = likeness.argmax(axis=1)
-    own = codes.numbers[best]
-    others = np.where(codes.numbers == own[:, None], -1.0, likeness).max(axis=1)
-    most = likeness[np.arange(len(quads)), best]
-    return TagCode(own, codes.turns[best], most, most - others)
+    most = np.where(spread < MIN_CODE_CONTRAST, 0.0, likeness[np.arange(len(quads)), best])
+    return TagCode(codes.numbers[best], codes.turns[best], most)
 
 
 def homographies(quads: FloatArray) -> FloatArray:

@@ -93,12 +93,17 @@ def _places(board: Board) -> IntArray:
     return _pattern(board).places(*board.size)
 
 
+def marker_codes(board: Board) -> Codes:
+    """Return the codes of the markers of a ChArUco board."""
+    pattern = _pattern(board)
+    numbers = pattern.first_marker + np.arange(len(_places(board)))
+    return Codes.of(AprilGrid(1.0, pattern.dictionary, 1, numbering="opencv"), numbers)
+
+
 def _read(image: GreyImage, squares: FloatArray, board: Board) -> TagCode:
     """Return the codes in the squares (N, 4, 2) of a board."""
     pattern = _pattern(board)
-    numbers = pattern.first_marker + np.arange(len(_places(board)))
-    codes = Codes.of(AprilGrid(1.0, pattern.dictionary, 1, numbering="opencv"), numbers)
     margin = 0.5 * (1.0 - pattern.marker_mm / np.array(board.squares_mm))
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     quads = transferred(homographies(squares), margin + unit * (1.0 - 2.0 * margin))
-    return read_tags(255 - image if pattern.inverted else image, quads, codes)
+    return read_tags(255 - image if pattern.inverted else image, quads, marker_codes(board))

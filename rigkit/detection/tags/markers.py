@@ -11,9 +11,10 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.aruco import marker_count
-from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, Codes, homographies, transferred
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, Codes, homographies
 from rigkit.detection.tags.quads import quadrilaterals
+from rigkit.kernels.surface import read_modules
 
 MIN_DARK_BORDER = 0.65
 """Of the modules of a marker's border, this part at least is darker than the middle between its darkest and its
@@ -63,16 +64,13 @@ def _framed(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray,
     mean 0 and length 1."""
     if not len(quads):
         return quads, np.zeros((0, side * side))
-    middles = (np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2) + 0.5) / side
-    points = transferred(homographies(quads), middles)
-    bright = np.asarray(sample(image, points.reshape(-1, 2)), np.float64).reshape(len(quads), -1)
+    bright, spread = read_modules(image, homographies(quads), side)
     edge = np.ones((side, side), np.bool_)
     edge[1:-1, 1:-1] = False
     middle = 0.5 * (bright.min(axis=1) + bright.max(axis=1))
     dark = (bright[:, edge.ravel()] < middle[:, None]).mean(axis=1)
-    good = (dark >= MIN_DARK_BORDER) & (bright.std(axis=1) >= MIN_CODE_CONTRAST)
-    bright = bright[good] - bright[good].mean(axis=1, keepdims=True)
-    return quads[good], bright / np.linalg.norm(bright, axis=1, keepdims=True)
+    good = (dark >= MIN_DARK_BORDER) & (spread >= MIN_CODE_CONTRAST)
+    return quads[good], bright[good]
 
 
 def _of_kind(quads: FloatArray, bright: FloatArray, codes: Codes) -> ReadMarkers:

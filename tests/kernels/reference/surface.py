@@ -80,11 +80,11 @@ def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)
     return out
 
 
-def read_modules(image: GreyImage, maps: FloatArray, patterns: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
-    """Return correlations (N, P) and standard deviations (N,) of the modules' brightness."""
+def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
+    """Return the modules' brightness of mean 0 and length 1 (N, side * side), and its standard deviation (N,)."""
     middle = (np.arange(side) + 0.5) / side
     places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
     bright = sample(image, transferred(maps, places)).astype(np.float64)
     bright -= bright.mean(axis=1, keepdims=True)
     length = np.linalg.norm(bright, axis=1, keepdims=True)
-    return (bright / np.maximum(length, 1e-9)) @ patterns.T, length[:, 0] / side
+    return bright / np.maximum(length, 1e-9), length[:, 0] / side
