@@ -17,7 +17,8 @@ import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import match_affine_features
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, RayJacobians, Rays
 from rigkit.core.errors import DegenerateError
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import skew
@@ -135,13 +136,23 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
     """Return the Sampson distances (M,) px of the matches that the cameras see, their derivatives (M, T), and which of
     N these are."""
     reach = REACH_SIGMAS * np.sqrt(np.diag(watched.covariance))
-    residual = _distances(watched, pair)
+    views = ((pair.first, pair.pixels1), (pair.second, pair.pixels2))
+    usual = [_Seen.by(watched.cameras[c], pixels) for c, pixels in views]
+    residual = _distances(watched, pair, usual)
     jacobian = np.zeros((len(residual), watched.size))
     for k in np.flatnonzero(reach > 0.0).tolist():
         step = np.zeros(watched.size)
         step[k] = reach[k]
-        ahead, behind = _distances(watched.changed(step), pair), _distances(watched.changed(-step), pair)
-        jacobian[:, k] = (ahead - behind) / (2.0 * reach[k])
+        moved = [c for c, _ in views if watched.lens(c).start <= k < watched.lens(c).stop]
+        ends = []
+        for changed in (watched.changed(step), watched.changed(-step)):
+            # Of a lens that stays, rays stay.
+            seen = [
+                _Seen.by(changed.cameras[c], pixels) if c in moved else same
+                for (c, pixels), same in zip(views, usual, strict=True)
+            ]
+            ends.append(_distances(changed, pair, seen))
+        jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * reach[k])
     good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
     return residual[good], jacobian[good], np.asarray(good)
 
@@ -183,19 +194,27 @@ def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
     return np.asarray(np.exp(-((left / (WELSCH_SIGMAS * max(sigma_px, MIN_SIGMA_PX))) ** 2)))
 
 
-def _distances(watched: Watched, pair: PairMatches) -> FloatArray:
-    first, second = (watched.cameras[c] for c in (pair.first, pair.second))
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """Rays (N, 3) of a camera's pixels, their derivatives (N, 3, 2) by the pixels, and where there are any (N,)."""
+
+    rays: Rays
+    jacobians: RayJacobians
+    valid: BoolArray
+
+    @classmethod
+    def by(cls, camera: Camera, pixels: Pixels) -> _Seen:
+        rays, valid = camera.unproject(pixels)
+        return cls(rays, camera.ray_jacobian(pixels), valid)
+
+
+def _distances(watched: Watched, pair: PairMatches, seen: Sequence[_Seen]) -> FloatArray:
+    """Return the Sampson distances (N,) px of a pair's matches, NaN where a camera does not see them."""
     motion = watched.cam_from_rig[pair.second] @ watched.cam_from_rig[pair.first].inverse()
-    rays1, seen1 = first.unproject(pair.pixels1)
-    rays2, seen2 = second.unproject(pair.pixels2)
-    found = sampson_distances(
-        skew(motion.translation_mm) @ motion.rotation,
-        rays1,
-        rays2,
-        first.ray_jacobian(pair.pixels1),
-        second.ray_jacobian(pair.pixels2),
-    )
-    return np.where(seen1 & seen2, found, np.nan)
+    essential = skew(motion.translation_mm) @ motion.rotation
+    first, second = seen
+    found = sampson_distances(essential, first.rays, second.rays, first.jacobians, second.jacobians)
+    return np.where(first.valid & second.valid, found, np.nan)
 
 
 def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:
