@@ -83,6 +83,7 @@ class Lab:
     board: Board
     words: str
     planes: tuple[str, ...]
+    placed: tuple[PlacedBoard, ...]
 
     @property
     def target(self) -> str:
@@ -150,6 +151,13 @@ def corner_of_a_room(walls: Sequence[Board], rng: np.random.Generator) -> Stereo
     raise AssertionError("no pair shows all boards from near enough to their fronts")
 
 
+def shoot(root: Path, placed: Sequence[PlacedBoard], side: str, camera: Camera, pose: Rigid3) -> None:
+    """Write one image of every board, the last of them into a folder of their own."""
+    rng = np.random.default_rng(7 if side == "left" else 8)
+    for n, one in enumerate(placed):
+        write((root if n < VIEWS else root / "fresh") / f"{side}/{n:02d}.png", shot([one], camera, pose, rng))
+
+
 @pytest.fixture(scope="module", params=sorted(KINDS))
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Lab:
     kind = str(request.param)
@@ -157,25 +165,33 @@ def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     words, planes = KINDS[kind]
     board = replace(board_of_words(words), board_id="target")
     (root / "target.toml").write_text(board_text(board, "as designed", root / "target.toml"))
-    lines = ["image,x_mm,y_mm,z_mm,qx,qy,qz,qw"]
-    for n, placed in enumerate(placed_before_both(board, VIEWS + FRESH, rng)):
-        folder = root if n < VIEWS else root / "fresh"
-        write(folder / f"left/{n:02d}.png", shot([placed], LEFT, Rigid3.identity(), rng))
-        write(folder / f"right/{n:02d}.png", shot([placed], RIGHT, RIGHT_FROM_LEFT, rng))
-        if n < VIEWS:
-            lines.append(robot_line(f"{n:02d}.png", placed.world_from_board))
-    (root / "poses.csv").write_text("\n".join(lines) + "\n")
-    walls = [replace(board_of_words(text), board_id=f"plane{n}") for n, text in enumerate(planes, start=1)]
-    # Of its own numbers, so that the same room is looked at whatever the number of views above.
+    placed = placed_before_both(board, VIEWS + FRESH, rng)
+    shoot(root, placed, "left", LEFT, Rigid3.identity())
+    lines = [robot_line(f"{n:02d}.png", one.world_from_board) for n, one in enumerate(placed[:VIEWS])]
+    (root / "poses.csv").write_text("\n".join(["image,x_mm,y_mm,z_mm,qx,qy,qz,qw", *lines]) + "\n")
+    told = ["--board", str(root / "target.toml"), "--model", "pinhole", "-o", str(root / "calibration.json")]
+    assert main(["calibrate", str(root / "left"), *told]) == 0
+    return Lab(kind, root, board, words, planes, tuple(placed))
+
+
+@pytest.fixture(scope="module")
+def right(lab: Lab) -> str:
+    """The folder of the other camera's images, rendered where a test asks for them."""
+    shoot(lab.root, lab.placed, "right", RIGHT, RIGHT_FROM_LEFT)
+    return lab.path("right")
+
+
+@pytest.fixture(scope="module")
+def room(lab: Lab) -> tuple[Board, ...]:
+    """Three boards in the corner of a room: as a pair for a manifest, and as two images of one mount."""
+    walls = [replace(board_of_words(text), board_id=f"plane{n}") for n, text in enumerate(lab.planes, start=1)]
     rng = np.random.default_rng(6)
     for side, image in enumerate(
         corner_of_a_room(walls, rng).images(optics=OPTICS, photometry=PHOTOMETRY, rng=rng), start=1
     ):
-        write(root / f"set/pair/view{side}.png", image)
-        write(root / f"mount/{side}.png", image)
-    told = ["--board", str(root / "target.toml"), "--model", "pinhole", "-o", str(root / "calibration.json")]
-    assert main(["calibrate", str(root / "left"), *told]) == 0
-    return Lab(kind, root, board, words, planes)
+        write(lab.root / f"set/pair/view{side}.png", image)
+        write(lab.root / f"mount/{side}.png", image)
+    return tuple(walls)
 
 
 def test_it_is_printed(lab: Lab) -> None:
@@ -210,9 +226,9 @@ def calibration(lab: Lab) -> str:
     return lab.path("calibration.json")
 
 
-def test_rig_and_its_check_and_certificate(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rig_and_its_check_and_certificate(lab: Lab, right: str, capsys: pytest.CaptureFixture[str]) -> None:
     rig = lab.path("rig.json")
-    both = [lab.path("left"), lab.path("right")]
+    both = [lab.path("left"), right]
     assert main(["calibrate", *both, "--board", lab.target, "--model", "pinhole", "-o", rig, "--force"]) == 0
     saved = load_saved_rig(rig)
     (board,) = saved.boards
@@ -248,6 +264,7 @@ def test_pose_and_hand(lab: Lab, calibration: str, capsys: pytest.CaptureFixture
     assert np.linalg.norm(moved) < HAND_MM
 
 
+@pytest.mark.usefixtures("room")
 def test_pairs_from_a_folder_to_the_tables(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
     root = Path(lab.path("set"))
     boards = [item for words in lab.planes for item in ("--board", words)]
@@ -265,12 +282,12 @@ def test_pairs_from_a_folder_to_the_tables(lab: Lab, calibration: str, capsys: p
     assert "all checks passed" in capsys.readouterr().out
 
 
-def test_boards_on_one_mount(lab: Lab) -> None:
+def test_boards_on_one_mount(lab: Lab, room: tuple[Board, ...]) -> None:
     session = Path(lab.path("mount/session.toml"))
-    names = [f"plane{n}" for n in (1, 2, 3)]
-    for name, words in zip(names, lab.planes, strict=True):
-        path = session.with_name(f"{name}.toml")
-        path.write_text(board_text(replace(board_of_words(words), board_id=name), "as designed", path))
+    names = [wall.board_id for wall in room]
+    for wall in room:
+        path = session.with_name(f"{wall.board_id}.toml")
+        path.write_text(board_text(wall, "as designed", path))
     listed = ", ".join(f'"{name}.toml"' for name in names)
     mounted = ", ".join(f'"{name}"' for name in names)
     session.write_text(
@@ -281,9 +298,7 @@ def test_boards_on_one_mount(lab: Lab) -> None:
     (path,) = Path(lab.path("mount")).glob("rig*boards*.json")
     (mount,) = load_board_rigs(path)
     assert mount.image_count == 2
-    assert [placed.board.pattern.type for placed in mount.boards] == [
-        board_of_words(w).pattern.type for w in lab.planes
-    ]
+    assert [placed.board.pattern.type for placed in mount.boards] == [wall.pattern.type for wall in room]
     assert abs(mount.angle_deg("plane1", "plane2")[0] - 90.0) < ANGLE_DEG
 
 

@@ -92,7 +92,7 @@ def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytes
 def test_a_board_in_a_room_with_tiles(pattern: Pattern) -> None:
     """Of the tiles every image shows another, larger part: no grid of one size is seen often, but the board's is."""
     board = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
-    camera = Pinhole((1400, 600), np.array([800.0, 800.0, 699.5, 299.5]))
+    camera = Pinhole((700, 300), np.array([400.0, 400.0, 349.5, 149.5]))
     images = []
     for k, size in enumerate(((9, 8), (10, 9), (11, 8))):
         tiles = PlacedBoard(Board("tiles", *size, 50.0, 50.0), Rigid3(np.eye(3), [80.0, -200.0, 800.0 + k]))

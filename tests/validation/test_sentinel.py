@@ -293,16 +293,16 @@ def _matches(pose: Rigid3, rng: np.random.Generator, noise_px: float = MATCH_NOI
 
 
 def test_a_scene_tells_of_a_mount_without_any_board() -> None:
-    quiet, named = 0, 0
+    quiet, named, draws = 0, 0, 2
     turn = np.radians([0.05, 0.0, 0.0])
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
-    for seed in range(3):
+    for seed in range(draws):
         rng = np.random.default_rng(seed)
         quiet += check_matches(_rig(), [_matches(MOUNT, rng)]).holds
         alarmed = check_matches(_rig(), [_matches(moved, rng)])
         assert not alarmed.holds
         named += alarmed.change is not None and alarmed.change.cause.kind == "rotation"
-    assert quiet == named == 3
+    assert quiet == named == draws
     with pytest.raises(DegenerateError, match="texture"):
         check_matches(_rig(), [])
     # All in one corner of the image; and none that a lens sees.
@@ -342,7 +342,7 @@ def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
     """A mount known to 0.06 degrees only: matches are off by many times their scatter, as the calibration says."""
     sigmas = np.array([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-3] * 3, *[0.01] * 3])
     unsure = replace(_rig(), covariance=np.diag(sigmas**2))
-    for seed in range(9):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         turn = 1e-3 * rng.standard_normal(3)
         moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
@@ -367,7 +367,7 @@ def test_wrong_matches_that_lie_alone_do_not_rename_a_change(axis: int) -> None:
     # A lens can bend to a few matches where there are no others: off by little, as those of tiles are by a period.
     turn = np.radians(0.05) * np.eye(3)[axis]
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         whole = _matches(moved, rng, FINE_MATCH_NOISE_PX / 4.0)
         alone = whole.pixels1[:, 0] < 400.0
