@@ -6,7 +6,7 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
     11  workflows        what a verb does: typed options in, typed results out, no printing
     10  report | coach   figures, pages, tables in Markdown, CSV and LaTeX | a guided capture on a local page
      9  io               manifests, sessions, calibration and corner files, PLY, images
-     8  validation | study | benchmark   against what was measured | synthetic studies | what measures detection
+     8  validation | study   against what was measured | synthetic studies
      7  reconstruction | planning        from detections, or correspondences, to a cloud | which picture to take next
      6  detection | identification   from an image to grids of corners | which board is which
      5  affine | relative_pose | calibration | synthetic | interop     estimators, truth to test them, foreign formats

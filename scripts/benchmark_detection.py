@@ -29,12 +29,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from detectors.peers import DETECTORS, INSTALL, PEERS, Answer, Worker
-
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.corner_bound import corner_information, position_bound
-from rigkit.benchmark.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
-from rigkit.benchmark.scenes import (
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.corner_bound import corner_information, position_bound
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.scenes import (
     BENCH_PHOTOMETRY,
     CONDITIONS,
     LENSES,
@@ -46,7 +44,9 @@ from rigkit.benchmark.scenes import (
     small_board,
     three_boards,
 )
-from rigkit.benchmark.score import FoundBoard, Score, score
+from detection_bench.score import FoundBoard, Score, score
+from detectors.peers import DETECTORS, INSTALL, PEERS, Answer, Worker
+
 from rigkit.core.errors import RigkitError
 from rigkit.detection.detect import detect_boards
 from rigkit.identification.identify import identify_pair

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from detection_bench.circle_bound import circle_information
+from detection_bench.corner_bound import position_bound
+from detection_bench.scenes import LENSES, BenchScene, bench_camera, bench_field_deg, one_board
 
-from rigkit.benchmark.circle_bound import circle_information
-from rigkit.benchmark.corner_bound import position_bound
-from rigkit.benchmark.scenes import LENSES, BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles

@@ -24,10 +24,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
+from detection_bench.corner_bound import position_bound
+from detection_bench.scenes import LENSES, one_board
+from detection_bench.tag_bound import tag_information
 
-from rigkit.benchmark.corner_bound import position_bound
-from rigkit.benchmark.scenes import LENSES, one_board
-from rigkit.benchmark.tag_bound import tag_information
 from rigkit.calibration.hand_eye import hand_eye
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView

@@ -33,12 +33,12 @@ import zlib
 
 import cv2
 import numpy as np
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.scenes import CONDITIONS, LENSES, one_board
 from detectors.degradations import SAME, Grey, degraded
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.scenes import CONDITIONS, LENSES, one_board
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.evidence import (

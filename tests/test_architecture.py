@@ -24,7 +24,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("affine", "relative_pose", "calibration", "synthetic", "interop"),
     ("detection", "identification"),
     ("reconstruction", "planning"),
-    ("validation", "study", "benchmark"),
+    ("validation", "study"),
     ("io",),
     ("report", "coach"),
     ("workflows",),

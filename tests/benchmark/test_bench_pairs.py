@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-from rigkit.benchmark.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 9, 19])

@@ -5,9 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.scenes import (
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.scenes import (
     CONDITIONS,
     LENSES,
     SCENES,
@@ -20,6 +19,7 @@ from rigkit.benchmark.scenes import (
     small_board,
     three_boards,
 )
+
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 

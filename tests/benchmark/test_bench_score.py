@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from detection_bench.scenes import covered_board, empty, one_board, room
+from detection_bench.score import FoundBoard, Score, score
 
-from rigkit.benchmark.scenes import covered_board, empty, one_board, room
-from rigkit.benchmark.score import FoundBoard, Score, score
 from rigkit.core.boards import Board
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.corner_bound import corner_information, position_bound
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from rigkit.benchmark.corner_bound import corner_information, position_bound
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
 from rigkit.detection.subpixel.edge_fit import ROUNDING_VARIANCE
 from rigkit.geometry.rigid3 import Rigid3

@@ -11,9 +11,9 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from detection_bench.scenes import one_board
 from helpers.data import REPOSITORY
 
-from rigkit.benchmark.scenes import one_board
 from rigkit.core.boards import Board
 
 SCRIPTS = REPOSITORY / "scripts"

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import bench_camera, one_board
 
-from rigkit.benchmark.scenes import bench_camera, one_board
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco

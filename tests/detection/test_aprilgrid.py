@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from detection_bench.corner_bound import position_bound
+from detection_bench.scenes import BenchScene, bench_camera, one_board
+from detection_bench.tag_bound import tag_information
 
-from rigkit.benchmark.corner_bound import position_bound
-from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
-from rigkit.benchmark.tag_bound import tag_information
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.scenes import CONDITIONS, one_board, three_boards
+from detection_bench.score import FoundBoard, Score, score
 from helpers.detection_scenes import SIZE_PX
 
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.scenes import CONDITIONS, one_board, three_boards
-from rigkit.benchmark.score import FoundBoard, Score, score
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.scenes import one_board
 
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.scenes import one_board
 from rigkit.detection import lattices as lattices_of_images
 from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import detect_boards

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.border import Side, ends_quietly, sides

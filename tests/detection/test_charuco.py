@@ -7,8 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import BenchScene, bench_camera, one_board
 
-from rigkit.benchmark.scenes import BenchScene, bench_camera, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError

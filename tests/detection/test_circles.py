@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.circle_bound import circle_information
+from detection_bench.corner_bound import position_bound
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
 
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.circle_bound import circle_information
-from rigkit.benchmark.corner_bound import position_bound
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError

@@ -10,10 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, small_board
 from kernels.reference import edges as reference
 from scipy.spatial import cKDTree
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, small_board
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.subpixel import edge_fit, subpixel

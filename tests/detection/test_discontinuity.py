@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.scenes import CONDITIONS, three_boards
+from detection_bench.score import FoundBoard, score
 from helpers.detection_scenes import SIZE_PX, Scene, regular
 from scipy.spatial import cKDTree
 
-from rigkit.benchmark.scenes import CONDITIONS, three_boards
-from rigkit.benchmark.score import FoundBoard, score
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers

@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from detection_bench.blanks import blank
+from detection_bench.scenes import one_board
 from helpers.data import shared_data
 
 from rigkit import detect_boards
-from rigkit.benchmark.blanks import blank
-from rigkit.benchmark.scenes import one_board
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed
 from rigkit.detection.doubtful import doubtful_grid

@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import CONDITIONS, one_board
 
-from rigkit.benchmark.scenes import CONDITIONS, one_board
 from rigkit.core.boards import Board
 from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.checks.validate import separate

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, one_board
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection

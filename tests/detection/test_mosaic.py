@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from detection_bench.blanks import BLANKS, blank
+from detection_bench.scenes import one_board
 
 from rigkit import detect_boards
-from rigkit.benchmark.blanks import BLANKS, blank
-from rigkit.benchmark.scenes import one_board
 from rigkit.detection.saddles.mosaic import without_mosaic
 
 RED_GREEN_BLUE = np.array([[0.45, 1.0], [1.0, 0.6]])

@@ -7,12 +7,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from detection_bench.corner_bound import corner_information, position_bound
+from detection_bench.scenes import BENCH_PHOTOMETRY, three_boards
+from detection_bench.score import FoundBoard, score
 from helpers.data import shared_data
 
 from rigkit import detect_boards
-from rigkit.benchmark.corner_bound import corner_information, position_bound
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, three_boards
-from rigkit.benchmark.score import FoundBoard, score
 from rigkit.core.arrays import FloatArray
 from rigkit.io.images import read_image
 from rigkit.synthetic.photometry import develop

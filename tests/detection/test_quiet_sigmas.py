@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.scenes import BENCH_PHOTOMETRY, three_boards
+from detection_bench.score import FoundBoard, Score, score
 from kernels.reference import edges as reference
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, three_boards
-from rigkit.benchmark.score import FoundBoard, Score, score
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards

@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import one_board
 
-from rigkit.benchmark.scenes import one_board
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid

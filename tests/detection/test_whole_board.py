@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.corner_bound import corner_information, position_bound
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, three_boards
 from scipy.special import ndtr
 
 from rigkit import detect_boards
-from rigkit.benchmark.corner_bound import corner_information, position_bound
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene, one_board, three_boards
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.subpixel.board_window import Surroundings, extended
 from rigkit.detection.subpixel.whole_board import MAX_TILE, fit_whole_board

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.scenes import BENCH_PHOTOMETRY, bench_field_deg
 
-from rigkit.benchmark.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, bench_field_deg
 from rigkit.detection.detect import detect_boards
 from rigkit.identification.identify import identify_pair
 from rigkit.synthetic.render import Optics

@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from detection_bench.scenes import one_board
 
-from rigkit.benchmark.scenes import one_board
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid

@@ -1,6 +1,6 @@
 """Pictures without a chessboard, on which a detector must find nothing and should not lose time: noise, a page of
 dots, text, texture, cloth, codes, patterns that have something of a chessboard, and the things of
-`rigkit.benchmark.things`.
+`detection_bench.things`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.benchmark.things import THINGS
+from detection_bench.things import THINGS
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 

@@ -1,6 +1,6 @@
 """Things of rows and columns that are no chessboards: keys, puzzles, tables, cloth, floors, walls, codes.
 
-Each is drawn on a sheet and seen turned and aslant; `rigkit.benchmark.blanks` puts lens and sensor before it.
+Each is drawn on a sheet and seen turned and aslant; `detection_bench.blanks` puts lens and sensor before it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How well corners of tags can be placed at all: the Cramer-Rao bound, from pixels that show nothing but the corner.
 
-As `rigkit.benchmark.corner_bound`, only that lines are not evenly spaced: pixels count up to half of the way to the
+As `detection_bench.corner_bound`, only that lines are not evenly spaced: pixels count up to half of the way to the
 next corner, within the tag and across the gap, and not where its code, blurred, begins.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.benchmark.corner_bound import PARAMETERS, changing_pictures, derivatives_around
-from rigkit.benchmark.scenes import BenchScene
+from detection_bench.corner_bound import PARAMETERS, changing_pictures, derivatives_around
+from detection_bench.scenes import BenchScene
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid

@@ -1,6 +1,6 @@
 """How well the centres of circles can be placed at all: the Cramer-Rao bound of every circle of a rendered scene.
 
-As `rigkit.benchmark.corner_bound`, from ten unknowns a circle: its position (2), size and slant (3), the blur (1), and
+As `detection_bench.corner_bound`, from ten unknowns a circle: its position (2), size and slant (3), the blur (1), and
 brightness, contrast and the light's gradient (4). Held as known: how the map from the plane to the image bends, which
 takes the centre off the middle of what is seen, that blur and noise are the same over the cell, the noise's level.
 """
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.benchmark.corner_bound import changing_pictures, pixels_around
-from rigkit.benchmark.scenes import BenchScene
+from detection_bench.corner_bound import changing_pictures, pixels_around
+from detection_bench.scenes import BenchScene
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles

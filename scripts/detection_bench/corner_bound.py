@@ -20,7 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.benchmark.scenes import BENCH_PHOTOMETRY, BenchScene
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError

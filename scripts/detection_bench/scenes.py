@@ -2,7 +2,7 @@
 
 Each function draws one scene from `rng`, for a regular or a fisheye lens, at any image size; `BenchScene.render` makes
 its image and `BenchScene.truth` says where every corner is, `BenchScene.clear` which of them a detector must find.
-Pictures without any board are in `rigkit.benchmark.blanks`, pairs of views in `rigkit.benchmark.pairs`.
+Pictures without any board are in `detection_bench.blanks`, pairs of views in `detection_bench.pairs`.
 """
 
 from __future__ import annotations

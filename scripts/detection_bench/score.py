@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rigkit.benchmark.scenes import BenchScene
+from detection_bench.scenes import BenchScene
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.detections import BoardDetection
 

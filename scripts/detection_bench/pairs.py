@@ -12,7 +12,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rigkit.benchmark.scenes import LENSES, bench_camera
+from detection_bench.scenes import LENSES, bench_camera
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
