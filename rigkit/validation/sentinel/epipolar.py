@@ -137,7 +137,7 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
     N these are."""
     reach = REACH_SIGMAS * np.sqrt(np.diag(watched.covariance))
     views = ((pair.first, pair.pixels1), (pair.second, pair.pixels2))
-    usual = [_Seen.by(watched.cameras[c], pixels) for c, pixels in views]
+    usual = [_SeenRays.by(watched.cameras[c], pixels) for c, pixels in views]
     residual = _distances(watched, pair, usual)
     jacobian = np.zeros((len(residual), watched.size))
     for k in np.flatnonzero(reach > 0.0).tolist():
@@ -148,7 +148,7 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
         for changed in (watched.changed(step), watched.changed(-step)):
             # Of a lens that stays, rays stay.
             seen = [
-                _Seen.by(changed.cameras[c], pixels) if c in moved else same
+                _SeenRays.by(changed.cameras[c], pixels) if c in moved else same
                 for (c, pixels), same in zip(views, usual, strict=True)
             ]
             ends.append(_distances(changed, pair, seen))
@@ -195,7 +195,7 @@ def _weights(left: FloatArray, sigma_px: float) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Seen:
+class _SeenRays:
     """Rays (N, 3) of a camera's pixels, their derivatives (N, 3, 2) by the pixels, and where there are any (N,)."""
 
     rays: Rays
@@ -203,12 +203,12 @@ class _Seen:
     valid: BoolArray
 
     @classmethod
-    def by(cls, camera: Camera, pixels: Pixels) -> _Seen:
+    def by(cls, camera: Camera, pixels: Pixels) -> _SeenRays:
         rays, valid = camera.unproject(pixels)
         return cls(rays, camera.ray_jacobian(pixels), valid)
 
 
-def _distances(watched: Watched, pair: PairMatches, seen: Sequence[_Seen]) -> FloatArray:
+def _distances(watched: Watched, pair: PairMatches, seen: Sequence[_SeenRays]) -> FloatArray:
     """Return the Sampson distances (N,) px of a pair's matches, NaN where a camera does not see them."""
     motion = watched.cam_from_rig[pair.second] @ watched.cam_from_rig[pair.first].inverse()
     essential = skew(motion.translation_mm) @ motion.rotation
