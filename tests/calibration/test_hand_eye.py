@@ -23,6 +23,7 @@ from rigkit.io.calibration_file import save_camera
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
+from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
 
 X = Rigid3(exp_so3(np.array([0.3, -1.2, 0.4])), [30.0, -60.0, 90.0])
 Z = Rigid3(exp_so3(np.array([2.0, 0.4, -0.3])), [400.0, 120.0, -15.0])
@@ -132,6 +133,16 @@ def test_a_second_axis_counts_by_how_certain_it_makes_the_place(rng: np.random.G
         sigmas.append(np.linalg.norm(result.sigmas()[1][0]))
     assert MAHALANOBIS[0] < float(np.sqrt(np.mean(np.square(ratios)))) < MAHALANOBIS[1]
     assert 0.2 < np.median(sigmas) < 60.0
+
+
+def test_a_board_that_looks_the_same_turned_is_refused(tmp_path: Path) -> None:
+    """Before any image is looked at: nobody could say which end of it is which."""
+    (tmp_path / "a.png").touch()
+    poses = tmp_path / "poses.csv"
+    poses.write_text("image,x_mm,y_mm,z_mm,qx,qy,qz,qw\na.png,0,0,0,0,0,0,1\n")
+    told = HandEyeOptions(camera=Path("camera.json"), board=Path("circles:9x6x30"))
+    with pytest.raises(InputError, match="looks the same turned"):
+        calibrate_hand_eye(poses, [tmp_path], told)
 
 
 def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -293,6 +293,9 @@ def test_what_is_known_of_cameras_stands_in_their_session(
     # A camera of the rig that has no images is not lost without a word.
     with_known_first(session)
     assert "without images here, top will not be in the new rig" in caplog.text
+    caplog.clear()
+    known.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": [{**cameras[0], "name": "right"}]}))
+    assert list(with_known_first(session).cameras) == ["right", "left"] and not caplog.text
     with pytest.raises(InputError, match="3 lenses for 2 cameras"):
         Known(lenses=(lens, lens, lens)).of_cameras(["left", "right"])
     one = of_one_camera(pictures, tmp_path / "one")

@@ -22,7 +22,8 @@ from rigkit.io.calibration_file import camera_to_json, load_calibration, load_ca
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.export_camera import foreign_files
 
-CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
+CAMERAS = REPOSITORY / "calib" / "cameras"
+CALIBRATION = CAMERAS / "mvca020_fe185" / "calibration.json"
 LAB = REPOSITORY / "datasets" / "lab-a"
 
 REFIT_PX = 0.05
@@ -52,6 +53,11 @@ def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytes
         files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["opencv", "kalibr"])
     assert [path.name for path in files] == ["fish-opencv.yaml", "fish-kalibr.yaml"]
     assert "fish-kalibr.yaml: " in caplog.text
+    caplog.clear()
+    files = foreign_files(
+        load_calibration(CAMERAS / "mvca020_r61" / "calibration.json"), tmp_path / "brown.json", ["opencv", "ros"]
+    )
+    assert len(files) == 2 and not caplog.text
 
 
 def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

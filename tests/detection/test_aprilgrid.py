@@ -101,6 +101,15 @@ def test_tags_with_borders_narrower_than_windows_are_fitted_whole(squares: bool)
     assert 0.8 < np.sqrt((np.concatenate(relative) ** 2).mean()) < 1.3
 
 
+def test_tags_alone_with_narrow_borders_are_completed() -> None:
+    """Corners that no first look finds are foretold by those around them."""
+    board, rng = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=False)), np.random.default_rng(1)
+    scene = one_board(rng, lens="fisheye", board=board)
+    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
+    assert len(found.grid) >= 78
+    assert (np.abs(errors(found, scene.truth()[0])) < 5.0 * found.sigma_px[:, None]).all()
+
+
 def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> None:
     boards = [Board(n, 6, 6, 60.0, 60.0, pattern=AprilGrid(0.3, first_tag=9 * k)) for k, n in enumerate("ab")]
     camera = bench_camera("regular")

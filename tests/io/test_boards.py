@@ -21,6 +21,7 @@ PATTERNS = [
     Charuco("DICT_4X4_100", 20.0, 3, legacy=True, inverted=True),
     AprilGrid(0.25, "tag25h9", 1, 2, "opencv", corner_squares=False),
     Circles("asymmetric", "left", 12.0),
+    Circles(diameter_mm=12.0),
 ]
 
 
