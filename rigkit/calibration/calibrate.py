@@ -225,7 +225,9 @@ def _result(
     moved = moved_lens(found.observations, fit) if how.folds else ()
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
     far, clusters = _determined(result, found.observations, fit), found.observations.clusters()
-    return replace(result, verdicts=judge(result, also, far=far, clusters=clusters, in_force=in_force))
+    solved_for = found.observations, fit
+    verdicts = judge(result, also, far=far, clusters=clusters, in_force=in_force, solved=solved_for)
+    return replace(result, verdicts=verdicts)
 
 
 def _others(tried: Lenses, model: str) -> list[Candidate]:

@@ -9,19 +9,26 @@ changes from image to image is one of them far above the others.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigkit.calibration.assemble import board_shapes
+from rigkit.calibration.fit import Fit
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.solver import solve
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.core.findings import Finding, Severity
+from rigkit.geometry.rigid3 import Rigid3
 
 MIN_TELLING_CORNERS = 20
 """A view with fewer corners says too little of its own after its pose."""
 MIN_TELLING_VIEWS = 6
 MIN_OWN_PART = 1e-6
 """A way to change that the pose, or the ways before, follow but for this part of it is none of its own."""
+MIN_COMMON_PART = 1e-6
+"""Of what is common to all images, a direction that a way to change follows but for this part of its square is open."""
 MIN_VARIANCE_RATIO = 6.0
 """Variance along a way to change over that of the rest."""
 MIN_SHARE_EXPLAINED = 0.5
@@ -38,6 +45,15 @@ MIN_LEAD_OF_GAIN = 0.1
 which of them it was, however many corners there are."""
 
 
+MAX_LEFT_OF_CONTROL = 0.85
+"""A motion over rows leaves no more than this part of the squares that one over columns leaves. Both follow half of
+what any lens or board unlike its model leaves: in real captures held still rows leave 0.89 of it and more."""
+MIN_SHARE_TRIED = 0.2
+"""Where a lens that changes explains this much at first order, it is solved for in every image."""
+LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
+"""A focal length that is off by a hundredth moves poses by more than first order: the second round ends it."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Way:
     """A way in which an image may differ from the others: what is said of it, and what to do."""
@@ -50,6 +66,10 @@ WAYS = {
     "focus": _Way(
         "the focal length differs from image to image",
         "switch autofocus, zoom and focus breathing off (fix the focus with a screw or tape), and retake all",
+    ),
+    "lens": _Way(
+        "the picture is scaled and shifted on the sensor from image to image (focus, zoom or stabilisation)",
+        "switch autofocus, zoom and image stabilisation off, and retake all",
     ),
     "shift": _Way(
         "the picture is shifted on the sensor from image to image",
@@ -69,34 +89,63 @@ WAYS = {
 NO_CHANGE = "columns"
 """No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
 model."""
+OF_LENS = ("focus", "shift", "lens")
+"""The last is both of the others, for a zoom whose centre is not the lens's."""
 MOTION = ("rows", NO_CHANGE)
 MOVED = _Way(
     "boards or the camera moved while the image was read (rolling shutter)",
     WAYS["rows"].remedy,
 )
 """A pose that follows a sheared board leaves nearly the same of a motion over rows as of one over columns. Where rows
-are best, and both explain the images far better than all else, it was a motion, unless a bend of each board is the main
-part, too: a lens or board unlike its model shows as that."""
+are best, and both explain nearly all, far better than all else, it was a motion, unless a bend of each board is the
+main part, too: a lens or board unlike its model shows as that."""
+MIN_SHARE_MOVED = 0.9
+"""What a motion explains then: 0.97 and more where boards in hand move by pixels, 0.85 at most where all stood
+still."""
 
 
-def changing(calibration: Calibration, correlation: float) -> list[Finding]:
-    """Return a finding where one thing differs from image to image that the calibration takes for constant;
-    `correlation` is that of the residuals of neighbouring corners."""
+def changing(
+    calibration: Calibration,
+    correlation: float,
+    solved: tuple[Observations, Fit] | None = None,
+    but: Collection[str] = (),
+) -> list[Finding]:
+    """Return a finding where one thing differs from image to image that the calibration takes for constant.
+
+    Parameters
+    ----------
+    correlation : that of the residuals of neighbouring corners.
+    solved : what was calibrated, where it is known: a lens that changes is then solved for, not only looked for at
+        first order.
+    but : names of ways to change that are not to be told.
+    """
     changes = view_changes(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else {}
     if not changes:
         return []
+    if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
+        changes |= {way: _solved_for(way, calibration, *solved, changes[way]) for way in OF_LENS}
     best = min(changes, key=lambda way: changes[way].criterion)
-    if best in WAYS and _leads(changes, best):
-        way, share = WAYS[best], changes[best].share
-    elif (
-        best == "rows"
-        and all(_leads(changes, way, but=MOTION) for way in MOTION)
-        and changes["bend"].share < MIN_SHARE_EXPLAINED
-    ):
-        way, share = MOVED, changes[best].share
+    if best in OF_LENS and _leads(changes, best, but=OF_LENS):
+        # A zoom about another centre is both; what is nearly as good with one of them is that one.
+        alone = [way for way in OF_LENS[:2] if _leads(changes, way, but=("lens",))]
+        way = WAYS[alone[0] if alone else best]
+    elif best == "rows" and changes["rows"].left <= MAX_LEFT_OF_CONTROL * changes[NO_CHANGE].left:
+        if _leads(changes, best):
+            way = WAYS[best]
+        elif (
+            all(_leads(changes, way, but=MOTION) and changes[way].share >= MIN_SHARE_MOVED for way in MOTION)
+            and changes["bend"].share < MIN_SHARE_EXPLAINED
+        ):
+            way = MOVED
+        else:
+            return []
+    elif best == "bend" and _leads(changes, best):
+        way = WAYS[best]
     else:
         return []
-    message = f"{way.message}: that explains {100.0 * share:.0f} % of the squares of all residuals"
+    if best in but:
+        return []
+    message = f"{way.message}: that explains {100.0 * changes[best].share:.0f} % of the squares of all residuals"
     return [Finding(severity=Severity.LOOK, message=message, remedy=way.remedy)]
 
 
@@ -120,70 +169,170 @@ class ViewChange:
     ----------
     ratio : variance along it over that of the rest; 1 by chance.
     share : of all squares, beyond chance.
+    left : part of all squares that it leaves.
     criterion : its Bayesian information criterion less that of no change.
     """
 
     ratio: float
     share: float
+    left: float
     criterion: float
+
+    @classmethod
+    def of(cls, left: float, freedom: int, directions: int) -> ViewChange:
+        """Return that of a way with so many directions, of residuals with so many degrees of freedom."""
+        rest = left / (freedom - directions)
+        squares = 1.0 - left
+        criterion = freedom * np.log(left) + directions * np.log(freedom)
+        return cls(squares / directions / rest, squares - directions * rest, left, float(criterion))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Evidence:
+    """What the residuals of V views say, as products of rows of `_rows` without the pose.
+
+    Attributes
+    ----------
+    views : which of the calibration's.
+    own, length : products (V, K, K), and the lengths (V, K) of the rows with it.
+    along : (V, K) products with the residuals, what is common to all images followed.
+    gram, scale : products (C, C) of what is common, to a unit diagonal by the scales (C,).
+    total, freedom : sum of squares of the residuals, and its degrees of freedom.
+    """
+
+    views: list[int]
+    own: FloatArray
+    length: FloatArray
+    along: FloatArray
+    gram: FloatArray
+    scale: FloatArray
+    total: float
+    freedom: int
+
+    def explained(self, way: slice) -> tuple[float, int, FloatArray]:
+        """Return the squares that a way to change explains when all that is common to the images follows, how many
+        directions it has, and its amounts (V, n)."""
+        # Directions of the unit vectors' own part, and how much of the residual, and of what is common, lies along
+        # each.
+        size, common = self.length[:, way], COMMON
+        sizes, axes = np.linalg.eigh(self.own[:, way, way] / (size[:, :, None] * size[:, None]))
+        known = sizes > MIN_OWN_PART**2
+        back = np.swapaxes(axes * np.where(known, sizes, np.inf)[:, None] ** -0.5, -1, -2) / size[:, None]
+        amount = (back @ self.along[:, way, None])[..., 0]
+        shared = back @ self.own[:, way, common] / self.scale
+        every = shared.reshape(-1, len(self.scale))
+        left = self.gram - every.T @ every
+        pull = self.along[:, common].sum(axis=0) / self.scale - amount.ravel() @ every
+        values, vectors = np.linalg.eigh(left)
+        followed = values > MIN_COMMON_PART
+        turned = vectors[:, followed].T @ pull
+        step = vectors[:, followed] @ (turned / values[followed])
+        squares = float((amount**2).sum()) + float((turned**2 / values[followed]).sum())
+        return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
 
 
 def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
     """Return what each way to change explains; nothing where too few views have enough corners, or where the boards
     are bent alike in all of them while the calibration has them flat."""
-    views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
-    if len(views) < MIN_TELLING_VIEWS:
+    evidence = _evidence(calibration)
+    if evidence is None:
         return {}
-    rows, count = _rows(calibration, views)
+    out = {}
+    for name, way in _columns(evidence.own.shape[1]).items():
+        squares, directions, _ = evidence.explained(way)
+        if evidence.freedom <= 2 * directions or not evidence.total > squares:
+            return {}
+        out[name] = ViewChange.of(1.0 - squares / evidence.total, evidence.freedom, directions)
+    return out
+
+
+def _evidence(calibration: Calibration) -> _Evidence | None:
+    """Return what the residuals say; None where that is nothing."""
+    telling = [k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
+    if len(telling) < MIN_TELLING_VIEWS:
+        return None
+    rows, count = _rows(calibration, [calibration.views[k] for k in telling])
     # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
     told = np.logical_and.reduceat(np.isfinite(rows).all(axis=(0, 1)), np.cumsum(count) - count)
     if np.count_nonzero(told) < MIN_TELLING_VIEWS:
-        return {}
+        return None
     stops = np.cumsum(count)
     each = [rows[..., stop - n : stop] for n, stop in zip(count[told], stops[told], strict=True)]
     products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
     own = _without_pose(products, length)
-    common, residual = slice(6, -OWN_COLUMNS), -1
-    gram, score = own[:, common, common].sum(axis=0), own[:, common, residual].sum(axis=0)
+    residual = -1
+    gram, score = own[:, COMMON, COMMON].sum(axis=0), own[:, COMMON, residual].sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-    step = np.linalg.lstsq(gram / np.outer(scale, scale), score / scale, rcond=MIN_OWN_PART)[0] / scale
+    scaled = gram / np.outer(scale, scale)
+    step = np.linalg.lstsq(scaled, score / scale, rcond=MIN_OWN_PART)[0] / scale
     before = float(own[:, residual, residual].sum())
     total = before - float(step @ (2.0 * score - gram @ step))
-    freedom = sum(2 * n - 6 for n in count[told].tolist()) - len(step)
     if total < (1.0 - MIN_SHARE_EXPLAINED) * before:
         # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
-        return {}
-    out = {}
-    along = own[:, :, residual] - own[:, :, common] @ step
-    for name, way in _columns(rows.shape[1]).items():
-        # Directions of the unit vectors' own part, and how much of the residual lies along each.
-        size = length[:, way]
-        sizes, axes = np.linalg.eigh(own[:, way, way] / (size[:, :, None] * size[:, None]))
-        known = sizes > MIN_OWN_PART**2
-        amount = ((along[:, way] / size)[:, None] @ axes)[:, 0]
-        squares = float((amount[known] ** 2 / sizes[known]).sum())
-        directions = int(known.sum())
-        if freedom <= 2 * directions or not total > squares:
-            return {}
-        rest = (total - squares) / (freedom - directions)
-        criterion = freedom * np.log1p(-squares / total) + directions * np.log(freedom)
-        out[name] = ViewChange(squares / directions / rest, (squares - directions * rest) / total, float(criterion))
-    return out
+        return None
+    return _Evidence(
+        views=[k for k, tells in zip(telling, told.tolist(), strict=True) if tells],
+        own=own,
+        length=length,
+        along=own[:, :, residual] - own[:, :, COMMON] @ step,
+        gram=scaled,
+        scale=scale,
+        total=total,
+        freedom=sum(2 * n - 6 for n in count[told].tolist()) - len(step),
+    )
+
+
+def _solved_for(
+    way: str, calibration: Calibration, observations: Observations, fit: Fit, at_first: ViewChange
+) -> ViewChange:
+    """Return what a lens that changes in this way explains when all is solved with it; `at_first` order where that is
+    more."""
+    weight, start, left = fit.weight(observations), fit.state, at_first.left
+    before = ((fit.residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
+    freedom, directions = 1, 0
+    for _ in range(LENS_ROUNDS):
+        evidence = _evidence(calibration)
+        if evidence is None:
+            return at_first
+        views, columns = evidence.views, _columns(evidence.own.shape[1])
+        _, found, amounts = evidence.explained(columns[way])
+        if not directions:
+            freedom, directions = evidence.freedom, found
+        zoom = amounts[:, 0] if way != "shift" else np.zeros(len(views))
+        shift = amounts[:, -2:] if way != "focus" else np.zeros((len(views), 2))
+        centre, _ = start.camera.project(np.array([0.0, 0.0, 1.0]))
+        pixels = observations.pixels.copy()
+        pixels[views] -= zoom[:, None, None] * (pixels[views] - centre) + shift[:, None]
+        observations = replace(observations, pixels=pixels)
+        solution = solve(observations, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=LENS_TOLERANCE)
+        start, residuals = solution.state, solution.data.residuals[0]
+        squares = ((residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
+        left = min(left, float(squares.sum() / before.sum()))
+        px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+        poses = Rigid3.stack(start.rotation, start.translation_mm)
+        calibration = replace(
+            calibration,
+            camera=start.camera,
+            views=ViewResult.of_views(observations.views, poses, px, fit.kept),
+            boards=board_shapes(observations, start.shape, start.unknowns),
+        )
+    return ViewChange.of(left, freedom, directions) if left < at_first.left else at_first
 
 
 WAY_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
 """How many rows of `_rows` each way to change has, in their order before the residual; bends are common, too."""
-OWN_COLUMNS = sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1
-"""Rows of `_rows` that are neither of the pose nor common to all images."""
+COMMON = slice(6, -(sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1))
+"""Rows of `_rows` that are common to all images: not of the pose, nor of one image's own."""
 
 
 def _columns(count: int) -> dict[str, slice]:
     """Return where the ways to change are among `count` rows of `_rows`."""
     stops = count - 1 - sum(WAY_COLUMNS.values()) + np.cumsum(list(WAY_COLUMNS.values()))
-    return {
+    out = {
         name: slice(stop - size, stop) for (name, size), stop in zip(WAY_COLUMNS.items(), stops.tolist(), strict=True)
     }
+    return out | {"lens": slice(out["focus"].start, out["shift"].stop)}
 
 
 def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:

@@ -13,9 +13,11 @@ from typing import Protocol
 import numpy as np
 
 from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
-from rigkit.calibration.changing import changing
+from rigkit.calibration.changing import MOTION, changing
+from rigkit.calibration.fit import Fit
 from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.neighbours import neighbour_correlation
+from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.uncertainty import FarProjection
@@ -37,6 +39,7 @@ RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 MAX_OUTLIER_SHARE = 0.2
 """A view with this part of its corners outliers."""
+NOT_OF_LENS = (*MOTION, "bend", "shift")
 NAMED = 3
 """So many images are named one by one."""
 PATTERN = 0.35
@@ -69,6 +72,7 @@ def judge(
     far: FarProjection | None = None,
     clusters: IntArray | None = None,
     in_force: Collection[str] = (),
+    solved: tuple[Observations, Fit] | None = None,
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first.
 
@@ -77,6 +81,7 @@ def judge(
     also : verdicts found elsewhere.
     far, clusters : what `FarProjection.of` and `cluster_numbers` (V,) return, where they are known already.
     in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
+    solved : what was calibrated, for `changing`.
     """
     far = FarProjection.of(calibration) if far is None else far
     if clusters is None:
@@ -84,13 +89,15 @@ def judge(
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed = two_cameras(calibration, clusters)
+    # Where it was another lens later on, residuals of one for both are of no motion and of no board.
+    steady = not any(finding.severity is Severity.BAD for finding in also)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
-        *([] if mixed else changing(calibration, correlation)),
+        *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS)),
         *unlike,
         *judge_capture(calibration, extent, far, clusters),
         *(finding for finding in also if finding.severity is Severity.BAD and not mixed),

@@ -246,8 +246,8 @@ def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.G
     ],
 )
 def test_boards_in_hand_that_move_while_rows_are_read(how: dict[str, Any], rng: np.random.Generator) -> None:
-    """Moved by 3 to 24 px, poses follow so much of it that columns fit nearly as well as rows: it is named all the same
-    in half of the sessions, and never something else."""
+    """Moved by 3 to 24 px, poses and the lens follow so much of it that columns fit nearly as well as rows: it is named
+    all the same, and never something else."""
     camera, named = Pinhole(SIZE, np.array([1364.0, 1364.0, 815.0, 617.0])), 0
     for _ in range(8):
         views = []
@@ -262,7 +262,40 @@ def test_boards_in_hand_that_move_while_rows_are_read(how: dict[str, Any], rng: 
         found = changing_in(calibrate(views, SIZE, **how))
         assert all("(rolling shutter)" in finding.message for finding in found)
         named += len(found)
-    assert named >= 4
+    assert named >= 7
+
+
+@pytest.mark.parametrize("again", ["in half of the images", "nearer is longer"])
+def test_a_zoom_is_not_taken_for_a_motion(again: str, rng: np.random.Generator) -> None:
+    """Half of the images at a focal length 1 % longer, or one that follows the distance (focus breathing), before a
+    board that is bent a little."""
+    bent, side = BOARD.points(), BOARD.grid() / (np.array(BOARD.size) - 1.0) * 2.0 - 1.0
+    bent[:, 2] += 0.4 * (1.0 - side[:, 0] ** 2) + 0.1 * side[:, 0] * side[:, 1]
+    camera, named = lens("reg"), 0
+    for _ in range(4):
+        views = []
+        for k in range(20):
+            longer = 1.0 + (rng.uniform(0.0, 0.03) if again == "nearer is longer" else 0.01 * (k % 2))
+            own = camera.with_parameters(camera.parameters * np.array([longer, longer, *[1.0] * 7]))
+            view = random_views(own, 1, rng, reach_deg=33.0, noise_px=0.03, points_mm=bent)[0][0]
+            views.append(replace(view, image=f"{k:03d}.png"))
+        found = calibrate(views, SIZE, model="brown", folds=0)
+        told = str(found.verdicts)
+        assert "rolling shutter" not in told and "is bent otherwise" not in told and "shifted" not in told
+        named += "the focal length differs from image to image" in told
+    assert named >= 3
+
+
+def test_a_zoom_in_the_middle_is_that_and_no_motion(rng: np.random.Generator) -> None:
+    camera, views = lens("reg"), []
+    for k in range(20):
+        longer = 1.0 + 0.02 * (k >= 10)
+        own = camera.with_parameters(camera.parameters * np.array([longer, longer, *[1.0] * 7]))
+        view = random_views(own, 1, rng, reach_deg=33.0, noise_px=0.03)[0][0]
+        views.append(replace(view, image=f"{k:03d}.png"))
+    found = calibrate(views, SIZE, model="brown", board="flat")
+    assert "was another one in the second half of the images" in first(found)
+    assert "rolling shutter" not in str(found.verdicts)
 
 
 @pytest.mark.parametrize("way", ["focus", "shift", "rows", "bend"])

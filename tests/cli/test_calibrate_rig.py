@@ -143,8 +143,8 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     assert load_calibration(tmp_path / "calibration.json").heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
     (target,) = load_board_rigs(tmp_path / "calibration-boards.json")
     assert sorted(target.names) == [b.board_id for b in ALIKE] and target.image_count == 6
-    angle, sigma = target.angle_deg("plane1", "plane2")
-    assert angle == pytest.approx(told["checks"][0]["ours"])
+    between, sigma = target.angle_deg("plane1", "plane2")
+    assert between == pytest.approx(told["checks"][0]["ours"])
     # The deviations in the file are those of its degrees of freedom.
     kept = json.loads((tmp_path / "calibration-boards.json").read_text())["rigs"][0]
     assert sigma in [pytest.approx(entry["sigma_deg"]) for entry in kept["angles"]]
