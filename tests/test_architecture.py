@@ -14,6 +14,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1] / "rigkit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+KERNELS = sorted([*PACKAGE.rglob("*.c"), *PACKAGE.rglob("*.h")])
 
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("kernels",),
@@ -154,7 +155,7 @@ def test_one_camera_knows_nothing_of_rigs() -> None:
 
 
 def test_module_size() -> None:
-    lines = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in MODULES}
+    lines = {str(path.relative_to(PACKAGE)): len(path.read_text().splitlines()) for path in [*MODULES, *KERNELS]}
     assert not {name: n for name, n in lines.items() if n > MAX_LINES}, "split them"
 
 
@@ -197,6 +198,26 @@ def test_function_size() -> None:
         for node in nodes_of(path)
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
         and (node.end_lineno or node.lineno) - node.lineno >= MAX_FUNCTION_LINES
+    }
+    assert not long, f"more than {MAX_FUNCTION_LINES} lines: {sorted(long)}"
+
+
+def c_functions(text: str) -> dict[str, int]:
+    """How many lines each function of a C file has, from its name to the brace that closes it."""
+    return {
+        found.group("name"): found.group().count("\n") + 1
+        for found in re.finditer(
+            r"^(?:[A-Za-z_][\w ]*[ *])(?P<name>\w+)\([^;{}]*\)\n?\s*\{\n.*?^\}$", text, re.MULTILINE | re.DOTALL
+        )
+    }
+
+
+def test_function_size_of_kernels() -> None:
+    assert c_functions("INLINE int one(\n    int a)\n{\n    return a;\n}\n") == {"one": 5}
+    found = {path.name: c_functions(path.read_text(encoding="utf-8")) for path in KERNELS}
+    assert sum(map(len, found.values())) > 200, "functions are not seen"
+    long = {
+        (name, function) for name, sizes in found.items() for function, n in sizes.items() if n > MAX_FUNCTION_LINES
     }
     assert not long, f"more than {MAX_FUNCTION_LINES} lines: {sorted(long)}"
 

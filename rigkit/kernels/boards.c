@@ -167,7 +167,7 @@ INLINE void look_along(const double near[3][3], int64_t lines, const double ends
         add_line(place, (double)line, slope, bend, turn, sharp, line % 2 ? 2.0 : -2.0, out->squares);
 }
 
-/* The product of both directions, and its derivatives along them: blur along two normals is correlated (edges.c). */
+/* The product of both directions, and its derivatives along them: blur along two normals is correlated (edges_model.c). */
 INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho, double part, double out[3])
 {
     out[0] += part * (a[0] * b[0] + rho * (a[1] * b[1] + rho * (0.5 * a[2] * b[2] + rho / 6.0 * a[3] * b[3])));

@@ -6,8 +6,8 @@
 enum { FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 };
 
 /* Write what the points come to; without denominator where the model is not `rational`. */
-INLINE void differentiate(const brown_points_t *at, const int rational, double *by_point, double *by, double *u, double *v,
-    uint8_t *valid)
+INLINE void differentiate(
+    const brown_points_t *at, const int rational, double *by_point, double *by, double *u, double *v, uint8_t *valid)
 {
     const double *k = at->parameters;
     const double fx = k[FX], fy = k[FY], cx = k[CX], cy = k[CY], p1 = k[P1], p2 = k[P2];
@@ -55,14 +55,12 @@ INLINE void differentiate(const brown_points_t *at, const int rational, double *
             by_v[K1 * N + n] = ray_v;
             by_u[K2 * N + n] = ray_u * t;
             by_v[K2 * N + n] = ray_v * t;
-            if (P > K3) {
-                by_u[K3 * N + n] = ray_u * t * t;
-                by_v[K3 * N + n] = ray_v * t * t;
-            }
+            if (P > K3)
+                by_u[K3 * N + n] = ray_u * t * t, by_v[K3 * N + n] = ray_v * t * t;
             if (rational)
                 for (int64_t i = K4; i <= K6; i++) {
-                    by_u[i * N + n] = -factor * by_u[(i == K6 ? K3 : i == K5 ? K2 : K1) * N + n];
-                    by_v[i * N + n] = -factor * by_v[(i == K6 ? K3 : i == K5 ? K2 : K1) * N + n];
+                    const int64_t above = (i == K6 ? K3 : i == K5 ? K2 : K1) * N + n;
+                    by_u[i * N + n] = -factor * by_u[above], by_v[i * N + n] = -factor * by_v[above];
                 }
         }
     }

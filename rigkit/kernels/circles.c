@@ -194,6 +194,64 @@ static void harmonics(const circle_t *at, const spot_t *spots, int64_t count, do
         out[n] *= 2.0 / (weight > 1e-12 ? weight : 1e-12);
 }
 
+/* Return the circle as its guess has it, with as many inversions of its map as a pixel's place needs. */
+static circle_t guessed(const double *pixel, const double *map, const double *bend, double blur)
+{
+    circle_t at = {.s = blur};
+    memcpy(at.c, pixel, sizeof at.c);
+    memcpy(at.M, map, sizeof at.M);
+    memcpy(at.H, bend, sizeof at.H);
+    at.size = sqrt(fabs(at.M[0] * at.M[3] - at.M[1] * at.M[2]));
+    /* The narrower of its axes is at least area over the longer. */
+    const double longest = sqrt(at.M[0] * at.M[0] + at.M[1] * at.M[1] + at.M[2] * at.M[2] + at.M[3] * at.M[3]);
+    double bent = 0.0, left_over = 1.0;
+    for (int k = 0; k < 6; k++)
+        bent += fabs(at.H[k]);
+    const double ratio = 0.5 * bent * longest / (at.size * at.size);
+    for (at.inversions = 0; at.inversions < INVERSIONS && left_over * ratio > PLACE_ERROR; at.inversions++)
+        left_over *= ratio;
+    return at;
+}
+
+/* Set the brightness to the means inside and outside; return whether there are pixels of both. */
+static int set_brightness(circle_t *at, const spot_t *spots, int64_t seen)
+{
+    double inverse[4], total[2] = {0.0, 0.0};
+    int64_t parts[2] = {0, 0};
+    if (!inverted(at->M, inverse))
+        return 0;
+    for (int64_t k = 0; k < seen; k++) {
+        const int inside = place_of(at, inverse, spots[k].u - at->c[0], spots[k].v - at->c[1]).d < 0.0;
+        total[inside] += spots[k].value;
+        parts[inside]++;
+    }
+    if (!(parts[0] > 0 && parts[1] > 0))
+        return 0;
+    at->a = total[0] / (double)parts[0];
+    at->b = total[1] / (double)parts[1] - at->a;
+    return 1;
+}
+
+/* Write the fitted circle with `N`, the normal equations' factor. */
+static void write_circle(const circle_t *at, const double *N, double squares, int64_t seen, int settled, double *result)
+{
+    double cov[2][PARAMETERS] = {{0.0}};
+    cov[0][X] = cov[1][Y] = 1.0;
+    cholesky_solve(N, PARAMETERS, cov[0]);
+    cholesky_solve(N, PARAMETERS, cov[1]);
+    memcpy(result, at->c, sizeof at->c);
+    memcpy(result + 2, at->M, sizeof at->M);
+    result[6] = cov[0][X];
+    result[7] = cov[0][Y];
+    result[8] = cov[1][Y];
+    result[9] = at->s;
+    result[10] = at->a;
+    result[11] = at->b;
+    result[12] = sqrt(squares / (double)(seen > PARAMETERS ? seen - PARAMETERS : 1));
+    result[13] = (double)seen;
+    result[14] = (double)settled;
+}
+
 void fit_circles(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *maps,
     const double *bends, const double *blur, const double *reach, const circle_rules_t *rules, int64_t most, double *scratch,
@@ -203,38 +261,14 @@ void fit_circles(
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * CIRCLE_OUTCOMES;
         memset(result, 0, CIRCLE_OUTCOMES * sizeof(double));
-        circle_t at = {.s = blur[n]};
-        memcpy(at.c, pixels + 2 * n, sizeof at.c);
-        memcpy(at.M, maps + 4 * n, sizeof at.M);
-        memcpy(at.H, bends + 6 * n, sizeof at.H);
-        at.size = sqrt(fabs(at.M[0] * at.M[3] - at.M[1] * at.M[2]));
-        /* The narrower of its axes is at least area over the longer. */
-        const double longest = sqrt(at.M[0] * at.M[0] + at.M[1] * at.M[1] + at.M[2] * at.M[2] + at.M[3] * at.M[3]);
-        double bend = 0.0, left_over = 1.0;
-        for (int k = 0; k < 6; k++)
-            bend += fabs(at.H[k]);
-        const double ratio = 0.5 * bend * longest / (at.size * at.size);
-        for (at.inversions = 0; at.inversions < INVERSIONS && left_over * ratio > PLACE_ERROR; at.inversions++)
-            left_over *= ratio;
+        circle_t at = guessed(pixels + 2 * n, maps + 4 * n, bends + 6 * n, blur[n]);
         const double band = rules->near_sigmas * at.s + rules->near_px;
         const int64_t seen = gather(&at, grey, bytes, width, height, reach[n], band, spots, most);
-        double N[PARAMETERS * PARAMETERS], step[PARAMETERS], sum = 0.0;
-        int solved = seen >= rules->fewest, settled = 0;
-        /* Brightness starts at the means inside and outside. */
-        double inverse[4], total[2] = {0.0, 0.0};
-        int64_t parts[2] = {0, 0};
-        if (solved && inverted(at.M, inverse))
-            for (int64_t k = 0; k < seen; k++) {
-                const int inside = place_of(&at, inverse, spots[k].u - at.c[0], spots[k].v - at.c[1]).d < 0.0;
-                total[inside] += spots[k].value;
-                parts[inside]++;
-            }
-        solved = solved && parts[0] > 0 && parts[1] > 0;
-        if (!solved)
+        double N[PARAMETERS * PARAMETERS], step[PARAMETERS];
+        if (!(seen >= rules->fewest) || !set_brightness(&at, spots, seen))
             continue;
-        at.a = total[0] / (double)parts[0];
-        at.b = total[1] / (double)parts[1] - at.a;
-        for (int64_t k = 0; k < rules->iterations && solved && !settled; k++) {
+        int solved = 1, settled = 0;
+        for (int64_t k = 0; k < rules->iterations && !settled; k++) {
             linearise(&at, spots, seen, N, step);
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
@@ -247,25 +281,10 @@ void fit_circles(
         }
         if (!solved)
             continue;
-        sum = linearise(&at, spots, seen, N, step);
+        const double squares = linearise(&at, spots, seen, N, step);
         if (!cholesky(N, PARAMETERS))
             continue;
-        double cov[2][PARAMETERS] = {{0.0}};
-        cov[0][X] = cov[1][Y] = 1.0;
-        cholesky_solve(N, PARAMETERS, cov[0]);
-        cholesky_solve(N, PARAMETERS, cov[1]);
-        result[0] = at.c[0];
-        result[1] = at.c[1];
-        memcpy(result + 2, at.M, sizeof at.M);
-        result[6] = cov[0][X];
-        result[7] = cov[0][Y];
-        result[8] = cov[1][Y];
-        result[9] = at.s;
-        result[10] = at.a;
-        result[11] = at.b;
-        result[12] = sqrt(sum / (double)(seen > PARAMETERS ? seen - PARAMETERS : 1));
-        result[13] = (double)seen;
-        result[14] = (double)settled;
+        write_circle(&at, N, squares, seen, settled, result);
         harmonics(&at, spots, seen, result + 15);
     }
 }

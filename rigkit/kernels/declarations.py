@@ -1,6 +1,6 @@
-"""Reads api.h: from its functions, structures and constants come the calls of `rigkit.kernels`, and their checks.
+"""Reads api.h and the headers it includes: from them come the calls of `rigkit.kernels`, and their checks.
 
-The header is a small part of C (see there), which a few patterns read.
+They are a small part of C (see there), which a few patterns read.
 """
 
 from __future__ import annotations
@@ -70,9 +70,11 @@ class Header:
 
 @functools.cache
 def header() -> Header:
-    """Return what api.h declares; raises ValueError where it is not as plain as it says of itself."""
-    text = (Path(__file__).parent / "api.h").read_text(encoding="utf-8")
-    return parsed(text)
+    """Return what api.h and its parts declare; raises ValueError where they are not as plain as api.h says of them."""
+    folder = Path(__file__).parent
+    text = (folder / "api.h").read_text(encoding="utf-8")
+    parts = re.findall(r'^#include "(\w+\.h)"', text, flags=re.MULTILINE)
+    return parsed("\n".join([text, *((folder / part).read_text(encoding="utf-8") for part in parts)]))
 
 
 def parsed(text: str) -> Header:

@@ -1,4 +1,4 @@
-"""The kernels in edges.c: the fit of the edge model to corners, and how the lines of a lattice bend."""
+"""The kernels in edges.c and bends.c: the fit of the edge model to corners, and how the lines of a lattice bend."""
 
 from __future__ import annotations
 

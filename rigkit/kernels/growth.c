@@ -1,4 +1,4 @@
-/* Lattices of corners: local polynomial fits, rows and columns from links, growth ring by ring.
+/* Lattices of corners: local polynomial fits, growth ring by ring. components.c makes the first ones from links.
  *
  * The definitions in numpy are in tests/kernels/reference/growth.py, the numbers in rigkit.detection.lattice. */
 #include "kernels.h"
@@ -38,105 +38,126 @@ INLINE void solve(double matrix[MOST_TERMS][MOST_TERMS], double right[MOST_TERMS
         }
 }
 
+/* The powers of column and row in a polynomial's terms. */
+static const int POWER_C[MOST_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
+static const int POWER_R[MOST_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
+
+/* What a fit takes from the cells around one: which cells, their weights, sums of weight * column^i * row^j, and those with
+ * the positions (from a corner `near`by, against cancellation). */
+typedef struct {
+    int64_t row, column, low_r, low_c, high_r, high_c, support;
+    double moment[2 * MOST_DEGREE + 1][2 * MOST_DEGREE + 1], position[MOST_TERMS][2], near[2];
+    double weights[2 * MOST_RADIUS + 1][2 * MOST_RADIUS + 1];
+} surroundings_t;
+
+/* Add the known cells of row `r`. */
+INLINE void add_row(
+    const double *lattice, int64_t columns, int64_t r, const int degree, const fit_rules_t *rules, const double *bell,
+    surroundings_t *at)
+{
+    double line[2 * MOST_DEGREE + 1] = {0.0}, line_u[MOST_DEGREE + 1] = {0.0}, line_v[MOST_DEGREE + 1] = {0.0};
+    const int64_t row = at->row, column = at->column;
+    int64_t found = 0;
+    for (int64_t c = at->low_c; c <= at->high_c; c++) {
+        const double *pixel = lattice + 2 * (r * columns + c);
+        const double u = pixel[0], v = pixel[1];
+        const int known = u == u && !(rules->leave_out && r == row && c == column);
+        double *weight = &at->weights[r - at->low_r][c - at->low_c];
+        *weight = 0.0;
+        if (!known)
+            continue;
+        if (at->support + found == 0) {
+            at->near[0] = u;
+            at->near[1] = v;
+        }
+        found++;
+        const double x = (double)(c - column);
+        double power = *weight = bell[r < row ? row - r : r - row] * bell[c < column ? column - c : c - column];
+        for (int i = 0; i <= 2 * degree; i++) {
+            line[i] += power;
+            if (i <= degree) {
+                line_u[i] += power * (u - at->near[0]);
+                line_v[i] += power * (v - at->near[1]);
+            }
+            power *= x;
+        }
+    }
+    if (!found)
+        return;
+    at->support += found;
+    const double y = (double)(r - row);
+    double powers[2 * MOST_DEGREE + 1];
+    powers[0] = 1.0;
+    for (int j = 1; j <= 2 * degree; j++)
+        powers[j] = powers[j - 1] * y;
+    for (int i = 0; i <= 2 * degree; i++)
+        for (int j = 0; i + j <= 2 * degree; j++)
+            at->moment[i][j] += line[i] * powers[j];
+    for (int k = 0; k < (degree + 1) * (degree + 2) / 2; k++) {
+        at->position[k][0] += line_u[POWER_C[k]] * powers[POWER_R[k]];
+        at->position[k][1] += line_v[POWER_C[k]] * powers[POWER_R[k]];
+    }
+}
+
+/* Return by how much the value at the cell grows with independent errors of the positions around it, `solved` being the
+ * polynomial of the cell's own column of the inverse. */
+INLINE double gain_of(const surroundings_t *at, const int degree, double solved[MOST_TERMS][3])
+{
+    double gain = 0.0;
+    for (int64_t r = at->low_r; r <= at->high_r; r++) {
+        const double y = (double)(r - at->row);
+        for (int64_t c = at->low_c; c <= at->high_c; c++) {
+            const double x = (double)(c - at->column);
+            double lever = solved[0][2] + x * solved[1][2] + y * solved[2][2];
+            if (degree > 1)
+                lever += x * x * solved[3][2] + x * y * solved[4][2] + y * y * solved[5][2];
+            if (degree > 2)
+                lever += x * x * (x * solved[6][2] + y * solved[7][2]) + y * y * (x * solved[8][2] + y * solved[9][2]);
+            lever *= at->weights[r - at->low_r][c - at->low_c];
+            gain += lever * lever;
+        }
+    }
+    return sqrt(gain);
+}
+
 /* Fit a polynomial of `degree` (known when compiling, so that all loops unroll) around the cell (row, column) of
  * `lattice` (rows, columns, 2), NaN where unknown. `bell` are the weights of steps 0, 1, ... along one direction. */
 INLINE void fit_polynomial(
     const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const int degree,
     const fit_rules_t *rules, const double *bell, fit_t *out)
 {
-    static const int power_c[MOST_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
-    static const int power_r[MOST_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
     const int terms = (degree + 1) * (degree + 2) / 2;
     const int64_t radius = rules->radius;
-    const int64_t low_r = row - radius > 0 ? row - radius : 0, low_c = column - radius > 0 ? column - radius : 0;
-    const int64_t high_r = row + radius < rows - 1 ? row + radius : rows - 1;
-    const int64_t high_c = column + radius < columns - 1 ? column + radius : columns - 1;
-    /* Sums of weight * column^i * row^j, and those with the positions (from a corner nearby, against cancellation). */
-    double moment[2 * MOST_DEGREE + 1][2 * MOST_DEGREE + 1] = {{0.0}}, position[MOST_TERMS][2] = {{0.0}};
-    double weights[2 * MOST_RADIUS + 1][2 * MOST_RADIUS + 1];
-    double near_u = 0.0, near_v = 0.0;
-    int64_t support = 0;
-    for (int64_t r = low_r; r <= high_r; r++) {
-        double line[2 * MOST_DEGREE + 1] = {0.0}, line_u[MOST_DEGREE + 1] = {0.0}, line_v[MOST_DEGREE + 1] = {0.0};
-        const double y = (double)(r - row);
-        int64_t found = 0;
-        for (int64_t c = low_c; c <= high_c; c++) {
-            const double *pixel = lattice + 2 * (r * columns + c);
-            const double u = pixel[0], v = pixel[1];
-            const int known = u == u && !(rules->leave_out && r == row && c == column);
-            double *weight = &weights[r - low_r][c - low_c];
-            *weight = 0.0;
-            if (!known)
-                continue;
-            if (support + found == 0) {
-                near_u = u;
-                near_v = v;
-            }
-            found++;
-            const double x = (double)(c - column);
-            double power = *weight = bell[r < row ? row - r : r - row] * bell[c < column ? column - c : c - column];
-            for (int i = 0; i <= 2 * degree; i++) {
-                line[i] += power;
-                if (i <= degree) {
-                    line_u[i] += power * (u - near_u);
-                    line_v[i] += power * (v - near_v);
-                }
-                power *= x;
-            }
-        }
-        if (!found)
-            continue;
-        support += found;
-        double powers[2 * MOST_DEGREE + 1];
-        powers[0] = 1.0;
-        for (int j = 1; j <= 2 * degree; j++)
-            powers[j] = powers[j - 1] * y;
-        for (int i = 0; i <= 2 * degree; i++)
-            for (int j = 0; i + j <= 2 * degree; j++)
-                moment[i][j] += line[i] * powers[j];
-        for (int k = 0; k < terms; k++) {
-            position[k][0] += line_u[power_c[k]] * powers[power_r[k]];
-            position[k][1] += line_v[power_c[k]] * powers[power_r[k]];
-        }
-    }
-    const double total = moment[0][0] > LEAST_PULL ? moment[0][0] : LEAST_PULL;
-    const double centre_u = position[0][0] / total, centre_v = position[0][1] / total;
+    surroundings_t at = {
+        .row = row, .column = column, .low_r = row - radius > 0 ? row - radius : 0,
+        .low_c = column - radius > 0 ? column - radius : 0, .high_r = row + radius < rows - 1 ? row + radius : rows - 1,
+        .high_c = column + radius < columns - 1 ? column + radius : columns - 1};
+    for (int64_t r = at.low_r; r <= at.high_r; r++)
+        add_row(lattice, columns, r, degree, rules, bell, &at);
+    const double total = at.moment[0][0] > LEAST_PULL ? at.moment[0][0] : LEAST_PULL;
+    const double centre_u = at.position[0][0] / total, centre_v = at.position[0][1] / total;
     double normal[MOST_TERMS][MOST_TERMS], solved[MOST_TERMS][3];
     const double pull[MOST_DEGREE + 1] = {LEAST_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
     for (int k = 0; k < terms; k++) {
         for (int j = k; j < terms; j++)
-            normal[k][j] = moment[power_c[k] + power_c[j]][power_r[k] + power_r[j]];
-        solved[k][0] = position[k][0] - centre_u * normal[0][k];
-        solved[k][1] = position[k][1] - centre_v * normal[0][k];
+            normal[k][j] = at.moment[POWER_C[k] + POWER_C[j]][POWER_R[k] + POWER_R[j]];
+        solved[k][0] = at.position[k][0] - centre_u * normal[0][k];
+        solved[k][1] = at.position[k][1] - centre_v * normal[0][k];
         solved[k][2] = k == 0;
     }
     for (int k = 0; k < terms; k++)
-        normal[k][k] += pull[power_c[k] + power_r[k]];
+        normal[k][k] += pull[POWER_C[k] + POWER_R[k]];
     solve(normal, solved, terms);
-    double gain = 0.0;
-    for (int64_t r = low_r; r <= high_r; r++) {
-        const double y = (double)(r - row);
-        for (int64_t c = low_c; c <= high_c; c++) {
-            const double x = (double)(c - column);
-            double lever = solved[0][2] + x * solved[1][2] + y * solved[2][2];
-            if (degree > 1)
-                lever += x * x * solved[3][2] + x * y * solved[4][2] + y * y * solved[5][2];
-            if (degree > 2)
-                lever += x * x * (x * solved[6][2] + y * solved[7][2]) + y * y * (x * solved[8][2] + y * solved[9][2]);
-            lever *= weights[r - low_r][c - low_c];
-            gain += lever * lever;
-        }
-    }
-    out->pixel[0] = solved[0][0] + centre_u + near_u;
-    out->pixel[1] = solved[0][1] + centre_v + near_v;
+    out->pixel[0] = solved[0][0] + centre_u + at.near[0];
+    out->pixel[1] = solved[0][1] + centre_v + at.near[1];
     for (int side = 0; side < 2; side++) {
         out->along_column[side] = solved[1][side];
         out->along_row[side] = solved[2][side];
         out->bend_column[side] = degree > 1 ? 2.0 * solved[3][side] : 0.0;
         out->bend_row[side] = degree > 1 ? 2.0 * solved[5][side] : 0.0;
     }
-    out->support = (double)support;
-    out->gain = sqrt(gain);
+    out->support = (double)at.support;
+    out->gain = gain_of(&at, degree, solved);
 }
 
 INLINE void fit_cell(
@@ -362,109 +383,4 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
         }
     }
     return -1;
-}
-
-/* Links as states: state 4 * corner + arm leads to the state 4 * its neighbour + the arm that points back, or to -1. */
-static int compare(const void *one, const void *two)
-{
-    const int64_t a = *(const int64_t *)one, b = *(const int64_t *)two;
-    return (a > b) - (a < b);
-}
-
-/* Keep the links that bound a closed square on either side (reference.front.quads). */
-static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
-{
-    memset(bound, 0, (size_t)(4 * count));
-    for (int64_t start = 0; start < 4 * count; start++) {
-        int64_t state = start;
-        for (int step = 0; step < 4 && state >= 0; step++)
-            state = to[state] < 0 ? -1 : to[state] / 4 * 4 + (to[state] + 3) % 4;
-        if (state == start)
-            bound[start] = bound[to[start]] = 1;
-    }
-    for (int64_t state = 0; state < 4 * count; state++)
-        if (!bound[state])
-            to[state] = -1;
-}
-
-/* Give a column and a row to every linked corner, and the arm that points to +column (reference.growth._walk). `label` is
- * -1 for corners without links; `members` lists the corners of the lattices one lattice after the other. Returns the
- * number of lattices. `queue` (2 * count) is scratch. */
-static int64_t walk(
-    int64_t count, const int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue)
-{
-    static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
-    enum { UNSEEN = -2, ALONE = -1 };
-    int64_t lattices = 0, listed = 0;
-    for (int64_t i = 0; i < count; i++) {
-        label[i] = to[4 * i] >= 0 || to[4 * i + 1] >= 0 || to[4 * i + 2] >= 0 || to[4 * i + 3] >= 0 ? UNSEEN : ALONE;
-        grid[2 * i] = grid[2 * i + 1] = turn[i] = 0;
-    }
-    for (int64_t i = 0; i < count; i++) {
-        if (label[i] != UNSEEN)
-            continue;
-        /* The whole component, to start from its best linked corner. */
-        const int64_t first = listed;
-        int64_t root = i, most = 0;
-        members[listed++] = i;
-        label[i] = lattices;
-        for (int64_t k = first; k < listed; k++) {
-            int64_t degree = 0;
-            for (int arm = 0; arm < 4; arm++) {
-                if (to[4 * members[k] + arm] < 0)
-                    continue;
-                degree++;
-                const int64_t end = to[4 * members[k] + arm] / 4;
-                if (label[end] == UNSEEN) {
-                    label[end] = lattices;
-                    members[listed++] = end;
-                }
-            }
-            if (degree > most || (degree == most && members[k] < root)) {
-                most = degree;
-                root = members[k];
-            }
-        }
-        /* Then ring by ring; the label is the number of the lattice again when a corner has its place. */
-        for (int64_t k = first; k < listed; k++)
-            label[members[k]] = UNSEEN;
-        int64_t *frontier = queue, *next = queue + count, size = 1;
-        frontier[0] = root;
-        label[root] = lattices;
-        while (size) {
-            int64_t added = 0;
-            for (int64_t k = 0; k < size; k++)
-                for (int64_t arm = 0; arm < 4; arm++) {
-                    const int64_t start = frontier[k], state = to[4 * start + arm];
-                    if (state < 0 || label[state / 4] != UNSEEN)
-                        continue;
-                    const int64_t end = state / 4, direction = (arm - turn[start] + 4) % 4;
-                    label[end] = lattices;
-                    grid[2 * end] = grid[2 * start] + step_c[direction];
-                    grid[2 * end + 1] = grid[2 * start + 1] + step_r[direction];
-                    turn[end] = (state % 4 - direction + 6) % 4;
-                    next[added++] = end;
-                }
-            qsort(next, (size_t)added, sizeof(int64_t), compare);
-            int64_t *swap = frontier;
-            frontier = next;
-            next = swap;
-            size = added;
-        }
-        for (int64_t k = first; k < listed; k++)
-            if (label[members[k]] == UNSEEN)
-                label[members[k]] = ALONE; /* Links are mutual, so there are none; but nothing is listed twice. */
-        lattices++;
-    }
-    return lattices;
-}
-
-/* reference.growth.components_of: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
- * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
-int64_t find_components(
-    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
-    uint8_t *bound)
-{
-    keep_quads(count, to, bound);
-    return walk(count, to, label, grid, turn, members, queue);
 }

@@ -1,4 +1,4 @@
-"""Calls of the kernels in growth.c: plain arrays in, plain arrays out; all tolerances come from the callers."""
+"""Calls of the kernels in growth.c and components.c: plain arrays; all tolerances come from the callers."""
 
 from __future__ import annotations
 

@@ -42,13 +42,46 @@ INLINE void add_released(
     }
 }
 
+/* Set the row of one coordinate of a corner, from the derivatives of its pixel by the point, weighted (`j`), and by the
+ * parameters (`by`, `stride` apart); `left` to the derivatives by the board's point, `q` is the lever. */
+INLINE void fill_row(
+    const board_views_t *seen, const double *R, const double *q, int64_t point, double weight, const double j[3], const double *by,
+    int64_t stride, int64_t parameters, double off, double left[3], double *row)
+{
+    const int64_t B = seen->warps;
+    const double *warp = seen->warp + 3 * B * point;
+    double *motion = row + parameters + B;
+    for (int64_t k = 0; k < parameters; k++)
+        row[k] = weight * by[k * stride];
+    for (int64_t k = 0; k < 3; k++)
+        left[k] = j[0] * R[k] + j[1] * R[3 + k] + j[2] * R[6 + k];
+    for (int64_t b = 0; b < B; b++)
+        row[parameters + b] = left[0] * warp[b] + left[1] * warp[B + b] + left[2] * warp[2 * B + b];
+    motion[0] = q[1] * j[2] - q[2] * j[1];
+    motion[1] = q[2] * j[0] - q[0] * j[2];
+    motion[2] = q[0] * j[1] - q[1] * j[0];
+    for (int64_t k = 0; k < 3; k++)
+        motion[3 + k] = j[k];
+    motion[POSE] = weight * off;
+}
+
+/* Return a corner's robust cost, and scale its `weight` by the loss. */
+INLINE double robust_cost(const double away[2], double loss, double *weight)
+{
+    const double squared = (away[0] * away[0] + away[1] * away[1]) * *weight * *weight;
+    if (!(loss > 0.0))
+        return squared;
+    const double relative = squared / (loss * loss);
+    *weight /= sqrt(1.0 + relative);
+    return loss * loss * log1p(relative);
+}
+
 EXPORT FOR_EACH_PROCESSOR void add_views(
     const board_views_t *seen, int64_t first, int64_t count, int64_t parameters, const double *d_pixels_d_point,
     const double *d_pixels_d_parameters, const double *u, const double *v, const uint8_t *projects, const double *lever,
     double *memory, const view_sums_t *sums)
 {
-    const int64_t C = seen->corners, all = seen->views * C, B = seen->warps, K = sums->across, across = padded(K);
-    const double loss = seen->loss_px;
+    const int64_t C = seen->corners, all = seen->views * C, K = sums->across, across = padded(K);
     double *total = memory, *rows = memory + across * across;
     memset(rows, 0, (size_t)(2 * CORNERS * across) * sizeof(double));
     for (int64_t view = first, n = 0; n < count; view++) {
@@ -64,13 +97,8 @@ EXPORT FOR_EACH_PROCESSOR void add_views(
             sums->residuals[m] = away[0];
             sums->residuals[all + m] = away[1];
             sums->valid[m] = projects[n];
-            double weight = seen->weight[m], squared = (away[0] * away[0] + away[1] * away[1]) * weight * weight;
-            if (loss > 0.0) {
-                squared /= loss * loss;
-                weight /= sqrt(1.0 + squared);
-                squared = loss * loss * log1p(squared);
-            }
-            cost += squared;
+            double weight = seen->weight[m];
+            cost += robust_cost(away, seen->loss_px, &weight);
             /* A corner outside the model's field of view has no derivative; it waits until a step brings it back. */
             if (!projects[n] || weight == 0.0)
                 continue;
@@ -78,22 +106,10 @@ EXPORT FOR_EACH_PROCESSOR void add_views(
             double left[2][3];
             double *both = rows + 2 * across * used++;
             for (int64_t i = 0; i < 2; i++) {
-                const double *J = d_pixels_d_point + 3 * count * i + n, *by = d_pixels_d_parameters + parameters * count * i + n;
+                const double *J = d_pixels_d_point + 3 * count * i + n;
                 const double j[3] = {weight * J[0], weight * J[count], weight * J[2 * count]};
-                double *row = both + across * i, *motion = row + parameters + B;
-                for (int64_t k = 0; k < parameters; k++)
-                    row[k] = weight * by[k * count];
-                for (int64_t k = 0; k < 3; k++)
-                    left[i][k] = j[0] * R[k] + j[1] * R[3 + k] + j[2] * R[6 + k];
-                const double *warp = seen->warp + 3 * B * point;
-                for (int64_t b = 0; b < B; b++)
-                    row[parameters + b] = left[i][0] * warp[b] + left[i][1] * warp[B + b] + left[i][2] * warp[2 * B + b];
-                motion[0] = q[1] * j[2] - q[2] * j[1];
-                motion[1] = q[2] * j[0] - q[0] * j[2];
-                motion[2] = q[0] * j[1] - q[1] * j[0];
-                for (int64_t k = 0; k < 3; k++)
-                    motion[3 + k] = j[k];
-                motion[POSE] = weight * away[i];
+                fill_row(seen, R, q, point, weight, j, d_pixels_d_parameters + parameters * count * i + n, count, parameters, away[i],
+                         left[i], both + across * i);
             }
             if (seen->released && seen->place[point] >= 0)
                 add_released(sums, view, seen->place[point], left, both, both + across);

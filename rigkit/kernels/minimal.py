@@ -1,4 +1,4 @@
-"""Calls of the kernels in minimal.c: essential matrices of many minimal samples."""
+"""Calls of the kernels in five_point.c and six_point.c: essential matrices of many minimal samples."""
 
 from __future__ import annotations
 

@@ -4,96 +4,9 @@
  * the brightness are free. The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 Years On", 2004):
  * derivatives are those of the patch of image 1, taken once. Images are read between pixels by cubic convolution.
  * The functions in numpy that say what is computed are in tests/kernels/reference/patches.py. */
-#include "kernels.h"
+#include "patch_samples.h"
 
-/* Samples of a patch are filled up to whole vectors by ones without weight. */
-enum { MOST_SIDE = 2 * MOST_HALF + 1, MOST_SAMPLES = (MOST_SIDE * MOST_SIDE + 15) / 16 * 16, UNKNOWNS = 6 };
-
-typedef float four_t __attribute__((vector_size(16), aligned(4)));
-
-/* Write the weights of four neighbours at the fraction t after the second (Catmull and Rom). */
-#define CUBIC(t, w0, w1, w2, w3)                                                                                       \
-    do {                                                                                                               \
-        (w0) = (t) * (-0.5f + (t) * (1.0f - 0.5f * (t)));                                                              \
-        (w1) = 1.0f + (t) * (t) * (-2.5f + 1.5f * (t));                                                                \
-        (w2) = (t) * (0.5f + (t) * (2.0f - 1.5f * (t)));                                                               \
-        (w3) = (t) * (t) * (-0.5f + 0.5f * (t));                                                                       \
-    } while (0)
-
-/* Read `image` at the `count` places (u, v) + A (x, y), which lie at least a pixel inside; count is a multiple of 16. */
-INLINE void read_samples(
-    const image_t image, float u, float v, const float A[4], const float *x, const float *y, int64_t count, float *out)
-{
-    int32_t at[MOST_SAMPLES];
-    float across[4][MOST_SAMPLES], down[4][MOST_SAMPLES], sums[4 * MOST_SAMPLES];
-    const int32_t width = (int32_t)image.width;
-#pragma omp simd
-    for (int64_t n = 0; n < count; n++) {
-        const float place_u = u + A[0] * x[n] + A[1] * y[n], place_v = v + A[2] * x[n] + A[3] * y[n];
-        const int32_t left = (int32_t)place_u, top = (int32_t)place_v;
-        const float s = place_u - (float)left, t = place_v - (float)top;
-        at[n] = (top - 1) * width + left - 1;
-        CUBIC(s, across[0][n], across[1][n], across[2][n], across[3][n]);
-        CUBIC(t, down[0][n], down[1][n], down[2][n], down[3][n]);
-    }
-    for (int64_t n = 0; n < count; n++) {
-        const float *from = image.brightness + at[n];
-        four_t row, sum;
-        memcpy(&row, from, sizeof row);
-        sum = down[0][n] * row;
-        memcpy(&row, from + width, sizeof row);
-        sum += down[1][n] * row;
-        memcpy(&row, from + 2 * (ptrdiff_t)width, sizeof row);
-        sum += down[2][n] * row;
-        memcpy(&row, from + 3 * (ptrdiff_t)width, sizeof row);
-        sum += down[3][n] * row;
-        memcpy(sums + 4 * n, &sum, sizeof sum);
-    }
-#pragma omp simd
-    for (int64_t n = 0; n < count; n++)
-        out[n] = (across[0][n] * sums[4 * n] + across[1][n] * sums[4 * n + 1]) +
-                 (across[2][n] * sums[4 * n + 2] + across[3][n] * sums[4 * n + 3]);
-}
-
-/* Read `image` at side x side places a pixel apart, from (u, v), which lies at least a pixel inside. */
-INLINE void read_square(const image_t image, float u, float v, int64_t side, float *out)
-{
-    enum { MOST_LINE = MOST_SIDE + 2 };
-    const int32_t left = (int32_t)u, top = (int32_t)v;
-    const float s = u - (float)left, t = v - (float)top;
-    float across[4], down[4], lines[(MOST_LINE + 3) * MOST_LINE];
-    CUBIC(s, across[0], across[1], across[2], across[3]);
-    CUBIC(t, down[0], down[1], down[2], down[3]);
-    for (int64_t j = 0; j < side + 3; j++) {
-        const float *from = image.brightness + (ptrdiff_t)(top - 1 + j) * (ptrdiff_t)image.width + (left - 1);
-        for (int64_t i = 0; i < side; i++)
-            lines[j * side + i] =
-                across[0] * from[i] + across[1] * from[i + 1] + across[2] * from[i + 2] + across[3] * from[i + 3];
-    }
-    for (int64_t j = 0; j < side; j++)
-        for (int64_t i = 0; i < side; i++)
-            out[j * side + i] = down[0] * lines[j * side + i] + down[1] * lines[(j + 1) * side + i] +
-                                down[2] * lines[(j + 2) * side + i] + down[3] * lines[(j + 3) * side + i];
-}
-
-INLINE int is_inside(const image_t image, double u, double v, double margin)
-{
-    return u >= 1.0 + margin && v >= 1.0 + margin && u < (double)image.width - 2.0 - margin &&
-           v < (double)image.height - 2.0 - margin;
-}
-
-/* The window, and a patch of image 1 with what the alignment takes from it: `steep` are the derivatives by the six unknowns
- * (the rows of dA, then dq, in the frame of image 1), free of brightness's gain and offset, times the window. */
-typedef struct {
-    int64_t half, count;
-    float window[MOST_SAMPLES], u[MOST_SAMPLES], v[MOST_SAMPLES];
-    float values[MOST_SAMPLES], weighted[MOST_SAMPLES], there[MOST_SAMPLES];
-    float steep[UNKNOWNS][MOST_SAMPLES];
-    float mean;
-    double total, effective, energy, normal[UNKNOWNS][UNKNOWNS];
-} patch_t;
-
-static void make_window(const patch_rules_t *rules, patch_t *patch)
+void make_window(const patch_rules_t *rules, patch_t *patch)
 {
     const int64_t half = rules->half;
     patch->half = half;
@@ -232,113 +145,6 @@ INLINE void solve(double L[UNKNOWNS][UNKNOWNS], double x[UNKNOWNS])
     }
 }
 
-/* A pair of patches: where, and what the alignment says of it. */
-typedef struct {
-    double u1, v1, u2, v2, A[4];
-} place_t;
-
-typedef struct {
-    double correlation, noise, normal[UNKNOWNS][UNKNOWNS];
-} agreement_t;
-
-/* What is known of a pair beside the images: rows on the six unknowns with what they should be, each over its sigma. */
-typedef struct {
-    double rows[3][UNKNOWNS], values[3];
-} knowledge_t;
-
-/* The epipolar geometry at a node of image 1: the ray f1 of the node turned into line E f1, and E B1. */
-typedef struct {
-    const epipolar_t *geometry;
-    double line[3], by_pixel[3][2];
-} line_t;
-
-/* Return the ray of image 2 at a pixel, and its derivatives by the pixel (a row each of three); 0 outside the field. */
-INLINE int ray_at(const epipolar_t *g, double u, double v, double ray[3], double by_u[3], double by_v[3])
-{
-    const double x = u / g->spacing, y = v / g->spacing;
-    if (!(x >= 1.0 && y >= 1.0 && x < (double)g->columns - 2.0 && y < (double)g->rows - 2.0))
-        return 0;
-    const int64_t left = (int64_t)x, top = (int64_t)y;
-    double across[2][4], down[2][4];
-    for (int64_t way = 0; way < 2; way++) {
-        const double t = way ? y - (double)top : x - (double)left;
-        double (*w)[4] = way ? down : across;
-        w[0][0] = t * (-0.5 + t * (1.0 - 0.5 * t));
-        w[0][1] = 1.0 + t * t * (-2.5 + 1.5 * t);
-        w[0][2] = t * (0.5 + t * (2.0 - 1.5 * t));
-        w[0][3] = t * t * (-0.5 + 0.5 * t);
-        w[1][0] = -0.5 + t * (2.0 - 1.5 * t);
-        w[1][1] = t * (-5.0 + 4.5 * t);
-        w[1][2] = 0.5 + t * (4.0 - 4.5 * t);
-        w[1][3] = t * (-1.0 + 1.5 * t);
-    }
-    for (int64_t n = 0; n < 3; n++)
-        ray[n] = by_u[n] = by_v[n] = 0.0;
-    for (int64_t j = 0; j < 4; j++) {
-        for (int64_t i = 0; i < 4; i++) {
-            const double *at = g->rays2 + 3 * ((top - 1 + j) * g->columns + left - 1 + i);
-            for (int64_t n = 0; n < 3; n++) {
-                ray[n] += down[0][j] * across[0][i] * at[n];
-                by_u[n] += down[0][j] * across[1][i] * at[n];
-                by_v[n] += down[1][j] * across[0][i] * at[n];
-            }
-        }
-    }
-    for (int64_t n = 0; n < 3; n++) {
-        by_u[n] /= g->spacing;
-        by_v[n] /= g->spacing;
-    }
-    return isfinite(ray[0]) && isfinite(ray[1]) && isfinite(ray[2]);
-}
-
-/* Say how far a pair is from its epipolar line in image 2, and how its affinity is from one that agrees with the lines:
- * normal n2 of the line (unit), distance, and n2^T A + n1 / |n2|. Return 0 where there is no line. */
-INLINE int miss(const line_t *line, const place_t *at, double n2[2], double *distance, double off[2])
-{
-    double ray[3], by_u[3], by_v[3];
-    if (!ray_at(line->geometry, at->u2, at->v2, ray, by_u, by_v))
-        return 0;
-    double c = 0.0, n1[2] = {0.0, 0.0};
-    n2[0] = n2[1] = 0.0;
-    for (int64_t n = 0; n < 3; n++) {
-        c += ray[n] * line->line[n];
-        n2[0] += by_u[n] * line->line[n];
-        n2[1] += by_v[n] * line->line[n];
-        n1[0] += ray[n] * line->by_pixel[n][0];
-        n1[1] += ray[n] * line->by_pixel[n][1];
-    }
-    const double length = sqrt(n2[0] * n2[0] + n2[1] * n2[1]);
-    if (!(length > 1e-12))
-        return 0;
-    n2[0] /= length;
-    n2[1] /= length;
-    *distance = c / length;
-    off[0] = n2[0] * at->A[0] + n2[1] * at->A[2] + n1[0] / length;
-    off[1] = n2[0] * at->A[1] + n2[1] * at->A[3] + n1[1] / length;
-    return 1;
-}
-
-/* Fill `known` with what the line says of the next step: q2 changes by -A dq, A by -A dA. Samples are `scale` pixels of
- * image 1 apart. Return 0 where there is no line. */
-INLINE int line_knowledge(const line_t *line, const place_t *at, double scale, knowledge_t *known)
-{
-    double n2[2], distance, off[2];
-    if (!miss(line, at, n2, &distance, off))
-        return 0;
-    const double across[2] = {n2[0] * at->A[0] + n2[1] * at->A[2], n2[0] * at->A[1] + n2[1] * at->A[3]};
-    const double of_place = 1.0 / line->geometry->sigma, of_A = 1.0 / line->geometry->sigma_A;
-    memset(known, 0, sizeof *known);
-    known->rows[0][4] = across[0] * scale * of_place;
-    known->rows[0][5] = across[1] * scale * of_place;
-    known->values[0] = distance * of_place;
-    for (int64_t k = 0; k < 2; k++) {
-        known->rows[1 + k][k] = across[0] * of_A;
-        known->rows[1 + k][2 + k] = across[1] * of_A;
-        known->values[1 + k] = off[k] * of_A;
-    }
-    return 1;
-}
-
 /* Say how the patch read from image 2 (`there`) agrees with that of image 1: its products with `steep` and with the patch,
  * and its own energy, free of offset. `steep` and the weighted patch sum up to nothing: an offset is no part of theirs. */
 INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *energy)
@@ -368,26 +174,67 @@ INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *e
     *energy = (double)square - (double)level * (double)level / p->total;
 }
 
+/* Fill `matrix` and add to `step` what the line says of them; return whether there is a line. */
+INLINE int add_line(
+    const line_t *line, const place_t *place, double scale1, double weight, double step[UNKNOWNS], double matrix[UNKNOWNS][UNKNOWNS])
+{
+    knowledge_t known;
+    if (!line_knowledge(line, place, scale1, &known))
+        return 0;
+    for (int64_t r = 0; r < 3; r++) {
+        for (int64_t m = 0; m < UNKNOWNS; m++) {
+            step[m] += weight * known.rows[r][m] * known.values[r];
+            for (int64_t n = 0; n < UNKNOWNS; n++)
+                matrix[m][n] += weight * known.rows[r][m] * known.rows[r][n];
+        }
+    }
+    return 1;
+}
+
+/* Move `place` by a step: W <- W o dW^-1, that is A <- A (I + dA)^-1, q2 <- q2 - A dq with the new A. Return whether the
+ * step is one that the linear model can mean. */
+INLINE int move_place(place_t *place, const double step[UNKNOWNS], double scale1)
+{
+    const double e = 1.0 + step[0], f = step[1], g = step[2], h = 1.0 + step[3];
+    const double determinant = e * h - f * g;
+    if (!(determinant > 0.1 && determinant < 10.0))
+        return 0;
+    const double before[4] = {place->A[0], place->A[1], place->A[2], place->A[3]};
+    place->A[0] = (before[0] * h - before[1] * g) / determinant;
+    place->A[1] = (before[1] * e - before[0] * f) / determinant;
+    place->A[2] = (before[2] * h - before[3] * g) / determinant;
+    place->A[3] = (before[3] * e - before[2] * f) / determinant;
+    place->u2 -= scale1 * (place->A[0] * step[4] + place->A[1] * step[5]);
+    place->v2 -= scale1 * (place->A[2] * step[4] + place->A[3] * step[5]);
+    return 1;
+}
+
+/* Read the patch of `image2` at `place`; return whether all of it is inside. */
+INLINE int read_there(patch_t *p, const image_t image2, double scale1, double scale2, const place_t *place)
+{
+    const double ratio = scale1 / scale2, half = (double)p->half;
+    const float A[4] = {
+        (float)(ratio * place->A[0]), (float)(ratio * place->A[1]), (float)(ratio * place->A[2]), (float)(ratio * place->A[3])};
+    const double u = place->u2 / scale2, v = place->v2 / scale2;
+    const double wide = half * (double)(fabsf(A[0]) + fabsf(A[1])), high = half * (double)(fabsf(A[2]) + fabsf(A[3]));
+    if (!(is_inside(image2, u - wide, v - high, 0.01) && is_inside(image2, u + wide, v + high, 0.01)))
+        return 0;
+    read_samples(image2, (float)u, (float)v, A, p->u, p->v, p->count, p->there);
+    return 1;
+}
+
 /* Align the patch `p`, taken `scale1` pixels a sample around (u1, v1), with `image2` of `scale2` pixels a sample; return
  * whether it settled. */
 INLINE int align_patch(
     patch_t *p, const image_t image2, double scale1, double scale2, const patch_rules_t *rules, const line_t *line,
     place_t *place, agreement_t *out)
 {
-    const int64_t count = p->count;
     const double half = (double)p->half, u0 = place->u2, v0 = place->v2;
     double step[UNKNOWNS], matrix[UNKNOWNS][UNKNOWNS];
     int fixed = 0;
     for (int64_t k = 0; k <= rules->most_steps; k++) {
-        const double ratio = scale1 / scale2;
-        const float A[4] = {
-            (float)(ratio * place->A[0]), (float)(ratio * place->A[1]), (float)(ratio * place->A[2]),
-            (float)(ratio * place->A[3])};
-        const double u = place->u2 / scale2, v = place->v2 / scale2;
-        const double wide = half * (double)(fabsf(A[0]) + fabsf(A[1])), high = half * (double)(fabsf(A[2]) + fabsf(A[3]));
-        if (!(is_inside(image2, u - wide, v - high, 0.01) && is_inside(image2, u + wide, v + high, 0.01)))
+        if (!read_there(p, image2, scale1, scale2, place))
             return 0;
-        read_samples(image2, (float)u, (float)v, A, p->u, p->v, count, p->there);
         double sums[UNKNOWNS];
         double common, energy;
         compare(p, sums, &common, &energy);
@@ -402,37 +249,16 @@ INLINE int align_patch(
             step[n] = gain * sums[n];
         if (line != NULL || !fixed) {
             memcpy(matrix, p->normal, sizeof matrix);
-            if (line != NULL) {
-                knowledge_t known;
-                if (!line_knowledge(line, place, scale1, &known))
-                    return 0;
-                const double weight = rules->excess_noise * out->noise;
-                for (int64_t r = 0; r < 3; r++) {
-                    for (int64_t m = 0; m < UNKNOWNS; m++) {
-                        step[m] += weight * known.rows[r][m] * known.values[r];
-                        for (int64_t n = 0; n < UNKNOWNS; n++)
-                            matrix[m][n] += weight * known.rows[r][m] * known.rows[r][n];
-                    }
-                }
-            }
+            if (line != NULL && !add_line(line, place, scale1, rules->excess_noise * out->noise, step, matrix))
+                return 0;
             memcpy(out->normal, matrix, sizeof matrix);
             if (!factor(matrix))
                 return 0;
             fixed = 1;
         }
         solve(matrix, step);
-        /* W <- W o dW^-1: A <- A (I + dA)^-1, q2 <- q2 - A dq with the new A. */
-        const double e = 1.0 + step[0], f = step[1], g = step[2], h = 1.0 + step[3];
-        const double determinant = e * h - f * g;
-        if (!(determinant > 0.1 && determinant < 10.0))
+        if (!move_place(place, step, scale1))
             return 0;
-        const double before[4] = {place->A[0], place->A[1], place->A[2], place->A[3]};
-        place->A[0] = (before[0] * h - before[1] * g) / determinant;
-        place->A[1] = (before[1] * e - before[0] * f) / determinant;
-        place->A[2] = (before[2] * h - before[3] * g) / determinant;
-        place->A[3] = (before[3] * e - before[2] * f) / determinant;
-        place->u2 -= scale1 * (place->A[0] * step[4] + place->A[1] * step[5]);
-        place->v2 -= scale1 * (place->A[2] * step[4] + place->A[3] * step[5]);
         const double away_u = (place->u2 - u0) / scale2, away_v = (place->v2 - v0) / scale2;
         if (!(away_u * away_u + away_v * away_v < rules->most_move * rules->most_move))
             return 0;
@@ -498,7 +324,7 @@ INLINE double covariance_of(const place_t *place, double scale1, const agreement
 
 /* Align the patches around a pair as finely as its texture allows; write PATCH_COLUMNS numbers and return 1 if it is good.
  * The patch of the image that shows the surface larger is read from a coarser level: both are equally sharp. */
-INLINE int align_pair(
+FOR_EACH_PROCESSOR int align_pair(
     const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch,
     place_t *place, double *out)
 {
@@ -545,128 +371,4 @@ FOR_EACH_PROCESSOR void align_patches(
             for (int64_t n = 0; n < PATCH_COLUMNS; n++)
                 out[PATCH_COLUMNS * k + n] = NAN;
     }
-}
-
-/* The nodes whose neighbours are still to be tried, the best correlation on top. */
-typedef struct {
-    const double *out;
-    int32_t *nodes;
-    int64_t count;
-} heap_t;
-
-INLINE double rank_of(const heap_t *heap, int64_t place) { return heap->out[(int64_t)PATCH_COLUMNS * heap->nodes[place] + 6]; }
-
-INLINE void swap_nodes(heap_t *heap, int64_t a, int64_t b)
-{
-    const int32_t node = heap->nodes[a];
-    heap->nodes[a] = heap->nodes[b];
-    heap->nodes[b] = node;
-}
-
-static void push_node(heap_t *heap, int32_t node)
-{
-    int64_t at = heap->count++;
-    heap->nodes[at] = node;
-    for (; at > 0 && rank_of(heap, at) > rank_of(heap, (at - 1) / 2); at = (at - 1) / 2)
-        swap_nodes(heap, at, (at - 1) / 2);
-}
-
-static int32_t pop_node(heap_t *heap)
-{
-    const int32_t best = heap->nodes[0];
-    heap->nodes[0] = heap->nodes[--heap->count];
-    for (int64_t at = 0;;) {
-        int64_t next = 2 * at + 1;
-        if (next + 1 < heap->count && rank_of(heap, next + 1) > rank_of(heap, next))
-            next++;
-        if (next >= heap->count || rank_of(heap, next) <= rank_of(heap, at))
-            return best;
-        swap_nodes(heap, at, next);
-        at = next;
-    }
-}
-
-/* Try the pair `place` at its node; return 1 and write it if it is good. */
-INLINE int try_node(
-    const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
-    const patch_grid_t *grid, int64_t node, patch_t *patch, place_t *place)
-{
-    line_t line = {.geometry = epipolar};
-    const double *ray = grid->rays1 + 3 * node, *by = grid->jacobians1 + 6 * node;
-    if (!isfinite(ray[0]))
-        return 0;
-    for (int64_t n = 0; n < 3; n++) {
-        const double *E = epipolar->E21 + 3 * n;
-        line.line[n] = E[0] * ray[0] + E[1] * ray[1] + E[2] * ray[2];
-        for (int64_t k = 0; k < 2; k++)
-            line.by_pixel[n][k] = E[0] * by[k] + E[1] * by[2 + k] + E[2] * by[4 + k];
-    }
-    const int knows = isfinite(epipolar->sigma), gated = isfinite(epipolar->most_distance);
-    double found[PATCH_COLUMNS], n2[2], distance, off[2];
-    grid->tries[node]++;
-    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->most_distance + rules->most_move))
-        return 0;
-    if (!align_pair(first, second, rules, knows ? &line : NULL, patch, place, found))
-        return 0;
-    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->most_distance))
-        return 0;
-    memcpy(grid->out + PATCH_COLUMNS * node, found, sizeof found);
-    return 1;
-}
-
-/* Grow pairs over the nodes of image 1 from `seeds` (as the starts of `align_patches`), the best first; `out` is NaN where
- * there is none. Return how many nodes have a pair. */
-FOR_EACH_PROCESSOR int64_t grow_patches(
-    const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
-    const patch_grid_t *grid, const double *seeds, int64_t count)
-{
-    patch_t patch;
-    make_window(rules, &patch);
-    const int64_t nodes = grid->rows * grid->columns;
-    const double step = (double)grid->step;
-    heap_t heap = {grid->out, grid->heap, 0};
-    memset(grid->tries, 0, (size_t)nodes);
-    for (int64_t k = 0; k < nodes * PATCH_COLUMNS; k++)
-        grid->out[k] = NAN;
-    int64_t grown = 0;
-    for (int64_t k = 0; k < count; k++) {
-        const double *at = seeds + 8 * k;
-        const int64_t column = (int64_t)floor(at[0] / step + 0.5), row = (int64_t)floor(at[1] / step + 0.5);
-        if (column < 0 || row < 0 || column >= grid->columns || row >= grid->rows)
-            continue;
-        const int64_t node = row * grid->columns + column;
-        if (isfinite(grid->out[PATCH_COLUMNS * node]))
-            continue;
-        const double u = step * (double)column - at[0], v = step * (double)row - at[1];
-        place_t place = {
-            step * (double)column, step * (double)row, at[2] + at[4] * u + at[5] * v, at[3] + at[6] * u + at[7] * v,
-            {at[4], at[5], at[6], at[7]}};
-        if (try_node(first, second, epipolar, rules, grid, node, &patch, &place)) {
-            push_node(&heap, (int32_t)node);
-            grown++;
-        }
-        /* A bad seed must not keep the surface from coming this way. */
-        grid->tries[node] = 0;
-    }
-    while (heap.count > 0) {
-        const int64_t node = pop_node(&heap), row = node / grid->columns, column = node % grid->columns;
-        const double *at = grid->out + PATCH_COLUMNS * node;
-        for (int64_t way = 0; way < 4; way++) {
-            const int64_t du = way == 0 ? 1 : way == 1 ? -1 : 0, dv = way == 2 ? 1 : way == 3 ? -1 : 0;
-            const int64_t next = (row + dv) * grid->columns + column + du;
-            if (row + dv < 0 || row + dv >= grid->rows || column + du < 0 || column + du >= grid->columns)
-                continue;
-            if (grid->tries[next] >= grid->most_tries || isfinite(grid->out[PATCH_COLUMNS * next]))
-                continue;
-            const double u = step * (double)du, v = step * (double)dv;
-            place_t place = {
-                step * (double)(column + du), step * (double)(row + dv), at[0] + at[2] * u + at[3] * v,
-                at[1] + at[4] * u + at[5] * v, {at[2], at[3], at[4], at[5]}};
-            if (try_node(first, second, epipolar, rules, grid, next, &patch, &place)) {
-                push_node(&heap, (int32_t)next);
-                grown++;
-            }
-        }
-    }
-    return grown;
 }

@@ -1,4 +1,4 @@
-"""Calls of the kernels in patches.c: patches of two images aligned, one by one or grown over a surface."""
+"""Calls of the kernels in patches.c and patch_growth.c: patches of two images, aligned or grown over a surface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calls of the kernels in pose.c: hypotheses of the relative pose against many matches."""
+"""Calls of the kernels in pose_quality.c and pose_minimum.c: hypotheses of the relative pose against many matches."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def qualities(packed: FloatArray, E21: Mat3, noise: float) -> FloatArray:
 
 
 def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, sigmas: float) -> FloatArray:
-    """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3); see pose.c."""
+    """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3), as pose_quality.c."""
     R, t = np.ascontiguousarray(R, np.float64), np.ascontiguousarray(t, np.float64)
     out = np.empty(len(t))
     kernels().qualities_ahead(packed, packed.shape[1], R, t, len(t), noise, sigmas, out)
@@ -71,8 +71,8 @@ def minimise(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, int, bool]:
     """Return R, t, residuals (M,), Jacobian (M, 5), weights (M,), iterations, and whether the last step was small.
 
-    `affine` (25, K) are the affinities of the matches `which` (K,), see pose.c; `loss` is 0 for none, 1 for Cauchy's
-    or 2 for the marginal one, and its scale; `free` which of the five unknowns move.
+    `affine` (25, K) are the affinities of the matches `which` (K,), see pose_minimum.c; `loss` is 0 for none,
+    1 for Cauchy's or 2 for the marginal one, and its scale; `free` which of the five unknowns move.
     """
     packed, affine, point_weights = (np.ascontiguousarray(a, np.float64) for a in (packed, affine, point_weights))
     which, free = (np.ascontiguousarray(a, np.int64) for a in (which, free))

@@ -158,7 +158,7 @@ INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const
     for (int64_t j = 0; j <= along[1].count; j++, before = ink, ink += tag->cells)
         add_row(along, ink, before, j ? (const float(*)[BLOCK])along[1].part[j - 1] : NULL, sums);
     for (int i = 0; i < BLOCK; i++) {
-        /* Blur along the two normals is correlated: Mehler's series, as in edges.c. */
+        /* Blur along the two normals is correlated: Mehler's series, as in edges_model.c. */
         const float rho = n[0][0][i] * n[1][0][i] + n[0][1][i] * n[1][1][i], half = 0.5f * rho * rho;
         const float by_x = per_s * (sums[1][0][i] + rho * sums[2][1][i] + half * sums[3][2][i]);
         const float by_y = per_s * (sums[0][1][i] + rho * sums[1][2][i] + half * sums[2][3][i]);
@@ -303,6 +303,58 @@ static double tag_equations(
     return products[PARAMETERS];
 }
 
+/* Add what is known of the `bends` and of the light beforehand, at noise of this `variance`. */
+static void add_prior(
+    const tag_t *tag, double bend_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS], double step[PARAMETERS])
+{
+    const double dim = 1.0 / (rules->light_sigma * tag->scale), straight = variance / (bend_sigma * bend_sigma);
+    for (int i = BENDS; i < MOVES; i++) {
+        step[i] -= straight * tag->moves[i];
+        N[i * (PARAMETERS + 1)] += straight;
+    }
+    for (int axis = 0; axis < 2; axis++) {
+        step[GX + axis] -= dim * dim * variance * tag->g[axis];
+        N[(GX + axis) * (PARAMETERS + 1)] += dim * dim * variance;
+    }
+}
+
+/* Take a step, cut where the model is not linear; return the largest of the moves that it wants. */
+static double take_step(tag_t *tag, const double step[PARAMETERS], const tag_rules_t *rules)
+{
+    double largest = 0.0;
+    for (int i = 0; i < MOVES; i++) {
+        largest = fabs(step[i]) > largest ? fabs(step[i]) : largest;
+        tag->moves[i] += limited(step[i], rules->most_move_px);
+    }
+    tag->s += limited(step[S], rules->most_blur_change * tag->s);
+    tag->s = tag->s < rules->least_blur ? rules->least_blur : tag->s > rules->most_blur ? rules->most_blur : tag->s;
+    tag->a += step[A];
+    tag->b += step[B];
+    tag->g[0] = limited(tag->g[0] + step[GX], 1.0);
+    tag->g[1] = limited(tag->g[1] + step[GY], 1.0);
+    return largest;
+}
+
+/* Write the fitted tag with `N`, the normal equations' factor. */
+static void write_tag(const tag_t *tag, const double *N, double variance, double *result)
+{
+    memcpy(result, tag->moves, BENDS * sizeof(double));
+    for (int corner = 0; corner < 4; corner++) {
+        double spread = 0.0;
+        for (int axis = 0; axis < 2; axis++) {
+            double unit[PARAMETERS] = {0.0};
+            unit[2 * corner + axis] = 1.0;
+            cholesky_solve(N, PARAMETERS, unit);
+            spread += unit[2 * corner + axis];
+        }
+        result[BENDS + corner] = sqrt(0.5 * variance * spread);
+    }
+    result[BENDS + 4] = tag->s;
+    result[BENDS + 5] = -tag->b;
+    result[BENDS + 6] = sqrt(variance);
+    result[BENDS + 7] = 1.0;
+}
+
 void fit_tags(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *maps, const double *centres,
     const double *scales, const uint8_t *ink, int64_t cells, const double *breaks, double reach, const double *blur,
@@ -322,54 +374,18 @@ void fit_tags(
         for (int64_t k = 0; k < squares; k++)
             for (int i = 0; i < BLOCK; i++)
                 tag.a += (double)blocks[k].counts[i] * ((double)blocks[k].value[i] - 0.5 * tag.b) / (double)seen;
-        const double dim = 1.0 / (rules->light_sigma * tag.scale);
         double N[PARAMETERS * PARAMETERS], step[PARAMETERS], variance = 0.0;
-        int solved = 1, settled = 0;
-        for (int64_t k = 0; k < rules->iterations && solved && !settled; k++) {
+        int settled = 0;
+        for (int64_t k = 0; k < rules->iterations && !settled; k++) {
             variance = tag_equations(&tag, blocks, squares, rules, N, step) / (double)(seen - PARAMETERS);
             variance = variance > rules->least_variance ? variance : rules->least_variance;
-            const double straight = variance / (bend_sigma[n] * bend_sigma[n]);
-            for (int i = BENDS; i < MOVES; i++) {
-                step[i] -= straight * tag.moves[i];
-                N[i * (PARAMETERS + 1)] += straight;
-            }
-            for (int axis = 0; axis < 2; axis++) {
-                step[GX + axis] -= dim * dim * variance * tag.g[axis];
-                N[(GX + axis) * (PARAMETERS + 1)] += dim * dim * variance;
-            }
-            solved = cholesky(N, PARAMETERS);
-            if (!solved)
+            add_prior(&tag, bend_sigma[n], variance, rules, N, step);
+            if (!cholesky(N, PARAMETERS))
                 break;
             cholesky_solve(N, PARAMETERS, step);
-            double largest = 0.0;
-            for (int i = 0; i < MOVES; i++) {
-                largest = fabs(step[i]) > largest ? fabs(step[i]) : largest;
-                tag.moves[i] += limited(step[i], rules->most_move_px);
-            }
-            tag.s += limited(step[S], rules->most_blur_change * tag.s);
-            tag.s = tag.s < rules->least_blur ? rules->least_blur : tag.s > rules->most_blur ? rules->most_blur : tag.s;
-            tag.a += step[A];
-            tag.b += step[B];
-            tag.g[0] = limited(tag.g[0] + step[GX], 1.0);
-            tag.g[1] = limited(tag.g[1] + step[GY], 1.0);
-            settled = largest <= rules->converged_px;
+            settled = take_step(&tag, step, rules) <= rules->converged_px;
         }
-        if (!solved || !settled)
-            continue;
-        memcpy(result, tag.moves, BENDS * sizeof(double));
-        for (int corner = 0; corner < 4; corner++) {
-            double spread = 0.0;
-            for (int axis = 0; axis < 2; axis++) {
-                double unit[PARAMETERS] = {0.0};
-                unit[2 * corner + axis] = 1.0;
-                cholesky_solve(N, PARAMETERS, unit);
-                spread += unit[2 * corner + axis];
-            }
-            result[BENDS + corner] = sqrt(0.5 * variance * spread);
-        }
-        result[BENDS + 4] = tag.s;
-        result[BENDS + 5] = -tag.b;
-        result[BENDS + 6] = sqrt(variance);
-        result[BENDS + 7] = 1.0;
+        if (settled)
+            write_tag(&tag, N, variance, result);
     }
 }

@@ -1,4 +1,4 @@
-"""What the detector asks the kernels of front.c for, in numpy and OpenCV; arguments as those of `rigkit.kernels.front`.
+"""What the detector asks the kernels of `rigkit.kernels.front` for, in numpy and OpenCV, with the same arguments.
 
 The tolerances are those of the detector, whatever the rules say.
 """

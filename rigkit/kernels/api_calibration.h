@@ -1,0 +1,125 @@
+/* Declarations of api.h: cameras and the normal equations of calibrations. */
+#ifndef RIGKIT_KERNELS_API_CALIBRATION_H
+#define RIGKIT_KERNELS_API_CALIBRATION_H
+
+/* departures.c */
+
+/* Displacements of an image that models leave out: so many powers of the radius, and of those that are not radial eight
+ * (calibration.departures). A pose has six numbers. */
+enum { RADIAL_POWERS = 5, DISPLACEMENTS = RADIAL_POWERS + 8, POSE = 6 };
+
+/* Corners of boards, view after view so many: their derivatives, what turns with the pose (board corner less the board's
+ * origin, in the camera frame), where they project, the residuals, and which of them tell anything. The derivatives by the
+ * parameters count in units of `sigmas`. */
+typedef struct {
+    ARRAY(const double, d_pixels_d_point, 2, 3, count);
+    ARRAY(const double, d_pixels_d_parameters, 2, parameters, count);
+    ARRAY(const double, sigmas, parameters);
+    ARRAY(const double, lever, 3, count);
+    ARRAY(const double, u, count);
+    ARRAY(const double, v, count);
+    ARRAY(const double, residuals, count, 2);
+    ARRAY(const uint8_t, told, count);
+    ARRAY(const int64_t, counts, views);
+    int64_t count, parameters, views, width, height;
+} lens_corners_t;
+
+EXPORT void displace_pixels(
+    ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
+    ARRAY(double, out, 2, DISPLACEMENTS, count));
+EXPORT void displace_by(
+    ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
+    ARRAY(const double, amounts, DISPLACEMENTS), ARRAY(double, out, 2, count));
+EXPORT int64_t lens_memory(int64_t parameters);
+EXPORT void lens_products(
+    const lens_corners_t *corners, ARRAY(double, memory, lens_memory(corners.parameters)),
+    ARRAY(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
+    ARRAY(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
+EXPORT void average_amounts(
+    ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
+    ARRAY(const double, sizes, count), int64_t count, ARRAY(double, out, DISPLACEMENTS, DISPLACEMENTS));
+
+/* linearise.c */
+
+/* Views of boards, padded to so many corners each, and what their residuals weigh (calibration.linearise): poses, the boards'
+ * points and by how much a warp moves them, which point each corner is, and where each point stands among those released (-1
+ * where it does not). Corners that do not project are `lost_px` off, along both axes; the loss is least squares where
+ * `loss_px` is zero. */
+typedef struct {
+    ARRAY(const double, rotation, views, 3, 3);
+    ARRAY(const double, translation, views, 3);
+    ARRAY(const double, table, points, 3);
+    ARRAY(const double, warp, points, 3, warps);
+    ARRAY(const int64_t, place, points);
+    ARRAY(const int64_t, point, views, corners);
+    ARRAY(const double, pixels, views, corners, 2);
+    ARRAY(const double, weight, views, corners);
+    int64_t views, corners, points, warps, released;
+    double loss_px, lost_px;
+} board_views_t;
+
+/* What they come to: residuals, which corners project, the cost of each view, and the sums of products of its `across` rows;
+ * of the released points those with all rows of their corners and their own three, and with the poses. */
+typedef struct {
+    ARRAY(double, residuals, 2, views, corners);
+    ARRAY(uint8_t, valid, views, corners);
+    ARRAY(double, costs, views);
+    ARRAY(double, products, views, across, across);
+    ARRAY(double, own, released, 3, across + 3);
+    ARRAY(double, poses, views, released, 3, POSE);
+    int64_t views, corners, across, released;
+} view_sums_t;
+
+/* Where the corners of the views from `first` on stand in the camera frame, and those without the translation. */
+EXPORT void place_corners(
+    const board_views_t *seen, int64_t first, int64_t count, ARRAY(double, lever, 3, count), ARRAY(double, points, 3, count));
+EXPORT int64_t rows_memory(int64_t across);
+EXPORT void add_views(
+    const board_views_t *seen, int64_t first, int64_t count, int64_t parameters,
+    ARRAY(const double, d_pixels_d_point, 2, 3, count), ARRAY(const double, d_pixels_d_parameters, 2, parameters, count),
+    ARRAY(const double, u, count), ARRAY(const double, v, count), ARRAY(const uint8_t, projects, count),
+    ARRAY(const double, lever, 3, count), ARRAY(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
+
+/* coverage.c */
+
+EXPORT void cover_pixels(
+    ARRAY(const int64_t, grid, count, 2), ARRAY(const double, corners, count, 2), int64_t count,
+    ARRAY(const int64_t, counts, views), int64_t views, double squares, ARRAY(const double, pixels, asked, 2), int64_t asked,
+    ARRAY(uint8_t, covered, asked));
+
+/* brown.c */
+
+/* Points in the camera frame and a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero where it has less of them. Of
+ * derivatives by parameters so many `rows` are written, none or those that the camera has; zeros are not. */
+typedef struct {
+    ARRAY(const double, x, count);
+    ARRAY(const double, y, count);
+    ARRAY(const double, z, count);
+    ARRAY(const double, parameters, 12);
+    int64_t count, rows, rational;
+    double max_r;
+} brown_points_t;
+
+EXPORT void differentiate_brown(
+    const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, 3, points.count),
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
+    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+
+/* monotone.c */
+
+/* Functions linear x + factor P(x) - offset that increase from `low` to `high`, and a table of their roots, even in a target
+ * from `first` to `last`. */
+typedef struct {
+    ARRAY(const double, polynomial, terms);
+    ARRAY(const double, linear, count);
+    ARRAY(const double, factor, count);
+    ARRAY(const double, offset, count);
+    ARRAY(const double, target, count);
+    ARRAY(const double, table, cells + 1);
+    int64_t terms, count, cells;
+    double first, last, low, high;
+} increasing_t;
+
+EXPORT void invert_increasing(const increasing_t *functions, ARRAY(double, out, functions.count));
+
+#endif

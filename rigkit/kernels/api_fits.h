@@ -1,0 +1,168 @@
+/* Declarations of api.h: sub-pixel fits of corners, tags, circles and whole boards. */
+#ifndef RIGKIT_KERNELS_API_FITS_H
+#define RIGKIT_KERNELS_API_FITS_H
+
+/* edges.c, with edges_window.c, edges_model.c and edges_noise.c */
+
+/* How far two pixels lie apart, both ways, whose noise is compared: LAGS pairs, of which the opposite ones are the same.
+ * What comes out of a corner: u, v, sigma, s, 2 b, RMS residual, RMS noise, whether it is valid, its pixels, for each of
+ * the LAGS the sum of products of the noise, and of how many. */
+enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, OUTCOMES = 9 + 2 * LAGS };
+
+/* The constants of detection.subpixel.edge_model and detection.subpixel.edge_fit, under their names there. */
+typedef struct {
+    double reach, end_sigmas, paper_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
+    double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
+    double most_move_px, most_turn, most_blur_change, most_light_change;
+    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
+    int64_t iterations, mirrored, fewest_mirrored;
+} edge_rules_t;
+
+EXPORT int64_t edges_scratch(const edge_rules_t *rules);
+EXPORT void fit_edges(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
+    ARRAY(const double, curvature, count, 2), ARRAY(const double, curvature_sigma, count, 2),
+    ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, tilts, count, 2, 2),
+    ARRAY(const double, reach, count, 2, 2),
+    ARRAY(const double, paper, count, 2, 2), ARRAY(const double, single, count, 2), ARRAY(const double, sign, count),
+    ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
+    ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
+
+/* bends.c */
+
+/* The constants of detection.subpixel.edge_curvature. */
+typedef struct {
+    double decay, least_sigma, free, bent;
+    int64_t reach;
+} bend_rules_t;
+
+EXPORT void line_bends(
+    ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns),
+    ARRAY(const uint8_t, wanted, rows, columns), int64_t rows, int64_t columns, int64_t count,
+    ARRAY(const double, sides, count, 2), const bend_rules_t *rules, ARRAY(double, out, count, 2),
+    ARRAY(double, out_sigma, count, 2));
+
+/* paper.c */
+
+/* The constants of detection.subpixel.outer_squares, under their names there. */
+typedef struct {
+    ARRAY(const double, steps, step_count);
+    int64_t step_count;
+    double aside, first, last, goes_on, cut, near_witness, seen, max_paper;
+} paper_rules_t;
+
+EXPORT int64_t paper_memory(int64_t count);
+EXPORT void find_paper(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, gaps, count, 2, 2),
+    ARRAY(const uint8_t, ends, count, 2, 2), ARRAY(const double, contrast, count), ARRAY(const double, blur, count),
+    ARRAY(const double, sign, count), ARRAY(const int64_t, owner, count), const paper_rules_t *rules,
+    ARRAY(double, scratch, 2 * rules.step_count + 4 * count), ARRAY(uint8_t, memory, paper_memory(count)),
+    ARRAY(int64_t, near, 4 * count), ARRAY(double, paper, count, 2, 2), ARRAY(double, out_gaps, count, 2, 2));
+
+/* surface.c */
+
+/* Degree of the polynomial that a lens adds to a perspective, at most, and how many terms x^i y^j that has. */
+enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGREE + 2) / 2 };
+
+EXPORT double fit_perspective(
+    ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
+EXPORT int64_t fit_polynomials(
+    ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, double middle_x,
+    double middle_y, double size, int64_t terms, double most_leverage, ARRAY(double, basis, terms, count),
+    ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, scratch, 4, count),
+    ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, foretold, count, 2), ARRAY(double, leverage, count));
+EXPORT void polynomial_at(
+    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    int64_t degree, ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
+    ARRAY(double, out, 5, count, 2));
+EXPORT void surest_polynomial(
+    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
+    ARRAY(const double, misses, SURFACE_DEGREE + 1), ARRAY(double, out, count, 3));
+EXPORT void read_modules(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
+    ARRAY(const double, maps, count, 3, 3), int64_t count, int64_t side,
+    ARRAY(double, bright, count, side * side), ARRAY(double, spread, count));
+
+/* tags.c */
+
+/* What comes out of a tag: moves of the four corners (8), their standard deviations (4), blur, contrast, RMS residual,
+ * whether it settled. Terms of a cubic polynomial of two variables. Pixels on a side of the squares that are
+ * taken at once, and the doubles of one. */
+enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
+
+/* The constants of detection.tags.whole, under their names there. */
+typedef struct {
+    double tail_sigmas, pixel_kurtosis, sharp_blur, least_blur, most_blur, most_move_px, most_blur_change, light_sigma;
+    double least_variance, converged_px;
+    int64_t iterations;
+} tag_rules_t;
+
+EXPORT void fit_tags(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2), ARRAY(const double, scales, count),
+    ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells, ARRAY(const double, breaks, cells - 1), double reach,
+    ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
+    ARRAY(double, scratch, most, TAG_BLOCK), ARRAY(double, out, count, TAG_OUTCOMES));
+
+/* boards.c */
+
+/* Planes of the picture of a board: the pattern, its slopes along u and v, what lies beyond each of the four sides, how the
+ * pattern changes as they go further out. */
+enum { BOARD_PLANES = 11 };
+
+EXPORT void board_places(
+    ARRAY(const double, coefficients, rows + 2, columns + 2, 2), int64_t rows, int64_t columns, int64_t left, int64_t top,
+    int64_t width, int64_t height, double around, ARRAY(double, places, height, width, 2));
+EXPORT void board_picture(
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
+    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp, ARRAY(float, out, BOARD_PLANES, height, width));
+
+/* board_changes.c */
+
+EXPORT void board_shares(
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing,
+    double most, int64_t cubic, int64_t margin, ARRAY(int32_t, nodes, height, width, 2),
+    ARRAY(float, weights, height, width, 2, 4), ARRAY(int64_t, boxes, rows * columns, 4));
+EXPORT void board_values(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const double, values, count, rows, columns), int64_t count,
+    ARRAY(float, out, count, height, width));
+EXPORT void move_blocks(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const float, gradient, 2, height, width),
+    ARRAY(const float, weight, height, width), ARRAY(const float, taps, 2 * radius + 1), int64_t radius,
+    ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
+    ARRAY(float, scratch, 3 * room), int64_t size, ARRAY(float, data, size));
+EXPORT void share_blocks(
+    ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
+    int64_t height, int64_t rows, int64_t columns, ARRAY(const float, planes, wide_by, height, width), int64_t wide_by,
+    ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
+    ARRAY(float, scratch, room), int64_t size, ARRAY(float, data, size));
+EXPORT void block_products(
+    ARRAY(const int64_t, boxes, count, 4), ARRAY(const int64_t, starts, count), ARRAY(const int64_t, wide_by, count),
+    ARRAY(const int64_t, first, count), int64_t count, int64_t size, ARRAY(const float, data, size),
+    ARRAY(const float, rest, height, width), int64_t width, int64_t height, int64_t unknowns,
+    ARRAY(double, out, unknowns, unknowns), ARRAY(double, right, unknowns));
+
+/* circles.c */
+
+/* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness
+ * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8). */
+enum { CIRCLE_OUTCOMES = 23, SPOT = 3 };
+
+/* The constants of detection.circles.fit, under their names there. */
+typedef struct {
+    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px;
+    int64_t iterations, fewest;
+} circle_rules_t;
+
+EXPORT void fit_circles(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2), ARRAY(const double, bends, count, 2, 3),
+    ARRAY(const double, blur, count), ARRAY(const double, reach, count), const circle_rules_t *rules, int64_t most,
+    ARRAY(double, scratch, most, SPOT), ARRAY(double, out, count, CIRCLE_OUTCOMES));
+
+#endif

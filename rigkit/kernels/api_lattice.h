@@ -1,0 +1,176 @@
+/* Declarations of api.h: from an image to lattices of corners. */
+#ifndef RIGKIT_KERNELS_API_LATTICE_H
+#define RIGKIT_KERNELS_API_LATTICE_H
+
+/* An image of brightness. */
+typedef struct {
+    ARRAY(const float, brightness, height, width);
+    int64_t width, height;
+} image_t;
+
+/* smoothing.c */
+
+EXPORT void shrink_floats(
+    ARRAY(const float, image, height, width), int64_t height, int64_t width, int64_t factor, ARRAY(float, sums, width),
+    ARRAY(float, out, height / factor, width / factor));
+EXPORT void shrink_bytes(
+    ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, int64_t factor,
+    ARRAY(uint16_t, sums, width), ARRAY(float, out, height / factor, width / factor));
+EXPORT void smooth_floats(
+    ARRAY(const float, image, height, width), int64_t height, int64_t width, ARRAY(const float, kernel, 5),
+    ARRAY(float, column, width + 4), ARRAY(float, out, height, width),
+    ARRAY(float, half, (height + 1) / 2, (width + 1) / 2));
+EXPORT void smooth_bytes(
+    ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, ARRAY(const float, kernel, 5), float whole,
+    ARRAY(uint16_t, column, width + 4), ARRAY(float, out, height, width),
+    ARRAY(float, half, (height + 1) / 2, (width + 1) / 2));
+
+/* peaks.c */
+
+/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. */
+enum { STRIP = 64 };
+
+EXPORT void typical_values(
+    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, int64_t step,
+    int64_t few, ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
+    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
+EXPORT int64_t find_peaks(
+    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float threshold,
+    ARRAY(float, scratch, 5 * (width + STRIP + 4)), ARRAY(uint8_t, high, 5 * (width / STRIP + 1)),
+    ARRAY(int32_t, at, (height / 3 + 1) * (width / 3 + 1), 2),
+    ARRAY(float, response, (height / 3 + 1) * (width / 3 + 1)));
+EXPORT int64_t keep_strongest(
+    ARRAY(int32_t, at, count, 2), ARRAY(float, response, count), int64_t count, int64_t height, int64_t width, int64_t side,
+    int64_t most, int64_t finest, ARRAY(float, squares, (height / side + 1) * (width / side + 1)),
+    ARRAY(int32_t, bins, finest + 1), ARRAY(int32_t, share, count));
+
+/* corners.c; rings also in growth.c */
+
+/* Samples of a ring in half a turn (detection.saddles.ring): known here, the loops over them need no counting. */
+enum { HALF = 16, TURN = 2 * HALF };
+
+/* How rings are read (detection.saddles.ring): `circle` holds the (u, v) of HALF samples in half a turn and of their
+ * opposites; `gains` R_2 / R_4 over the ratio of harmonic 2 at half the radius to that on the ring, from 1/4 to 1. */
+typedef struct {
+    ARRAY(const float, circle, TURN, 2);
+    ARRAY(const double, gains, gain_count);
+    int64_t gain_count;
+    double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
+} ring_rules_t;
+
+EXPORT int64_t find_corners(
+    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp,
+    ARRAY(const int32_t, peaks, count, 2), ARRAY(const float, response, count), int64_t count,
+    ARRAY(double, saddles, count, 2), ARRAY(int64_t, which, count), ARRAY(double, angles, count + 1, 2),
+    ARRAY(double, contrast, count + 1), ARRAY(int64_t, found, 1));
+EXPORT int64_t mark_known(
+    ARRAY(const double, fresh, count, 2), int64_t count, ARRAY(const double, known, known_count, 2), int64_t known_count,
+    double reach, ARRAY(uint8_t, mark, count));
+
+/* links.c */
+
+/* The constants of detection.lattice.links. */
+typedef struct {
+    int64_t neighbours, places, most;
+    ARRAY(const double, along, places);
+    double arm_cosine, contrast_ratio, length_ratio, aside, least_aside;
+} link_rules_t;
+
+/* The corners and the level that their edges are read from. */
+typedef struct {
+    ARRAY(const double, pixels, count, 2);
+    ARRAY(const double, lines, count, 2, 2);
+    ARRAY(const double, contrast, count);
+    ARRAY(const double, least, count);
+    ARRAY(const double, most, count);
+    ARRAY(const double, reach, count);
+    int64_t count;
+} corners_t;
+
+EXPORT int64_t find_links(
+    const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules,
+    ARRAY(int64_t, nearest, corners.count, 4), ARRAY(int64_t, both, corners.count, 4));
+
+/* growth.c */
+
+enum { FIT_COLUMNS = 12 };
+
+/* The constants of detection.lattice.local_fit. */
+typedef struct {
+    int64_t degree, radius, leave_out;
+    double width, ridge[2];
+} fit_rules_t;
+
+/* See the constants of detection.lattice.grow, detection.lattice.links and detection.saddles.ring. */
+typedef struct {
+    fit_rules_t predictions[2];
+    const ring_rules_t *ring;
+    ARRAY(const double, along, places);
+    int64_t places, most, tried, fewest;
+    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, least_area;
+} growth_rules_t;
+
+/* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */
+typedef struct {
+    image_t image;
+    double scale, offset;
+} pyramid_level_t;
+
+/* A lattice within empty cells; `sign` of the cell (0, 0) is +1 where brightness grows with the angle across its +column
+ * edge. `due` marks the cells to be tried with each of the two predictions. */
+typedef struct {
+    ARRAY(double, pixels, rows, columns, 2);
+    ARRAY(double, contrast, rows, columns);
+    ARRAY(uint8_t, due, 2, rows, columns);
+    int64_t rows, columns;
+    double sign;
+} sheet_t;
+
+/* Points in squares: those of square b are order[first[b]] to order[first[b + 1] - 1]; filled by `sort_points`. */
+typedef struct {
+    const double *points;
+    int32_t *first, *order;
+    int64_t columns, rows;
+    double left, top, side;
+} squares_t;
+
+EXPORT void fit_cells(
+    ARRAY(const double, lattice, rows, columns, 2), int64_t rows, int64_t columns,
+    ARRAY(const uint8_t, cells, rows, columns), const fit_rules_t *rules, int64_t count,
+    ARRAY(double, out, count, FIT_COLUMNS));
+EXPORT int64_t squares_memory(int64_t count);
+EXPORT void sort_points(
+    ARRAY(const double, points, count, 2), int64_t count, ARRAY(int32_t, memory, squares_memory(count)), squares_t *out);
+EXPORT int64_t grow_lattice(
+    sheet_t *sheet, const pyramid_level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
+    ARRAY(double, fresh, sheet.rows * sheet.columns, 3), ARRAY(int64_t, where, sheet.rows * sheet.columns));
+
+/* components.c */
+
+EXPORT int64_t find_components(
+    int64_t count, ARRAY(int64_t, to, count, 4), ARRAY(int64_t, label, count), ARRAY(int64_t, grid, count, 2),
+    ARRAY(int64_t, turn, count), ARRAY(int64_t, members, count), ARRAY(int64_t, queue, 2 * count),
+    ARRAY(uint8_t, bound, 4 * count));
+
+/* lattice.c */
+
+/* The constants of detection.subpixel.scatter. */
+typedef struct {
+    double unexplained, median_of_normal;
+    int64_t fewest_corners, fewest_differences, first_order, last_order;
+} scatter_rules_t;
+
+EXPORT void uneven_steps(
+    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns,
+    ARRAY(double, scratch, 2 * rows * columns), int64_t inner, ARRAY(double, typical, inner),
+    ARRAY(int64_t, seen, inner), ARRAY(double, every, 2));
+EXPORT void excess_scatter(
+    ARRAY(const double, pixels, height, width, 2), ARRAY(const double, sigma, height, width), int64_t height,
+    int64_t width, ARRAY(const int64_t, parts, count, 4), int64_t count, const scatter_rules_t *rules,
+    ARRAY(double, scratch, 7 * height * width), ARRAY(double, out, count));
+EXPORT void edge_shifts(
+    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, double sign, image_t image, double scale,
+    double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,
+    ARRAY(double, sums, parts, steps + 1), ARRAY(double, out, parts));
+
+#endif

@@ -1,0 +1,166 @@
+/* Declarations of api.h: poses and surfaces of pairs of images. */
+#ifndef RIGKIT_KERNELS_API_PAIRS_H
+#define RIGKIT_KERNELS_API_PAIRS_H
+
+/* five_point.c, with roots.c */
+
+enum { MOST_ROOTS = 10 };
+
+EXPORT void five_rows(ARRAY(const double, rows, count, 5, 9), int64_t count, ARRAY(double, out, count, MOST_ROOTS, 3, 3));
+
+/* six_point.c */
+
+EXPORT void six_rows(ARRAY(const double, rows, count, 6, 9), int64_t count, ARRAY(double, out, count, 1, 3, 3));
+
+/* pose_quality.c */
+
+EXPORT void residuals(
+    ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, E, hypotheses, 3, 3), int64_t hypotheses,
+    ARRAY(double, out, hypotheses, count));
+EXPORT void qualities(
+    ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, E, hypotheses, 3, 3), int64_t hypotheses,
+    double noise, ARRAY(double, out, hypotheses));
+EXPORT void qualities_ahead(
+    ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, R, hypotheses, 2, 3, 3),
+    ARRAY(const double, t, hypotheses, 3), int64_t hypotheses, double noise, double sigmas,
+    ARRAY(double, out, hypotheses));
+EXPORT void improve(
+    ARRAY(const double, packed, 18, count), int64_t count, ARRAY(double, R, hypotheses, 3, 3),
+    ARRAY(double, t, hypotheses, 3), double noise, int64_t hypotheses, ARRAY(const int64_t, free, freedom), int64_t freedom,
+    int64_t most_steps, double settled);
+
+/* pose_minimum.c */
+
+enum { NO_MEMORY = -1000 };
+
+/* What the maximum likelihood pose is sought from (pose_problem.PoseProblem). `affine` are 25 rows of `chosen` numbers
+ * (residuals.whitened_affinities). */
+typedef struct {
+    ARRAY(const double, packed, 18, count);
+    ARRAY(const double, affine, 25, chosen);
+    ARRAY(const double, point_weights, count);
+    ARRAY(const int64_t, which, chosen);
+    ARRAY(const int64_t, free, freedom);
+    int64_t count, chosen, freedom, loss, most_iterations;
+    double scale, tolerance;
+} pose_problem_t;
+
+EXPORT int64_t minimise(
+    const pose_problem_t *problem, ARRAY(double, R, 3, 3), ARRAY(double, t, 3),
+    ARRAY(double, r, problem.count + 2 * problem.chosen), ARRAY(double, J, problem.count + 2 * problem.chosen, 5),
+    ARRAY(double, w, problem.count + 2 * problem.chosen));
+
+/* patches.c, with epipolar_lines.c */
+
+/* Levels of a pyramid; the largest half side of a patch in samples; what is said of a patch: place in image 2, affinity row
+ * by row, correlation, variance of its brightness, how many levels coarser it was aligned than the images' sharpness asks
+ * for, and the upper triangle of the covariance of place and affinity, row by row. */
+enum { MOST_LEVELS = 8, MOST_HALF = 16, PATCH_COLUMNS = 9 + 21 };
+
+/* An image and its halvings: pixel of level l = pixel of the image / 2^l. */
+typedef struct {
+    image_t levels[MOST_LEVELS];
+    int64_t count;
+} pyramid_t;
+
+/* The constants of affine.refine_patches; `half` is the half side of the patch, its window a Gaussian of `width`, both in
+ * samples. */
+typedef struct {
+    int64_t half, coarsest, most_steps;
+    double width, settled, most_move, least_contrast, least_correlation, most_sigma, least_noise, excess_noise;
+} patch_rules_t;
+
+/* The rays of image 2 every `spacing` pixels, and how well the pairs agree with E21: an infinite sigma is no knowledge. */
+typedef struct {
+    ARRAY(const double, rays2, rows, columns, 3);
+    int64_t rows, columns;
+    double spacing, E21[9], sigma, sigma_A, most_distance;
+} epipolar_t;
+
+/* The nodes that patches grow over: node (r, c) is the pixel `step` * (c, r) of image 1. */
+typedef struct {
+    ARRAY(const double, rays1, rows, columns, 3);
+    ARRAY(const double, jacobians1, rows, columns, 3, 2);
+    ARRAY(double, out, rows, columns, PATCH_COLUMNS);
+    ARRAY(uint8_t, tries, rows, columns);
+    ARRAY(int32_t, heap, rows, columns);
+    int64_t rows, columns, step, most_tries;
+} patch_grid_t;
+
+EXPORT void align_patches(
+    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, ARRAY(const double, starts, count, 8),
+    int64_t count, ARRAY(double, out, count, PATCH_COLUMNS));
+
+/* patch_growth.c */
+
+EXPORT int64_t grow_patches(
+    const pyramid_t *first, const pyramid_t *second, const epipolar_t *epipolar, const patch_rules_t *rules,
+    const patch_grid_t *grid, ARRAY(const double, seeds, count, 8), int64_t count);
+
+/* planes.c */
+
+/* What nodes of a grid say of the surface (reconstruction.growing.surface): values, NaN where nothing, their information
+ * (the inverse of their covariance), and the rows that predict them from a plane. */
+typedef struct {
+    ARRAY(const double, values, rows, columns, 3);
+    ARRAY(const double, information, rows, columns, 3, 3);
+    ARRAY(const double, frames, rows, columns, 3, 3);
+    int64_t rows, columns, reach, rounds;
+    double turn;
+} plane_grid_t;
+
+EXPORT void fit_planes(
+    const plane_grid_t *grid, ARRAY(double, planes, grid.rows, grid.columns, 3),
+    ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns));
+
+/* sweep.c */
+
+/* Samples of image 1 (rows x columns), and at every `spacing`-th of them where image 2 shows a surface at each of the ranges
+ * of a sweep (reconstruction.growing.sweep); NaN where nowhere. In between places are interpolated. */
+typedef struct {
+    ARRAY(const float, table, levels, table_rows, table_columns, 2);
+    int64_t levels, table_rows, table_columns, spacing, rows, columns;
+} sweep_t;
+
+/* Costs of a step to the next level, and of any larger one: `jump` where the brightness is even, half of what that is more
+ * where it changes by `even`. */
+typedef struct {
+    int64_t rows, columns, levels, bend, jump;
+    double even;
+} surface_rules_t;
+
+/* Whether each of the neighbours in 5 x 5 samples is darker. */
+enum { CENSUS_BITS = 24 };
+
+EXPORT int64_t sweep_levels(int64_t levels);
+EXPORT int64_t sweep_cost_memory(int64_t columns);
+EXPORT int64_t sweep_path_memory(int64_t columns, int64_t levels);
+EXPORT void sweep_costs(
+    const sweep_t *sweep, const image_t *image2, ARRAY(const float, samples1, sweep.rows, sweep.columns),
+    ARRAY(float, memory, sweep_cost_memory(sweep.columns)),
+    ARRAY(uint8_t, costs, sweep.rows, sweep.columns, sweep_levels(sweep.levels)));
+EXPORT void sweep_surfaces(
+    const surface_rules_t *rules, ARRAY(const uint8_t, costs, rules.rows, rules.columns, sweep_levels(rules.levels)),
+    ARRAY(const float, samples1, rules.rows, rules.columns),
+    ARRAY(uint8_t, memory, sweep_path_memory(rules.columns, rules.levels)),
+    ARRAY(uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)));
+EXPORT void sweep_winners(
+    const surface_rules_t *rules, ARRAY(const uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)),
+    ARRAY(int32_t, best, rules.rows, rules.columns), ARRAY(int32_t, around, rules.rows, rules.columns, 4));
+
+/* Surfaces at some samples (row, column): the level there, its change from row to row and from column to column, and how
+ * many levels away another surface begins. Samples count less the further they are, in units of `radius` samples, and the
+ * more their brightness differs, in units of `alike`. */
+typedef struct {
+    ARRAY(const int32_t, samples, count, 2);
+    ARRAY(const float, surfaces, count, 4);
+    int64_t count, rows, columns, levels;
+    double radius, alike;
+} claims_t;
+
+EXPORT void sweep_rivals(
+    const claims_t *claims, ARRAY(const uint8_t, costs, claims.rows, claims.columns, sweep_levels(claims.levels)),
+    ARRAY(const float, samples1, claims.rows, claims.columns), ARRAY(uint16_t, memory, sweep_levels(claims.levels)),
+    ARRAY(float, found, claims.count, 2));
+
+#endif

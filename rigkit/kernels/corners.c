@@ -1,0 +1,94 @@
+/* Which peaks of the saddle response are corners of a chessboard: their saddle points, the rings around them. 
+ * The definitions in numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection.saddles. */
+#include "kernels.h"
+
+/* reference.front.saddle_step for one pixel; whether it is a saddle and near. */
+INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])
+{
+    const float *at = smooth + v * width + u;
+    const double here = at[0], left = at[-1], right = at[1], above = at[-width], below = at[width];
+    const double gu = 0.5 * (right - left), gv = 0.5 * (below - above);
+    const double uu = right + left - 2.0 * here, vv = below + above - 2.0 * here;
+    const double uv = 0.25 * (((double)at[width + 1] + at[-width - 1]) - ((double)at[-width + 1] + at[width - 1]));
+    const double det = uu * vv - uv * uv;
+    if (!(det < 0.0))
+        return 0;
+    const double step_u = (uv * gv - vv * gu) / det, step_v = (uv * gu - uu * gv) / det;
+    pixel[0] = (double)u + step_u;
+    pixel[1] = (double)v + step_v;
+    return fabs(step_u) <= most_step && fabs(step_v) <= most_step;
+}
+
+/* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
+ * (reference.front.may_be_corners). */
+INLINE int may_be_corner(
+    const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
+{
+    enum { PAIRS = HALF / 4 };
+    float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f;
+    for (int64_t k = 0; k < PAIRS; k++) {
+        const float *one = rules->circle + 8 * k, *other = one + 2 * HALF;
+        const float here = brightness_at(image, u + radius * one[0], v + radius * one[1]);
+        const float there = brightness_at(image, u + radius * other[0], v + radius * other[1]);
+        even[k] = 0.5f * (here + there);
+        mean += even[k];
+        odd_energy += 0.25f * (here - there) * (here - there);
+    }
+    mean /= (float)PAIRS;
+    for (int64_t k = 0; k < PAIRS; k++)
+        energy += (even[k] - mean) * (even[k] - mean);
+    const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)PAIRS;
+    return odd_energy < (float)rules->quick_odd * energy &&
+           centre * centre < (float)(rules->quick_centre * rules->quick_centre) * variance &&
+           response < (float)rules->quick_sharp * variance;
+}
+
+/* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
+ * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
+ * than `most_sharp`. Returns the number of saddles and, in `found`, of corners. */
+FOR_EACH_PROCESSOR int64_t find_corners(
+    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
+    const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
+    int64_t *found)
+{
+    int64_t near = 0, corners = 0;
+    for (int64_t k = 0; k < count; k++) {
+        double *pixel = saddles + 2 * near;
+        if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
+            continue;
+        near++;
+        if (may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]) &&
+            read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
+                      angles + 2 * corners, contrast + corners))
+            which[corners++] = near - 1;
+    }
+    *found = corners;
+    return near;
+}
+
+/* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
+int64_t mark_known(
+    const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
+{
+    squares_t squares;
+    int32_t *scratch = malloc((size_t)SQUARES_MEMORY(known_count) * sizeof(int32_t));
+    if (!scratch)
+        return 0;
+    fill_squares(known, known_count, reach, scratch, &squares);
+    for (int64_t i = 0; i < count; i++) {
+        const double u = fresh[2 * i], v = fresh[2 * i + 1];
+        const int64_t left = square_at(u - reach, squares.left, squares.side, squares.columns);
+        const int64_t right = square_at(u + reach, squares.left, squares.side, squares.columns);
+        const int64_t bottom = square_at(v + reach, squares.top, squares.side, squares.rows);
+        mark[i] = 0;
+        for (int64_t row = square_at(v - reach, squares.top, squares.side, squares.rows); row <= bottom; row++) {
+            const int32_t *first = squares.first + row * squares.columns;
+            for (int32_t k = first[left]; k < first[right + 1]; k++) {
+                const double du = known[2 * squares.order[k]] - u, dv = known[2 * squares.order[k] + 1] - v;
+                mark[i] |= du * du + dv * dv <= reach * reach;
+            }
+        }
+    }
+    free(scratch);
+    return 1;
+}

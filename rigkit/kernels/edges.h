@@ -1,0 +1,68 @@
+/* What the files of the edge model's fit share: the pixels around a corner, and what is done with them in which file.
+ * The definitions in numpy are in tests/kernels/reference/edges.py, the numbers in rigkit.detection.subpixel. */
+#ifndef RIGKIT_EDGES_H
+#define RIGKIT_EDGES_H
+
+#include "kernels.h"
+
+enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
+enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
+
+/* Eight numbers at once, wherever they lie. */
+typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
+typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
+
+/* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
+ * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
+ * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. Of a corner of one square
+ * alone, on which side of its lines that lies, +1 or -1; of others 0. */
+typedef struct {
+    const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper, *single;
+    const uint8_t *ends;
+} geometry_t;
+
+/* The pixels of a corner, relative to (centre_u, centre_v), at most `radius` from it both ways. `rows` has room for the
+ * rows of reference.edges.linearise, a block of pixels after the other, `square`, `turned`, `change` and `paired` for `across`
+ * x `across` pixels around the centre. */
+typedef struct {
+    float *u, *v, *value, *rows, *square, *turned, *change, *paired;
+    int64_t count, across, radius;
+    double centre_u, centre_v, size;
+} window_t;
+
+/* An image as the camera gave it, a byte a pixel, or of floats: windows are copied anyway. */
+typedef struct {
+    const void *brightness;
+    int64_t width, height, bytes;
+} picture_t;
+
+/* The rows of the block of pixels that begins with `start`. */
+INLINE float (*rows_of(const window_t *window, int64_t start))[BLOCK]
+{
+    return (float(*)[BLOCK])(window->rows + start * ROWS);
+}
+
+/* edges_window.c */
+
+void collect_window(
+    window_t *window, const picture_t image, const double pixel[2], const geometry_t at, double blur, const edge_rules_t *rules);
+int is_surrounded(const window_t *window, float x, float y);
+
+/* edges_model.c */
+
+void set_brightness(double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double sign);
+void normal_equations(
+    const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products);
+void all_normal_equations(
+    const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products);
+void papered_equations(
+    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
+    double *products);
+
+/* edges_noise.c */
+
+double leave_residuals(window_t *window, const double *step, int parameters);
+double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules);
+void lag_products(const window_t *window, double y, double *out);
+
+#endif

@@ -1,0 +1,247 @@
+/* Which corners are neighbours along the edges between squares. The definitions in numpy are in tests/kernels/reference/front.py,
+ * the numbers in rigkit.detection.lattice.links. */
+#include "kernels.h"
+
+/* A corner that may be the neighbour along an arm. */
+typedef struct {
+    float square;
+    int64_t arm, end, back;
+} candidate_t;
+
+/* Corners that are looked at together; memory behind all lists is long enough for so many more. */
+enum { TOGETHER = 8 };
+
+/* The corners in the order of the squares, so that those of a row of squares lie side by side: position, the unit
+ * vectors of both lines, contrast. */
+enum { A_U, A_V, B_U, B_V, CONTRAST, COLUMNS };
+typedef struct {
+    double *u, *v;
+    float *columns[COLUMNS];
+} places_t;
+
+/* What is found around a corner: square of the distance, infinite where the contrast is not like its own; the place;
+ * whether they point an arm of the other kind at each other. */
+typedef struct {
+    float *square;
+    int32_t *place, *meets;
+} near_t;
+
+/* The corner whose neighbours are looked for, and the bounds of their contrast. */
+typedef struct {
+    double u, v;
+    float lines[4], contrast, least, most, ratio, square_of_cosine;
+} home_t;
+
+/* Look at the places `from` to `to` - 1 and append them to the `count` near ones; return how many there are then. */
+INLINE int64_t look_at(
+    const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
+{
+    const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
+    const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
+    const float contrast = home->contrast, ratio = home->ratio, cosine = home->square_of_cosine;
+    for (int64_t first = from; first < to; first += TOGETHER) {
+        const double *us = places->u + first, *vs = places->v + first;
+        const float *a_u = places->columns[A_U] + first, *a_v = places->columns[A_V] + first;
+        const float *b_u = places->columns[B_U] + first, *b_v = places->columns[B_V] + first;
+        const float *theirs = places->columns[CONTRAST] + first;
+        float *restrict square = near->square + count + first - from;
+        int32_t *restrict place = near->place + count + first - from;
+        int32_t *restrict meets = near->meets + count + first - from;
+        for (int32_t k = 0; k < TOGETHER; k++) {
+            const float u = (float)(us[k] - home->u), v = (float)(vs[k] - home->v), here = u * u + v * v;
+            const float a = u * mine_a_u + v * mine_a_v, b = u * mine_b_u + v * mine_b_v;
+            const float home_a = u * a_u[k] + v * a_v[k], home_b = u * b_u[k] + v * b_v[k];
+            const float along = a * a > b * b ? a * a : b * b;
+            const float back = home_a * home_a > home_b * home_b ? home_a * home_a : home_b * home_b;
+            const int32_t alike = (theirs[k] > home->least) & (theirs[k] < home->most);
+            square[k] = alike ? here : INFINITY;
+            place[k] = (int32_t)first + k;
+            meets[k] = alike & (along > cosine * here) & (back > cosine * here) &
+                       ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k]) &
+                       (theirs[k] > ratio * contrast);
+        }
+    }
+    return count + to - from;
+}
+
+/* How many of the `count` near corners are alike and nearer than the square root of `most`. */
+INLINE int32_t count_nearer(const near_t *near, int64_t count, float most)
+{
+    const float *restrict square = near->square;
+    int32_t nearer = 0;
+    for (int64_t k = 0; k < count; k++)
+        nearer += square[k] < most;
+    return nearer;
+}
+
+/* Look at the corners around `home`, square by square: at least the `wanted` nearest alike. Returns how many. */
+INLINE int64_t gather(
+    const squares_t *squares, const places_t *places, const home_t *home, int64_t wanted, const near_t *near)
+{
+    /* Squares to each side that mostly have enough. */
+    enum { AT_ONCE = 3 };
+    const double u = home->u, v = home->v, side = squares->side;
+    const int64_t column = square_at(u, squares->left, side, squares->columns);
+    const int64_t row = square_at(v, squares->top, side, squares->rows);
+    const double in_u = u - squares->left - (double)column * side, in_v = v - squares->top - (double)row * side;
+    double inner = in_u < in_v ? in_u : in_v;
+    inner = side - in_u < inner ? side - in_u : inner;
+    inner = side - in_v < inner ? side - in_v : inner;
+    int64_t count = 0;
+    for (int64_t ring = AT_ONCE;; ring++) {
+        const int64_t left = column - ring, right = column + ring, top = row - ring, bottom = row + ring;
+        for (int64_t r = top > 0 ? top : 0; r <= bottom && r < squares->rows; r++) {
+            const int32_t *first = squares->first + r * squares->columns;
+            /* Whole rows above and below, the two ends of the others. */
+            const int whole = ring == AT_ONCE || r == top || r == bottom;
+            for (int part = 0; part < (whole ? 1 : 2); part++) {
+                int64_t from = part == 0 ? left : right, to = whole ? right : from;
+                if (to < 0 || from >= squares->columns)
+                    continue;
+                from = from > 0 ? from : 0;
+                to = to < squares->columns ? to : squares->columns - 1;
+                count = look_at(places, first[from], first[to + 1], home, near, count);
+            }
+        }
+        if (left <= 0 && top <= 0 && right >= squares->columns - 1 && bottom >= squares->rows - 1)
+            return count;
+        /* All corners within the root of `safe` are among them by now. */
+        const float safe = (float)((inner + (double)ring * side) * (inner + (double)ring * side));
+        if (count >= wanted && count_nearer(near, count, safe) >= wanted)
+            return count;
+    }
+}
+
+/* The arm (A, B, -A, -B) that points most along the chord. */
+INLINE int64_t arm_along(double a, double b)
+{
+    return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
+}
+
+/* Whether the edge from corner i is there (reference.front._edge_seen). */
+INLINE int link_seen(
+    const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
+    const candidate_t *link)
+{
+    const int64_t j = link->end;
+    const double u = (corners->pixels[2 * i] - offset) / scale, v = (corners->pixels[2 * i + 1] - offset) / scale;
+    const double end_u = (corners->pixels[2 * j] - offset) / scale;
+    const double end_v = (corners->pixels[2 * j + 1] - offset) / scale;
+    double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
+    const double most = corners->reach[i];
+    aside = aside > rules->least_aside ? aside : rules->least_aside;
+    aside = aside < most ? aside : most;
+    const double there = corners->contrast[j], here = corners->contrast[i];
+    const double weakest = rules->contrast_ratio * (there < here ? there : here);
+    return edge_seen(image, rules->along, rules->places, rules->most, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0,
+                     aside, weakest);
+}
+
+/* The nearest corner along each of the four arms of the corner at `place` whose edge is seen: to[arm] = 4 * corner +
+ * arm, or -1. */
+INLINE void link_arms(
+    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image,
+    double scale, double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
+{
+    enum { MOST_CANDIDATES = 512 };
+    candidate_t candidates[MOST_CANDIDATES];
+    const int64_t i = squares->order[place], wanted = rules->neighbours + 1;
+    const home_t home = {places->u[place], places->v[place],
+                         {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place],
+                          places->columns[B_V][place]},
+                         places->columns[CONTRAST][place], (float)corners->least[i], (float)corners->most[i],
+                         (float)rules->contrast_ratio, (float)(rules->arm_cosine * rules->arm_cosine)};
+    const int64_t count = gather(squares, places, &home, wanted, near);
+    int64_t listed = 0;
+    for (int64_t first = 0; first < count; first += TOGETHER) {
+        int32_t any = 0;
+        for (int64_t k = first; k < first + TOGETHER; k++)
+            any |= near->meets[k];
+        if (!any)
+            continue;
+        const int64_t end = first + TOGETHER < count ? first + TOGETHER : count;
+        for (int64_t k = first; k < end && listed < MOST_CANDIDATES; k++) {
+            const float square = near->square[k];
+            if (!near->meets[k] || count_nearer(near, count, square) >= wanted)
+                continue;
+            const int32_t at = near->place[k];
+            const float u = (float)(places->u[at] - home.u), v = (float)(places->v[at] - home.v);
+            const candidate_t fresh = {
+                square, arm_along(u * home.lines[0] + v * home.lines[1], u * home.lines[2] + v * home.lines[3]),
+                squares->order[at],
+                arm_along(-(u * places->columns[A_U][at] + v * places->columns[A_V][at]),
+                          -(u * places->columns[B_U][at] + v * places->columns[B_V][at]))};
+            int64_t rank = listed++;
+            for (; rank > 0 && candidates[rank - 1].square > square; rank--)
+                candidates[rank] = candidates[rank - 1];
+            candidates[rank] = fresh;
+        }
+    }
+    for (int64_t k = 0; k < listed; k++) {
+        const candidate_t *link = candidates + k;
+        if (to[link->arm] < 0 && link_seen(corners, image, scale, offset, rules, i, link))
+            to[link->arm] = 4 * link->end + link->back;
+    }
+}
+
+static double link_length(const double *pixels, int64_t i, int64_t to)
+{
+    const double du = pixels[2 * (to / 4)] - pixels[2 * i], dv = pixels[2 * (to / 4) + 1] - pixels[2 * i + 1];
+    return sqrt(du * du + dv * dv);
+}
+
+/* reference.front.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
+ * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
+ * `nearest` (count, 4) is scratch. Returns 0 without memory. */
+FOR_EACH_PROCESSOR int64_t find_links(
+    const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,
+    int64_t *both)
+{
+    const int64_t count = corners->count, room = count + TOGETHER;
+    squares_t squares;
+    double *memory = calloc((size_t)room, 2 * sizeof(double) + (COLUMNS + 1) * sizeof(float) + 2 * sizeof(int32_t));
+    int32_t *scratch = malloc((size_t)SQUARES_MEMORY(count) * sizeof(int32_t));
+    if (!memory || !scratch) {
+        free(memory);
+        free(scratch);
+        return 0;
+    }
+    fill_squares(corners->pixels, count, 1.0, scratch, &squares);
+    places_t places = {memory, memory + room, {NULL}};
+    for (int k = 0; k < COLUMNS; k++)
+        places.columns[k] = (float *)(memory + 2 * room) + k * room;
+    const near_t near = {places.columns[COLUMNS - 1] + room, (int32_t *)(places.columns[COLUMNS - 1] + 2 * room),
+                         (int32_t *)(places.columns[COLUMNS - 1] + 3 * room)};
+    for (int64_t k = 0; k < count; k++) {
+        const int32_t i = squares.order[k];
+        places.u[k] = corners->pixels[2 * i];
+        places.v[k] = corners->pixels[2 * i + 1];
+        for (int part = 0; part < 4; part++)
+            places.columns[A_U + part][k] = (float)corners->lines[4 * i + part];
+        places.columns[CONTRAST][k] = (float)corners->contrast[i];
+    }
+    for (int64_t k = 0; k < 4 * count; k++)
+        nearest[k] = both[k] = -1;
+    /* In the order of the squares: neighbours look at the same corners and pixels. */
+    for (int64_t k = 0; k < count; k++)
+        link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near,
+                  nearest + 4 * (int64_t)squares.order[k]);
+    free(memory);
+    free(scratch);
+    for (int64_t k = 0; k < 4 * count; k++)
+        if (nearest[k] >= 0 && nearest[nearest[k]] == k)
+            both[k] = nearest[k];
+    /* Both halves of a link go, so what is dropped is marked before it is. */
+    for (int64_t k = 0; k < 4 * count; k++) {
+        const int64_t opposite = k / 4 * 4 + (k + 2) % 4;
+        nearest[k] = both[k] >= 0 && both[opposite] >= 0 &&
+                     link_length(corners->pixels, k / 4, both[k]) >
+                         rules->length_ratio * link_length(corners->pixels, k / 4, both[opposite]);
+    }
+    for (int64_t k = 0; k < 4 * count; k++)
+        if (nearest[k] && both[k] >= 0) {
+            both[both[k]] = -1;
+            both[k] = -1;
+        }
+    return 1;
+}

@@ -1,0 +1,204 @@
+/* The saddle response of an image and its peaks. The definitions in numpy are in tests/kernels/reference/front.py,
+ * the numbers in rigkit.detection.saddles. */
+#include "kernels.h"
+
+/* So many bits of a number at a time are counted to rank it. */
+#define RANK_BITS 11
+
+/* Minus the determinant of the Hessian at one pixel. */
+INLINE float saddle_response(const float *at, int64_t width)
+{
+    const float here = 2.0f * at[0];
+    const float uu = at[1] + at[-1] - here, vv = at[width] + at[-width] - here;
+    const float uv = 0.25f * ((at[width + 1] + at[-width - 1]) - (at[-width + 1] + at[width - 1]));
+    return uv * uv - uu * vv;
+}
+
+/* Return a number of the order of `value` among all floats: as integers of their bits positive ones are in order. */
+INLINE uint32_t order_of(float value)
+{
+    uint32_t bits;
+    memcpy(&bits, &value, sizeof bits);
+    return bits ^ (bits >> 31 ? UINT32_MAX : UINT32_C(1) << 31);
+}
+
+/* Return what `at` of `count` values are smaller than or equal to: its bits from the highest downwards, by counting the
+ * values that share those found so far. */
+static float value_at_rank(const float *values, int64_t count, int64_t at)
+{
+    uint32_t found = 0;
+    int32_t often[1 << RANK_BITS];
+    for (int left = 32; left > 0;) {
+        const int low = left > RANK_BITS ? left - RANK_BITS : 0;
+        const uint32_t mask = (UINT32_C(1) << (left - low)) - 1;
+        memset(often, 0, sizeof often);
+        for (int64_t k = 0; k < count; k++) {
+            const uint32_t order = order_of(values[k]);
+            /* A shift by 32 is undefined. */
+            if (((uint64_t)(order ^ found) >> left) == 0)
+                often[order >> low & mask]++;
+        }
+        uint32_t bits = 0;
+        for (; at >= often[bits] && bits < mask; bits++)
+            at -= often[bits];
+        found |= bits << low;
+        left = low;
+    }
+    const uint32_t sign = found >> 31 ? UINT32_C(1) << 31 : UINT32_MAX, back = found ^ sign;
+    float value;
+    memcpy(&value, &back, sizeof value);
+    return value;
+}
+
+/* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness
+ * that `few` of them are darker and brighter than. */
+void typical_values(
+    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness,
+    float *out)
+{
+    int64_t count = 0;
+    for (int64_t v = 1; v < height - 1; v += step)
+        for (int64_t u = 1; u < width - 1; u += step) {
+            const float *at = smooth + v * width + u;
+            response[count] = fabsf(saddle_response(at, width));
+            brightness[count++] = *at;
+        }
+    out[0] = value_at_rank(response, count, count / 2);
+    out[1] = value_at_rank(brightness, count, few);
+    out[2] = value_at_rank(brightness, count, count - 1 - few);
+}
+
+/* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row are peaks: not lower than the
+ * neighbours that follow within two pixels, higher than those before (a corner between pixels makes two equal ones), and
+ * above the threshold. */
+INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
+{
+    float before[STRIP + 4], after[STRIP + 4];
+    uint8_t peak[STRIP];
+    const float *above2 = rows[0] + u - 2, *above = rows[1] + u - 2, *here = rows[2] + u;
+    const float *below = rows[3] + u - 2, *below2 = rows[4] + u - 2;
+    for (int k = 0; k < STRIP + 4; k++) {
+        before[k] = above[k] > above2[k] ? above[k] : above2[k];
+        after[k] = below[k] > below2[k] ? below[k] : below2[k];
+    }
+    for (int k = 0; k < STRIP; k++) {
+        float most = before[k];
+        most = before[k + 1] > most ? before[k + 1] : most;
+        most = before[k + 2] > most ? before[k + 2] : most;
+        most = before[k + 3] > most ? before[k + 3] : most;
+        most = before[k + 4] > most ? before[k + 4] : most;
+        most = here[k - 2] > most ? here[k - 2] : most;
+        most = here[k - 1] > most ? here[k - 1] : most;
+        most = threshold > most ? threshold : most;
+        float least = after[k];
+        least = after[k + 1] > least ? after[k + 1] : least;
+        least = after[k + 2] > least ? after[k + 2] : least;
+        least = after[k + 3] > least ? after[k + 3] : least;
+        least = after[k + 4] > least ? after[k + 4] : least;
+        least = here[k + 1] > least ? here[k + 1] : least;
+        least = here[k + 2] > least ? here[k + 2] : least;
+        peak[k] = (uint8_t)((here[k] > most) & (here[k] >= least));
+    }
+    uint64_t bits = 0;
+    for (int k = 0; k < STRIP; k += 8) {
+        uint64_t eight;
+        memcpy(&eight, peak + k, 8);
+        /* The product gathers the lowest bits of eight bytes (the first one the lowest) in the highest byte. */
+        bits |= (eight * UINT64_C(0x0102040810204080)) >> 56 << k;
+    }
+    return bits;
+}
+
+/* The saddle response at the `count` pixels from u on of a row, into `to`; whether any is above the threshold. */
+INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict to)
+{
+    int32_t high = 0;
+    for (int64_t k = 0; k < count; k++) {
+        const float response = saddle_response(from + k, width);
+        to[k] = response;
+        high |= response > threshold;
+    }
+    return high;
+}
+
+/* reference.front.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
+ * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
+FOR_EACH_PROCESSOR int64_t find_peaks(
+    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
+    float *response)
+{
+    enum { FIRST = 3 };
+    const int64_t stride = width + STRIP + 4, strips = width / STRIP + 1;
+    for (int64_t k = 0; k < 5 * stride; k++)
+        scratch[k] = -1e30f;
+    int64_t count = 0;
+    for (int64_t v = 1; v < height - 1; v++) {
+        const float *from = smooth + v * width;
+        float *last = scratch + v % 5 * stride;
+        uint8_t *mark = high + v % 5 * strips;
+        last[1] = saddle_response(from + 1, width);
+        last[2] = saddle_response(from + 2, width);
+        for (int64_t u = FIRST; u < width - 1; u += STRIP, mark++)
+            /* Twice, so that the compiler knows how many there are. */
+            *mark = (uint8_t)(u + STRIP < width ? fill_response(from + u, width, STRIP, threshold, last + u)
+                                                : fill_response(from + u, width, width - 1 - u, threshold, last + u));
+        /* The middle one of the five rows is v - 2. */
+        if (v < 5)
+            continue;
+        float *rows[5];
+        for (int k = 0; k < 5; k++)
+            rows[k] = scratch + (v + 1 + k) % 5 * stride;
+        mark = high + (v - 2) % 5 * strips;
+        for (int64_t u = FIRST; u < width - 3; u += STRIP, mark++) {
+            if (!*mark)
+                continue;
+            for (uint64_t left = peaks_among(rows, u, threshold); left; left &= left - 1) {
+                const int64_t at_u = u + __builtin_ctzll(left);
+                if (at_u >= width - 3)
+                    break;
+                at[2 * count] = (int32_t)at_u;
+                at[2 * count + 1] = (int32_t)(v - 2);
+                response[count++] = rows[2][at_u];
+            }
+        }
+    }
+    return count;
+}
+
+/* Keep of `count` peaks, in place and in their order, about the `most` strongest beside the strongest one in their square
+ * of `side` pixels (reference.front._strongest): as many bins of this share as are needed, the highest first. `squares`
+ * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
+ * how many are left. */
+int64_t keep_strongest(
+    int32_t *at, float *response, int64_t count, int64_t height, int64_t width, int64_t side, int64_t most,
+    int64_t finest, float *squares, int32_t *bins, int32_t *share)
+{
+    (void)height;
+    const int32_t across = (int32_t)(width / side) + 1, step = (int32_t)side;
+    for (int32_t k = 0, row = -1, first = 0; k < (int32_t)count; k++) {
+        if (at[2 * k + 1] != row) {
+            row = at[2 * k + 1];
+            first = row / step * across;
+        }
+        share[k] = first + at[2 * k] / step;
+        float *strongest = squares + share[k];
+        *strongest = response[k] > *strongest ? response[k] : *strongest;
+    }
+    for (int64_t k = 0; k < count; k++) {
+        const float part = response[k] / squares[share[k]];
+        /* Beyond what float32 holds one is as strong as the other. */
+        share[k] = part < 1.0f ? (int32_t)((float)finest * part) : (int32_t)finest;
+        bins[share[k]]++;
+    }
+    int64_t least = finest, kept = bins[finest];
+    while (least > 0 && kept < most)
+        kept += bins[--least];
+    kept = 0;
+    for (int64_t k = 0; k < count; k++) {
+        at[2 * kept] = at[2 * k];
+        at[2 * kept + 1] = at[2 * k + 1];
+        response[kept] = response[k];
+        kept += share[k] >= least;
+    }
+    return kept;
+}

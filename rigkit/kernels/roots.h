@@ -1,0 +1,12 @@
+/* Real roots of a polynomial of degree ten (roots.c). */
+#ifndef RIGKIT_ROOTS_H
+#define RIGKIT_ROOTS_H
+
+#include "kernels.h"
+
+enum { DEGREE = 10 };
+
+/* Set `roots` to the real roots of the polynomial p, the lowest coefficient first; return how many. */
+int real_roots(const double p[DEGREE + 1], double roots[MOST_ROOTS]);
+
+#endif

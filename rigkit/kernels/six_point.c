@@ -1,0 +1,106 @@
+/* Essential matrices from six equations (rigkit.relative_pose.solvers.minimal). */
+#include "minimal.h"
+
+/* Rotate the `size` columns of `m`, `length` numbers each and one after the other, until they are perpendicular; `v`
+ * (size columns of size) collects the rotations: one-sided Jacobi, as exact for the small singular values. */
+INLINE void orthogonalise(double *m, int length, double *v, int size)
+{
+    for (int i = 0; i < size * size; i++)
+        v[i] = i % (size + 1) == 0;
+    for (int sweep = 0, turned = 1; turned && sweep < 30; sweep++) {
+        turned = 0;
+        for (int i = 0; i < size - 1; i++)
+            for (int j = i + 1; j < size; j++) {
+                double *a = m + length * i, *b = m + length * j, *p = v + size * i, *q = v + size * j;
+                double aa = 0.0, ab = 0.0, bb = 0.0;
+                for (int k = 0; k < length; k++) {
+                    aa += a[k] * a[k];
+                    ab += a[k] * b[k];
+                    bb += b[k] * b[k];
+                }
+                if (!(ab * ab > 1e-30 * aa * bb))
+                    continue;
+                turned = 1;
+                const double zeta = (bb - aa) / (2.0 * ab);
+                const double tangent = (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
+                const double c = 1.0 / sqrt(1.0 + tangent * tangent), s = c * tangent;
+                for (int k = 0; k < length; k++) {
+                    const double kept = a[k];
+                    a[k] = c * kept - s * b[k];
+                    b[k] = s * kept + c * b[k];
+                }
+                for (int k = 0; k < size; k++) {
+                    const double kept = p[k];
+                    p[k] = c * kept - s * q[k];
+                    q[k] = s * kept + c * q[k];
+                }
+            }
+    }
+}
+
+/* Return which of the `size` columns of `m` is the longest, or with `sign` -1 the shortest. */
+INLINE int extreme(const double *m, int length, int size, double sign)
+{
+    int found = 0;
+    double most = -INFINITY;
+    for (int i = 0; i < size; i++) {
+        double square = 0.0;
+        for (int k = 0; k < length; k++)
+            square += m[length * i + k] * m[length * i + k];
+        if (sign * square > most) {
+            most = sign * square;
+            found = i;
+        }
+    }
+    return found;
+}
+
+/* Replace E by the essential matrix nearest to it, unit norm (eight_point.essential_nearest). */
+INLINE void make_essential(double *E)
+{
+    double m[9], v[9];
+    for (int i = 0; i < 9; i++)
+        m[3 * (i % 3) + i / 3] = E[i];
+    orthogonalise(m, 3, v, 3);
+    const int least = extreme(m, 3, 3, -1.0);
+    memset(E, 0, 9 * sizeof(double));
+    for (int k = 0; k < 3; k++) {
+        const double *left = m + 3 * k;
+        const double size = sqrt(2.0 * (left[0] * left[0] + left[1] * left[1] + left[2] * left[2]));
+        for (int i = 0; k != least && i < 9; i++)
+            E[i] += left[i / 3] * v[3 * k + i % 3] / size;
+    }
+}
+
+/* Write the E of six rows (minimal.essential_from_six_rows): the monomials that violate the cubics least. */
+INLINE void solve_six(const double *rows, double *E)
+{
+    /* The first of four basis matrices is zero: ten of the monomials do not contain x. */
+    static const int WITHOUT_X[CUBICS] = {1, 6, 7, 13, 14, 15, 16, 17, 18, 19};
+    /* How often each occurs among the products of three of y, z, 1, and where each product is. */
+    static const double OFTEN[CUBICS] = {1.0, 3.0, 3.0, 3.0, 6.0, 3.0, 1.0, 3.0, 3.0, 1.0};
+    static const int PRODUCTS[3][9] = {{0, 1, 2, 1, 3, 4, 2, 4, 5}, {1, 3, 4, 3, 6, 7, 4, 7, 8}, {2, 4, 5, 4, 7, 8, 5, 8, 9}};
+    double basis[4 * 9] = {0.0}, cubics[CUBICS][MONOMIALS], m[CUBICS * CUBICS], v[CUBICS * CUBICS];
+    null_space(rows, 6, basis + 9);
+    constraints(basis, cubics);
+    for (int k = 0; k < CUBICS; k++)
+        for (int i = 0; i < CUBICS; i++)
+            m[CUBICS * k + i] = cubics[i][WITHOUT_X[k]] / sqrt(OFTEN[k]);
+    orthogonalise(m, CUBICS, v, CUBICS);
+    const double *found = v + CUBICS * extreme(m, CUBICS, CUBICS, -1.0);
+    double products[27], turn[9];
+    for (int i = 0; i < 27; i++)
+        products[i] = found[PRODUCTS[i / 9][i % 9]] / sqrt(OFTEN[PRODUCTS[i / 9][i % 9]]);
+    orthogonalise(products, 9, turn, 3);
+    const double *weights = turn + 3 * extreme(products, 9, 3, 1.0);
+    for (int i = 0; i < 9; i++)
+        E[i] = weights[0] * basis[9 + i] + weights[1] * basis[18 + i] + weights[2] * basis[27 + i];
+    make_essential(E);
+}
+
+/* `rows` (count, 6, 9) -> `out` (count, 9). */
+FOR_EACH_PROCESSOR void six_rows(const double *rows, int64_t count, double *out)
+{
+    for (int64_t b = 0; b < count; b++)
+        solve_six(rows + 54 * b, out + 9 * b);
+}

@@ -1,0 +1,119 @@
+/* From an image as it was read to one that saddles are sought in: smaller, smoother. The definitions in numpy are in tests/kernels/reference/front.py. */
+#include "kernels.h"
+
+/* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
+FOR_EACH_PROCESSOR void shrink_floats(
+    const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums,
+    float *restrict out)
+{
+    const int64_t rows = height / factor, columns = width / factor;
+    const float share = 1.0f / (float)(factor * factor);
+    for (int64_t row = 0; row < rows; row++) {
+        const float *restrict from = image + row * factor * width;
+        memcpy(sums, from, (size_t)(columns * factor) * sizeof(float));
+        for (int64_t k = 1; k < factor; k++)
+            for (int64_t u = 0; u < columns * factor; u++)
+                sums[u] += from[k * width + u];
+        float *restrict to = out + row * columns;
+        for (int64_t u = 0; u < columns; u++) {
+            float sum = 0.0f;
+            for (int64_t k = 0; k < factor; k++)
+                sum += sums[factor * u + k];
+            to[u] = share * sum;
+        }
+    }
+}
+
+/* The same of bytes; sums of at most 256 rows fit 16 bits. */
+FOR_EACH_PROCESSOR void shrink_bytes(
+    const uint8_t *restrict image, int64_t height, int64_t width, int64_t factor, uint16_t *restrict sums,
+    float *restrict out)
+{
+    const int64_t rows = height / factor, columns = width / factor;
+    const float share = 1.0f / (float)(factor * factor);
+    for (int64_t row = 0; row < rows; row++) {
+        const uint8_t *restrict from = image + row * factor * width;
+        for (int64_t u = 0; u < columns * factor; u++)
+            sums[u] = from[u];
+        for (int64_t k = 1; k < factor; k++)
+            for (int64_t u = 0; u < columns * factor; u++)
+                sums[u] = (uint16_t)(sums[u] + from[k * width + u]);
+        float *restrict to = out + row * columns;
+        for (int64_t u = 0; u < columns; u++) {
+            uint32_t sum = 0;
+            for (int64_t k = 0; k < factor; k++)
+                sum += sums[factor * u + k];
+            to[u] = share * (float)sum;
+        }
+    }
+}
+
+/* The rows of an image two above to two below row v, the border repeated. */
+typedef struct {
+    int64_t above2, above, here, below, below2;
+} rows_t;
+
+INLINE rows_t rows_around(int64_t v, int64_t height, int64_t width)
+{
+    return (rows_t){(v > 2 ? v - 2 : 0) * width, (v > 1 ? v - 1 : 0) * width, v * width,
+                    (v < height - 1 ? v + 1 : height - 1) * width, (v < height - 2 ? v + 2 : height - 1) * width};
+}
+
+/* Smooth with the kernel (outer, inner, centre, inner, outer) both ways, the border repeated; `half` gets every second
+ * pixel of every second row. `column` (width + 4) is scratch. */
+FOR_EACH_PROCESSOR void smooth_floats(
+    const float *restrict image, int64_t height, int64_t width, const float *restrict kernel, float *restrict column,
+    float *restrict out, float *restrict half)
+{
+    const float outer = kernel[0], inner = kernel[1], centre = kernel[2];
+    const int64_t half_width = (width + 1) / 2;
+    float *restrict middle = column + 2;
+    for (int64_t v = 0; v < height; v++) {
+        const rows_t at = rows_around(v, height, width);
+        const float *restrict above2 = image + at.above2, *restrict above = image + at.above;
+        const float *restrict below2 = image + at.below2, *restrict below = image + at.below;
+        const float *restrict here = image + at.here;
+        for (int64_t u = 0; u < width; u++)
+            middle[u] = outer * (above2[u] + below2[u]) + inner * (above[u] + below[u]) + centre * here[u];
+        column[0] = column[1] = middle[0];
+        middle[width] = middle[width + 1] = middle[width - 1];
+        float *restrict to = out + v * width;
+        for (int64_t u = 0; u < width; u++)
+            to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) +
+                    centre * column[u + 2];
+        if (v % 2 == 0)
+            for (int64_t u = 0; u < half_width; u++)
+                half[v / 2 * half_width + u] = to[2 * u];
+    }
+}
+
+/* The same of bytes with a kernel of small integers over `whole`: exact, as long as whole^2 * 255 fits 16 bits. */
+FOR_EACH_PROCESSOR void smooth_bytes(
+    const uint8_t *restrict image, int64_t height, int64_t width, const float *restrict kernel, float whole,
+    uint16_t *restrict column, float *restrict out, float *restrict half)
+{
+    const uint16_t outer = (uint16_t)lrintf(whole * kernel[0]), inner = (uint16_t)lrintf(whole * kernel[1]);
+    const uint16_t centre = (uint16_t)lrintf(whole * kernel[2]);
+    const float share = 1.0f / (whole * whole);
+    const int64_t half_width = (width + 1) / 2;
+    uint16_t *restrict middle = column + 2;
+    for (int64_t v = 0; v < height; v++) {
+        const rows_t at = rows_around(v, height, width);
+        const uint8_t *restrict above2 = image + at.above2, *restrict above = image + at.above;
+        const uint8_t *restrict below2 = image + at.below2, *restrict below = image + at.below;
+        const uint8_t *restrict here = image + at.here;
+        for (int64_t u = 0; u < width; u++)
+            middle[u] = (uint16_t)(outer * (uint16_t)(above2[u] + below2[u]) + inner * (uint16_t)(above[u] + below[u]) +
+                                   centre * here[u]);
+        column[0] = column[1] = middle[0];
+        middle[width] = middle[width + 1] = middle[width - 1];
+        float *restrict to = out + v * width;
+        for (int64_t u = 0; u < width; u++)
+            to[u] = share * (float)(uint16_t)(outer * (uint16_t)(column[u] + column[u + 4]) +
+                                              inner * (uint16_t)(column[u + 1] + column[u + 3]) +
+                                              centre * column[u + 2]);
+        if (v % 2 == 0)
+            for (int64_t u = 0; u < half_width; u++)
+                half[v / 2 * half_width + u] = to[2 * u];
+    }
+}
