@@ -1,4 +1,4 @@
-"""Calls of the kernels in smoothing.c, peaks.c, corners.c and links.c: plain arrays; tolerances come from the callers."""
+"""Calls of the kernels in smoothing.c, peaks.c, corners.c and links.c: plain arrays; tolerances are the callers'."""
 
 from __future__ import annotations
 
