@@ -42,6 +42,9 @@ SINGLE_PX = 0.12
 """A rim circle of a grid seen by a fisheye at 60 degrees from near by: its neighbours lie on one side."""
 
 
+NOISY = replace(BENCH_PHOTOMETRY, noise_levels=2.0)
+
+
 def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
     return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
 
@@ -154,6 +157,20 @@ def test_circles_that_something_covers_are_left_out() -> None:
     assert found.board_id == "h"
     assert clear.sum() - 8 <= len(found.grid) < len(truth.grid)
     assert np.abs(errors(found, truth)).max() < SINGLE_PX
+
+
+@pytest.mark.parametrize(("motion_px", "least"), [((2.6, 1.5), 0.35), ((5.2, 3.0), 0.14)])
+def test_a_motion_that_stretches_all_circles_alike_makes_none_uncertain(
+    motion_px: tuple[float, float], least: float
+) -> None:
+    """Not taken for errors of the map: sigmas are 2.4 and 5 times the errors, else 3.9 and 11 times."""
+    rng = np.random.default_rng(1)
+    scene = one_board(rng, board=REGULAR, size_px=(800, 600))
+    image = scene.render(optics=Optics(0.7, motion_px=motion_px), photometry=NOISY, rng=rng)
+    (found,) = detect_boards(image, [REGULAR])
+    turns = [found, *(found.turned(k) for k in REGULAR.turns)]
+    z = min((errors(t, scene.truth()[0]) / t.sigma_px[:, None] for t in turns), key=lambda e: float(np.abs(e).max()))
+    assert least < np.sqrt((z**2).mean()) < HONEST[1]
 
 
 def test_a_grid_of_another_size_is_no_board() -> None:

@@ -47,6 +47,9 @@ SURE_GAIN = 1.5
 MAP_ERROR = 1.0
 """Error of a centre over that of its circle's size times the radius in distances (`_with_map_error`): (n - 1) / 4 for
 the order n = 5 that follows the polynomial's."""
+WAVY_BY_NOISE = 2.5
+"""Noise makes the mean square of harmonics 3 to 6 of a circle's edge so many times its usual one once in a hundred
+circles."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 ROUNDS = 40
@@ -275,13 +278,16 @@ def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
 def _with_map_error(fit: CircleFit, radius: float) -> FloatArray:
     """Return standard deviations (N,) of the centres that know how uncertain the curvature of the map is.
 
-    What size and slant of a circle are off (growth e, in radii) shows the error of the map's first derivatives. At the
-    rim, where it is not small, the map is foretold from one side, and what its polynomial leaves of order n in the
-    distance t has second over first derivatives (n - 1) / t. A quarter of that, times the radius, moves the centre.
+    What size and slant of a circle are off (growth e, in radii), beyond what all are (motion stretches them), shows the
+    error of the map's first derivatives. At the rim, where it is not small, the map is foretold from one side, and what
+    its polynomial leaves of order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that,
+    times the radius, moves the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
     """
-    misshapen = np.sqrt((fit.growth**2).sum(axis=1))
+    misshapen = np.sqrt(((fit.growth - np.median(fit.growth, axis=0)) ** 2).sum(axis=1))
     size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
-    return np.asarray(np.hypot(fit.sigma_px, MAP_ERROR * radius * misshapen * size_px))
+    wavy = ((fit.harmonics - np.median(fit.harmonics, axis=0)) ** 2).mean(axis=(1, 2)) * size_px**2
+    uneven = np.sqrt(np.maximum(wavy - WAVY_BY_NOISE * fit.sigma_px**2, 0.0))
+    return np.asarray(np.sqrt(fit.sigma_px**2 + (MAP_ERROR * radius * misshapen * size_px) ** 2 + uneven**2))
 
 
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
