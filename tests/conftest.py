@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import zlib
 from pathlib import Path
 
@@ -20,6 +21,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.args_source is config.ArgsSource.TESTPATHS and (gone := names - {item.nodeid for item in items}):
         words = f"{THOROUGH.name} names tests that are not there: {', '.join(sorted(gone))}"
         config.issue_config_time_warning(pytest.PytestWarning(words), stacklevel=2)
+
+
+def pytest_configure() -> None:
+    """Collecting makes very many objects that stay: nobody looks for circles among them again and again."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From here on memory is cleared as ever, of what comes now."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture

@@ -131,8 +131,8 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     files = json.dumps([f"{b.board_id}.toml" for b in ALIKE])
     path = tmp_path / "session.toml"
     head = f'schema = "rigkit.session/1"\nboards = {files}\nmodel = "brown"\nboard_shape = "flat"\nimages = "*.png"\n'
-    angle = '{ a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 3.0, how = "set square" }'
-    path.write_text(f"{head}[[rigid_boards]]\nboards = {names}\nangles = [ {angle} ]\n")
+    declared = '{ a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 3.0, how = "set square" }'
+    path.write_text(f"{head}[[rigid_boards]]\nboards = {names}\nangles = [ {declared} ]\n")
     room = corner_of_a_room(rng, ALIKE)
     one = {"camera": (lens("reg"), Rigid3.identity())}
     views = target_views(rng, one, ALIKE, room, 6, noise_px=0.1, distance_mm=1000.0, shuffled=True)
