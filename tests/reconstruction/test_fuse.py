@@ -97,5 +97,8 @@ def test_one_cloud_stays_and_surfaces_apart_are_not_merged() -> None:
     )
     apart = fuse_clouds([clouds[0], far])
     assert (apart.pairs_of == 1).mean() > 0.95
+
+
+def test_without_clouds_there_is_none_to_fuse() -> None:
     with pytest.raises(InputError, match="none to fuse"):
         fuse_clouds([])
