@@ -20,10 +20,6 @@ NEARLY = 0.03
 """Of views whose gain and whose error are within this part of the best one's, the one nearest to the last pose is
 taken."""
 
-MAX_EXCHANGES = 50
-WORTH = 1e-3
-"""An exchange of views that gains less than this part of the error is none."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Proposal:
@@ -109,28 +105,6 @@ def choose_views(
         errors.append(float(after[pick]))
         left = np.delete(left, pick)
     return taken, errors
-
-
-def exchanged_views(information: FloatArray, views: FloatArray, goal: Aim, taken: Sequence[int]) -> list[int]:
-    """Return as many views as `taken`, better ones of C: one after the other is put back where another helps more,
-    until none does.
-
-    Reference: V. V. Fedorov, "Theory of Optimal Experiments" (1972), the exchange algorithm.
-    """
-    chosen = list(taken)
-    whole = information + views[chosen].sum(axis=0)
-    for _ in range(MAX_EXCHANGES):
-        error = float(goal.error(covariance_of(whole)))
-        left = np.setdiff1d(np.arange(len(views)), chosen)
-        # Every taken view against every one left.
-        without = whole - views[chosen]
-        after = goal.error(covariance_of(without[:, None] + views[left])) if len(left) else np.full((1, 1), np.inf)
-        out, into = np.unravel_index(int(np.argmin(after)), after.shape)
-        if not after[out, into] < (1.0 - WORTH) * error:
-            break
-        whole = without[out] + views[left[into]]
-        chosen[out] = int(left[into])
-    return chosen
 
 
 def plan_views(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from split_halves import load
 
+from planner.exchange import exchanged_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
@@ -23,7 +24,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
-from rigkit.planning.plan import choose_views, covariance_of, exchanged_views
+from rigkit.planning.plan import choose_views, covariance_of
 
 REAL = ("caliper", "camodocal", "ov-plane", "charuco-stereo-left", "charuco-stereo-right")
 GRID = (40, 30)

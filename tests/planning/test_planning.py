@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
+from planner.exchange import exchanged_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.shape import WARP_UNKNOWNS, warp_of_board
@@ -21,7 +22,7 @@ from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boar
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
-from rigkit.planning.plan import choose_views, covariance_of, exchanged_views, plan_views
+from rigkit.planning.plan import choose_views, covariance_of, plan_views
 from rigkit.planning.words import placement
 
 NOISE_PX = 0.2
