@@ -20,7 +20,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal, projection_goal, turned_design
+from rigkit.planning.goal import Goal, projection_goal, px_words, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, covariance_of, plan_views
@@ -143,8 +143,12 @@ class CaptureGuide:
         words = f"Hold the board: {where}"
         if glance.view is not None and worth >= WORTH_TAKING and glance.complaint:
             words = glance.complaint.capitalize()
-        if enough:
-            words = f"Enough: {error:.2g} {unit}; two more pictures would bring {100.0 * plan.gain:.0f} %"
+        error_px = None if error is None else self._error_px(plan)
+        if error_px is not None and enough:
+            left = px_words(plan.knowledge.camera, error_px)
+            if unit != "px":
+                left = f"{error:.2g} {unit}, {error_px:.2g} px"
+            words = f"Enough: {left}; two more pictures would bring {100.0 * plan.gain:.0f} %"
         return Advice(
             words=words,
             target_px=where.outline_px,
@@ -153,7 +157,7 @@ class CaptureGuide:
             enough=bool(enough),
             error=error,
             unit=unit,
-            error_px=None if error is None else self._error_px(plan),
+            error_px=error_px,
             more_percent=None if error is None else 100.0 * plan.gain,
         )
 

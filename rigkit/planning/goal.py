@@ -15,6 +15,7 @@ from rigkit.core.arrays import FloatArray, Pixels, Rays
 
 GOAL_GRID = (24, 18)
 """Columns and rows of the pixels that the goal averages over."""
+METRE_MM = 1000.0
 
 
 class Aim(Protocol):
@@ -53,6 +54,18 @@ def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixe
     rays = rays_within(camera, pixels, field_deg)
     left = turned_design(camera, rays).reshape(-1, camera.parameters.size)
     return Goal(left.T @ left / len(rays), "px", "rms error of the projection over the image")
+
+
+def px_words(camera: Camera, error_px: float) -> str:
+    """Return an error in the image in words, as it is and as what it comes to: how far aside, rms over the image, it
+    puts what is a metre away."""
+    pixels = grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2)
+    _, seen = camera.unproject(pixels)
+    if not seen.any():
+        return f"{error_px:.2g} px"
+    by_pixel = camera.ray_jacobian(pixels[seen])
+    aside = error_px * METRE_MM * float(np.sqrt(0.5 * (by_pixel**2).sum(axis=(-1, -2)).mean()))
+    return f"{error_px:.2g} px, {aside:.2g} mm at 1 m"
 
 
 def turned_design(camera: Camera, rays: Rays) -> FloatArray:

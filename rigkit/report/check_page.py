@@ -11,6 +11,7 @@ import numpy as np
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import without_nan
 from rigkit.core.tables import Cell, Table, cells, columns
+from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
@@ -57,7 +58,7 @@ def check_words(check: SentinelCheck) -> CheckWords:
             "or another board; check what was photographed, and calibrate anew."
         )
     else:
-        headline = f"Does NOT hold ({p}): {change}"
+        headline = f"Does NOT hold ({p}): {change}; {_cost_words(check, change)}"
         sentences.append(
             f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
             f"are left.{_nearest_words(check, change)}"
@@ -72,9 +73,15 @@ def check_words(check: SentinelCheck) -> CheckWords:
         sentences.append(_could_have_found(worst))
         if worst.chance < FOUND and len(check.watched.cameras) == 1:
             sentences.append("Which pictures would tell most: rigkit plan CALIBRATION --check")
-    if change is not None and not check.holds and check.cost_unit != "px":
-        sentences.append(f"In the length it makes an error of {check.cost:.3g} {check.cost_unit} rms.")
     return CheckWords(headline, tuple(sentences))
+
+
+def _cost_words(check: SentinelCheck, change: Change) -> str:
+    """Return what a change costs: in the length that is measured, or of what is a metre away."""
+    if check.cost_unit != "px":
+        return f"an error of {check.cost:.2g} {check.cost_unit} rms in the length"
+    c = 0 if change.cause.camera is None else check.watched.names.index(change.cause.camera)
+    return px_words(check.watched.cameras[c], change.size_px)
 
 
 def _nearest_words(check: SentinelCheck, change: Change) -> str:

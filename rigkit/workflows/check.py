@@ -36,7 +36,7 @@ from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.next_views import goal_of
+from rigkit.workflows.next_views import goal_of, length_goal
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
 
@@ -103,7 +103,7 @@ def check_pictures(
     ensure_writable(outputs, force=options.force, inputs=inputs)
     if options.history is not None:
         ensure_register(options.history, inputs)
-    cost = None if options.length is None else _cost(watched, options.length)
+    cost = [] if options.length is None else length_costs(watched, options.length)
     left_out: list[tuple[str, str]] = []
     unreadable: list[str] = []
     if options.scene:
@@ -273,11 +273,31 @@ def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before
     return turned if apart(turned) < apart(view) else view
 
 
-def _cost(watched: Watched, task: Task) -> Goal:
-    """Return what a change of the first camera (of a rig: of the pair) does to a length."""
-    if len(watched.cameras) > 1:
-        raise InputError("check: --length tells what a change of one camera costs; of a rig see `rigkit certify`")
-    return goal_of(watched.cameras[0], Reach(), task)
+def length_costs(watched: Watched, task: Task) -> list[Goal]:
+    """Return what a change does to a length: that one camera sees, or the first of a rig with each of the others that
+    see it, too.
+
+    Raises DegenerateError where none does.
+    """
+    if len(watched.cameras) == 1:
+        return [goal_of(watched.cameras[0], Reach(), task)]
+    found, unseen = [], None
+    for c in range(1, len(watched.cameras)):
+        cameras, mounts = watched.cameras, watched.cam_from_rig
+        try:
+            goal = length_goal((cameras[0], cameras[c]), (mounts[0], mounts[c]), task)
+        except DegenerateError as error:
+            unseen = error
+            continue
+        # The first camera is the rig's frame: its mount does not change.
+        lenses = np.r_[watched.lens(0), watched.lens(c)]
+        own, kept = np.r_[lenses, watched.mount(c)], np.r_[0 : len(lenses), len(lenses) + 6 : len(lenses) + 12]
+        weight = np.zeros((watched.size, watched.size))
+        weight[np.ix_(own, own)] = goal.weight[np.ix_(kept, kept)]
+        found.append(replace(goal, weight=weight))
+    if not found and unseen is not None:
+        raise DegenerateError(f"of no two cameras: {unseen}")
+    return found
 
 
 def fixed_text(source: Path, check: SentinelCheck) -> str:

@@ -52,21 +52,30 @@ def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
         return projection_goal(camera, reach.field_deg)
     if task.quantity is not Quantity.LENGTH:
         raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
-    p = camera.parameters.size
+    return length_goal((camera,), (Rigid3.identity(),), task)
+
+
+def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task: Task) -> Goal:
+    """Return the error of a length seen by a camera, or by two, over the image of the first: its weight is on their
+    parameters, and of two then on both mounts (rad, mm).
+
+    Raises DegenerateError where the length is nowhere in view.
+    """
+    count = sum(camera.parameters.size for camera in cameras) + (12 if len(cameras) == 2 else 0)
     instrument = Instrument(
-        names=("camera",),
-        cameras=(camera,),
-        cam_from_rig=(Rigid3.identity(),),
-        covariance=np.zeros((p, p)),
+        names=tuple(f"{k}" for k in range(len(cameras))),
+        cameras=tuple(cameras),
+        cam_from_rig=tuple(cam_from_rig),
+        covariance=np.zeros((count, count)),
         sigma_px=1.0,
     )
-    rays, valid = camera.unproject(grid_pixels(camera.size_px, TASK_CELLS).reshape(-1, 2))
-    _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=False))
+    rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
+    _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=instrument.is_rig))
     if not seen.any():
         raise DegenerateError(
             f"plan: nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
             "length or another distance"
         )
-    rows = by_calibration[seen].reshape(-1, p)
+    rows = by_calibration[seen].reshape(-1, count)
     what = f"standard error of a length of {task.size_mm:g} mm at {task.distance_mm:g} mm"
     return Goal(rows.T @ rows / len(rows), "mm", what)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -125,9 +126,13 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
     assert said["amounts"] == pytest.approx([FOCUS_PERCENT], abs=0.1)
     # A length seen through a focus that is 0.5 % off is 0.5 % off.
     assert said["cost"] == pytest.approx(0.01 * FOCUS_PERCENT * 200.0, rel=0.4)
+    assert f"an error of {said['cost']:.2g} mm rms in the length" in said["statement"]
     assert "does not hold" in page.read_text()
     assert load_camera(fixed).parameters[0] == pytest.approx(CAMERA.parameters[0] * 1.005, rel=1e-3)
     assert main(["check", str(fixed), str(home / "moved")]) == 0
+    capsys.readouterr()
+    assert main(["check", calibration, str(home / "moved")]) == 1
+    assert re.search(r" px, [0-9.]+ mm at 1 m$", capsys.readouterr().out.splitlines()[0])
     drift = tmp_path / "drift.html"
     assert main(["history", str(register), "--add", str(fixed), "--to", calibration, "-r", str(drift)]) == 0
     lines = capsys.readouterr().out.splitlines()

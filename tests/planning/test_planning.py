@@ -13,13 +13,14 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.shape import WARP_UNKNOWNS, warp_of_board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boards, outline_mm
-from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.goal import Goal, projection_goal, px_words
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import choose_views, covariance_of, plan_views
@@ -169,16 +170,15 @@ def test_words(at: tuple[float, ...], turn_deg: tuple[float, ...], words: str) -
     assert str(placement(guessed_camera(60.0, (1280, 960)), board, Rigid3(rotation, at - rotation @ middle))) == words
 
 
+def test_an_error_of_the_image_is_told_in_mm() -> None:
+    # A pixel of a narrow lens is an angle of 1 / f.
+    narrow = Pinhole((640, 480), np.array([10000.0, 10000.0, 319.5, 239.5]))
+    assert px_words(narrow, 0.5) == "0.5 px, 0.05 mm at 1 m"
+
+
 def test_words_of_a_corner() -> None:
     where = placement(guessed_camera(90.0, (1280, 960)), BOARD, Rigid3(np.eye(3), [400.0, -400.0, 600.0]))
     assert where.place == "top right corner"
-
-
-def test_views_taken_for_want_of_better_ones_are_exchanged() -> None:
-    views = np.stack([np.diag([0.1, 0.0]), np.diag([0.0, 9.0]), np.diag([8.0, 0.0]), np.diag([0.0, 0.1])])
-    goal = Goal(np.eye(2), "px", "both")
-    assert sorted(exchanged_views(np.eye(2), views, goal, [0, 3])) == [1, 2]
-    assert exchanged_views(np.eye(2), views, goal, [2, 1]) == [2, 1]
 
 
 def test_a_board_that_may_bow_is_shown_turned() -> None:

@@ -18,6 +18,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -32,13 +33,16 @@ from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.report.check_page import check_page, check_words
 from rigkit.report.history_page import drift_svg, history_facts, history_page
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck, check_views, judge_evidence
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
-from rigkit.workflows.check import fixed_text
+from rigkit.workflows.check import fixed_text, length_costs
 from rigkit.workflows.history import add_calibration, show_history
+from rigkit.workflows.next_views import TASK_CELLS
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
@@ -339,6 +343,38 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
     # Where nothing is off, it is the calibration's numbers that are.
     with pytest.raises(DegenerateError, match="calibration's numbers"):
         judge_evidence(rig, lambda _: replace(far, rms_px=0.1))
+
+
+def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
+    """The old rig measures points that the changed one sees."""
+    watched, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
+    step = np.zeros(watched.size)
+    step[watched.lens(0)][:2] = 0.3
+    step[watched.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
+    now, (goal,) = watched.changed(step), length_costs(watched, task)
+    rays, valid = watched.cameras[0].unproject(grid_pixels(watched.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
+    points = measured_points(rays[valid], task, is_rig=True)[0]
+    seen, shown = np.ones(len(points), dtype=bool), []
+    for camera, pose in zip(now.cameras, now.cam_from_rig, strict=True):
+        pixels, sees = camera.project(pose.apply(points))
+        seen &= (sees & camera.on_image(pixels)).all(axis=1)
+        shown.append(pixels)
+    found = points.copy()
+    for _ in range(4):
+        rows, left = [], []
+        for camera, pose, pixels in zip(watched.cameras, watched.cam_from_rig, shown, strict=True):
+            projected, _, by_point, _ = camera.project_with_jacobians(pose.apply(found))
+            rows.append(by_point @ pose.rotation)
+            left.append(pixels - projected)
+        J, r = np.concatenate(rows, axis=-2)[seen], np.concatenate(left, axis=-1)[seen]
+        JT = np.swapaxes(J, -1, -2)
+        found[seen] += np.linalg.solve(JT @ J, JT @ r[..., None])[..., 0]
+    lengths = np.linalg.norm(found[seen][:, 1::2] - found[seen][:, ::2], axis=-1)
+    wrong = float(np.sqrt(((lengths - task.size_mm) ** 2).mean()))
+    assert goal.unit == "mm" and np.sqrt(step @ goal.weight @ step) == pytest.approx(wrong, rel=0.02)
+    far = Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=700.0)
+    with pytest.raises(DegenerateError, match="of no two cameras"):
+        length_costs(watched, far)
 
 
 def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:

@@ -56,7 +56,7 @@ class PairMatches:
 
 
 def check_scene(
-    watched: Watched, frames: Sequence[Sequence[Any]], cost: Goal | None = None, *, progress: Progress = silent
+    watched: Watched, frames: Sequence[Sequence[Any]], cost: Sequence[Goal] = (), *, progress: Progress = silent
 ) -> SentinelCheck:
     """Return the verdict on images of a textured scene, one a camera in every frame.
 
@@ -84,7 +84,7 @@ def scene_matches(image1: Any, image2: Any) -> Correspondences:
     return match_affine_features(image1, image2, tilts=(1.0,), features_per_view=FEATURES, unique=True)
 
 
-def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Goal | None = None) -> SentinelCheck:
+def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on matches of a rig's cameras.
 
     Raises DegenerateError where there are too few.

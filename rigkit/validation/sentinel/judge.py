@@ -134,16 +134,16 @@ def _wild(rms_px: float, expected_px: float) -> bool:
     return not rms_px <= max(WILD * expected_px, ALARM_PX)
 
 
-def check_views(watched: Watched, views: Sequence[FreshView], cost: Goal | None = None) -> SentinelCheck:
+def check_views(watched: Watched, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return whether fresh views of boards agree with what is `watched`; `cost` weighs a change of theta by what it
-    does to a measurement, by default to the projection.
+    does to a measurement (the worst of several), by default to the projection.
 
     Raises as `evidence_of`.
     """
     return judge_evidence(watched, lambda now: evidence_of(now, views), cost)
 
 
-def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> SentinelCheck:
+def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
     evidence = look(watched)
     expected_px, known, chance = _expected_px(watched, evidence), list[Change](), 1.0
@@ -166,7 +166,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Goal | None = None) -> Se
         unsure = best.cause.directions @ best.covariance @ best.cause.directions.T
         covariance = watched.covariance + unsure
         change = replace(best, amounts=amounts, size_px=_size_px(watched, evidence, step, unsure))
-    goals = [cost] if cost is not None else lens_goals(watched)
+    goals = cost or lens_goals(watched)
     return SentinelCheck(
         chance=chance,
         change=change,
