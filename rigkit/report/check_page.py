@@ -15,7 +15,7 @@ from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.facts_page import build_facts_page
 from rigkit.report.page_facts import PageFacts
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, Change, SentinelCheck
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
 DRAWN_WIDTH = 600.0
@@ -58,10 +58,15 @@ def check_words(check: SentinelCheck) -> CheckWords:
             "or another board; check what was photographed, and calibrate anew."
         )
     else:
-        headline = f"Does NOT hold ({p}): {change}; {_cost_words(check, change)}"
+        # What changed in several ways is told by what it does alone.
+        what = change.cause.words if change.cause.kind == "lens" else change
+        headline = f"Does NOT hold ({p}): {what}; {_cost_words(check, change)}"
+        unsure = (
+            "" if change.size_px >= ALARM_PX else f", perhaps {change.most_px:.2f} px: these pictures tell it badly"
+        )
         sentences.append(
-            f"It moves the projection by {change.size_px:.3f} px rms; after the correction {check.rms_fixed_px:.3f} px "
-            f"are left.{_nearest_words(check, change)}"
+            f"It moves the projection by {change.size_px:.3f} px rms{unsure}; after the correction "
+            f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
         )
     if not check.holds and len(check.watched.cameras) > 1:
         sentences.append(

@@ -507,7 +507,7 @@ def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration
     check = _checked(calibration, much, np.random.default_rng(1))
     assert check.change is not None and check.change.cause.kind == "lens" and not check.holds
     words = check_words(check)
-    assert re.search(r"changed in several ways: by [\d.]+ px rms in all$", words.headline)
+    assert re.search(r"changed in several ways; [\d.]+ px, [\d.]+ mm at 1 m$", words.headline)
     assert re.search(r"\d+% of what is seen is explained by this alone: the ", words.sentences[1])
 
 

@@ -56,6 +56,7 @@ class Change:
     amounts, covariance : (K,) and (K, K), in `cause.units`.
     chance : probability that unchanged cameras show as much of it.
     size_px : how far it moves the projection, rms after the best rotation; of a mount, how far what it shows moves.
+    most_px : the same with how unsure it is: what may be large is not small because it is told badly.
     gain : by how much it lowers the sum of squares.
     """
 
@@ -64,6 +65,7 @@ class Change:
     covariance: FloatArray
     chance: float
     size_px: float
+    most_px: float
     gain: float
 
     @property
@@ -126,7 +128,7 @@ class SentinelCheck:
         """Nothing says that the calibration does not hold."""
         if self.unexplained:
             return False
-        return self.change is None or self.chance >= ALARM_CHANCE or self.change.size_px < ALARM_PX
+        return self.change is None or self.chance >= ALARM_CHANCE or self.change.most_px < ALARM_PX
 
 
 def _wild(rms_px: float, expected_px: float) -> bool:
@@ -165,7 +167,8 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         step = best.cause.directions @ amounts
         unsure = best.cause.directions @ best.covariance @ best.cause.directions.T
         covariance = watched.covariance + unsure
-        change = replace(best, amounts=amounts, size_px=_size_px(watched, evidence, step, unsure))
+        size_px, most_px = _sizes_px(watched, evidence, step, unsure)
+        change = replace(best, amounts=amounts, size_px=size_px, most_px=most_px)
     goals = cost or lens_goals(watched)
     return SentinelCheck(
         chance=chance,
@@ -261,17 +264,19 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     gain = float(right @ amounts)
     m = len(amounts)
     chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
-    return Change(cause, amounts, covariance, chance, 0.0, gain)
+    return Change(cause, amounts, covariance, chance, 0.0, 0.0, gain)
 
 
-def _size_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> float:
+def _sizes_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> tuple[float, float]:
     """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`: over the image of the
     camera that suffers most, after the best rotation; how far a camera that turned on its mount sees what is far away
-    move; or what the corners show of it. The square of an estimate is too large by its variance, which is taken off."""
+    move; or what the corners show of it. The square of an estimate is too large by its variance, which is taken off;
+    and the same where it is not."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     turns = [_turn_weight(watched, c) for c in range(1, len(watched.cameras))]
     weights = [shown, *(goal.weight for goal in lens_goals(watched)), *turns]
-    return float(np.sqrt(max(0.0, *(step @ weight @ step - (weight * unsure).sum() for weight in weights))))
+    squares = np.array([(step @ weight @ step, (weight * unsure).sum()) for weight in weights])
+    return float(np.sqrt(max(0.0, *(squares[:, 0] - squares[:, 1])))), float(np.sqrt(max(0.0, *squares[:, 0])))
 
 
 def _turn_weight(watched: Watched, c: int) -> FloatArray:
