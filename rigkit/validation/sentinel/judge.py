@@ -46,7 +46,7 @@ DRAWS, FEW_DRAWS = 4000, 8
 """Of what unchanged cameras show; fewer than so many tell no chance."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Change:
     """A cause with the amounts that explain the frames best.
 
@@ -264,7 +264,9 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     gain = float(right @ amounts)
     m = len(amounts)
     chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
-    return Change(cause, amounts, covariance, chance, 0.0, 0.0, gain)
+    return Change(
+        cause=cause, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, most_px=0.0, gain=gain
+    )
 
 
 def _sizes_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> tuple[float, float]:
