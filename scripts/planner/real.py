@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from split_halves import load
 
-from planner.exchange import exchanged_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
