@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
-from planner.exchange import exchanged_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.shape import WARP_UNKNOWNS, warp_of_board
