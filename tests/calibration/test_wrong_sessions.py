@@ -165,6 +165,26 @@ def test_frames_that_are_not_of_one_moment(rng: np.random.Generator) -> None:
         assert (camera.calibration.parameter_sigmas > 0.5 * alone.parameter_sigmas).all()
 
 
+@pytest.mark.parametrize("other_mm", [30.0, 25.0])
+def test_boards_whose_stated_sizes_contradict_each_other(other_mm: float, rng: np.random.Generator) -> None:
+    """Both are of 30 mm. One camera cannot tell; two see themselves nearer to each other by the one that is stated
+    with 25 mm."""
+    cameras = {"left": (lens("reg"), 0.0), "right": (lens("reg", np.array([790.0, 640.0])), -80.0)}
+    rotation, translation = poses(rng, 40, 0.4 * rng.normal(size=(40, 3)))
+    sizes = {"first": 30.0, "second": other_mm}
+    stated = [replace(BOARD, board_id=name, square_x_mm=mm, square_y_mm=mm) for name, mm in sizes.items()]
+    views = {
+        name: [
+            (view.image, replace(view, board=stated[int(view.image[:3]) % 2]))
+            for view in seen(camera, rotation, translation + np.array([away, 0.0, 0.0]), rng)
+        ]
+        for name, (camera, away) in cameras.items()
+    }
+    rig = calibrate_rig(views, dict.fromkeys(cameras, SIZE), model="brown")
+    assert ("are not of the sizes that are stated" in rig.verdicts[0].message) is (other_mm != 30.0)
+    assert "the images of a frame are not of one moment" not in str(rig.verdicts)
+
+
 def test_the_verdict_does_not_depend_on_how_the_model_was_reached(rng: np.random.Generator) -> None:
     fish = lens("fish")
     longer = fish.with_parameters(np.asarray(fish.parameters) * np.array([1.03, 1.03, *[1.0] * 6]))

@@ -11,6 +11,7 @@ import numpy as np
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.board_sizes import sizes_apart
 from rigkit.calibration.rig.disagree import (
     DISAGREES,
     MIN_PX,
@@ -113,6 +114,7 @@ def solve_jointly(
     mounts, notes = mounts_of(names, seen, places)
     mounts = list(mounts) if known is None else known.mounts(names, mounts)
     seen = turned_alike(seen, mounts, places)
+    sizes, also = sizes_apart(names, seen, places), tuple[Finding, ...]()
     shared = len(shared_keys(seen))
     left_out = part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
     sigma = _sigma(single)
@@ -146,7 +148,7 @@ def solve_jointly(
         if known is not None:
             observations = known.hold(observations, solution.state, names)
         solution = solve_rig(observations, solution.state, sigma)
-        notes = (_disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1), *notes)
+        also = _disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1)
     return JointRig(
         observations=observations,
         solution=solution,
@@ -154,7 +156,7 @@ def solve_jointly(
         sigma_px=sigma,
         cost_sigmas=usual_sigmas,
         left_out=tuple(left_out),
-        notes=notes,
+        notes=(*(sizes or also), *notes),
         known=known,
     )
 
@@ -197,7 +199,9 @@ def _boards_px(seen: Sequence[FrameObservations]) -> float:
     return float(np.median(2.0 * np.sqrt(np.add.reduceat((off**2).sum(axis=1), start) / count)))
 
 
-def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool) -> Finding:
+def _disagreement(
+    cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool
+) -> tuple[Finding]:
     """Return what to say where sharing poses usually costs more than chance: `usual` px a corner, and sigmas."""
     usual_px, usual_sigmas = usual
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
@@ -212,7 +216,7 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, f
         f"{frames}; the lenses are held near what each camera says alone, and the sigmas of the rig rest on how "
         "far its frames disagree"
     )
-    return Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
+    return (Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy),)
 
 
 def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:

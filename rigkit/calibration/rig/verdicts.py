@@ -28,8 +28,8 @@ def judge_rig(
     """Return the verdicts, the headline first; `far` are the cameras' projections, `notes` verdicts found elsewhere,
     `in_force` as for `judge`."""
     causes = [
-        *_not_converged(rig),
         *notes,
+        *_not_converged(rig),
         *_left_out(rig),
         *_worse(rig),
         *_overdispersed(rig, in_force),

@@ -1,0 +1,66 @@
+"""Whether boards are as large, against each other, as they are said to be: by each, how far apart the cameras are.
+
+One camera cannot tell: a board of half the size at half the distance looks the same. But two cameras see by every board
+how far apart they are themselves, in units of its squares. What the boards say of that must agree.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from rigkit.calibration.rig.frames import target_poses
+from rigkit.calibration.rig.observations import FrameObservations, Places
+from rigkit.core.arrays import FloatArray
+from rigkit.core.findings import Finding, Severity
+from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
+
+MIN_FRAMES_OF_BOARD = 3
+"""With fewer frames of a board nobody knows how far what it says scatters."""
+MIN_SIZES_APART = 0.01
+"""Printed boards are a few parts in a thousand off; a size that was mistaken for another is off by parts in ten."""
+SIZES_ERRORS = 6.0
+"""So many standard errors apart, as the frames of both boards scatter."""
+
+
+def sizes_apart(names: Sequence[str], seen: Sequence[FrameObservations], places: Places) -> tuple[Finding, ...]:
+    """Return a finding where two boards contradict each other on how far apart two of the cameras `names` are."""
+    for i, j in combinations(range(len(seen)), 2):
+        shared = seen[i].keys() & seen[j].keys()
+        pairs = sorted({seen[i][place].key for place in shared if seen[i][place].key == seen[j][place].key})
+        if not pairs:
+            continue
+        own = [{entry.key: entry for entry in seen[k].values()} for k in (i, j)]
+        (turn1, at1), (turn2, at2) = (target_poses([each[key] for key in pairs], places) for each in own)
+        between = at2 - np.einsum("nij,nkj,nk->ni", turn2, turn1, at1)
+        middle = np.median(between, axis=0)
+        length = between @ middle / max(float(np.linalg.norm(middle)), np.finfo(float).tiny)
+        of_board = defaultdict(list)
+        for (_, target), value in zip(pairs, length.tolist(), strict=True):
+            of_board[target].append(value)
+        told = {name: np.array(values) for name, values in of_board.items() if len(values) >= MIN_FRAMES_OF_BOARD}
+        for one, other in combinations(sorted(told, key=lambda name: -len(told[name])), 2):
+            usual = [float(np.median(told[name])) for name in (one, other)]
+            chance = float(np.hypot(_error(told[one]), _error(told[other])))
+            apart = abs(usual[1] - usual[0])
+            if min(usual) > 0.0 and apart > max(MIN_SIZES_APART * min(usual), SIZES_ERRORS * chance):
+                return (_finding((names[i], names[j]), (one, other), (usual[0], usual[1])),)
+    return ()
+
+
+def _error(values: FloatArray) -> float:
+    """Return the standard error of the median of values (N,)."""
+    spread = SIGMA_OF_MEDIAN * float(np.median(np.abs(values - np.median(values))))
+    return float(np.sqrt(0.5 * np.pi / len(values))) * spread
+
+
+def _finding(cameras: tuple[str, str], boards: tuple[str, str], usual_mm: tuple[float, float]) -> Finding:
+    return Finding(
+        severity=Severity.BAD,
+        message=f"boards '{boards[0]}' and '{boards[1]}' are not of the sizes that are stated: by the one cameras "
+        f"'{cameras[0]}' and '{cameras[1]}' are {usual_mm[0]:.4g} mm apart, by the other {usual_mm[1]:.4g} mm",
+        remedy="measure the squares of both (are the two sizes swapped?), and calibrate again",
+    )
