@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibration.test_rig import NOISE_PX, mounts, rig_views
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
+from helpers.rig_scenes import NOISE_PX, mounts, rig_views
 
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig

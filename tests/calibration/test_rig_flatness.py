@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibration.test_rig import MODELS, Views, mounts, rig_views, sizes
 from helpers.calibration_scenes import BOARD
+from helpers.rig_scenes import MODELS, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.flatness import shape_error

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration.test_rig import MODELS, rig_views, sizes
+from helpers.rig_scenes import MODELS, rig_views, sizes
 
 from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble

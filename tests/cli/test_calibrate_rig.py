@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.test_rig import Views, mounts, rig_views
 from helpers.board_rig_scenes import ALIKE, corner_of_a_room, target_views
 from helpers.calibration_scenes import lens
+from helpers.rig_scenes import Views, mounts, rig_views
 
 from rigkit.cli.main import main
 from rigkit.core.boards import Board

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration.test_rig import rig_views
 from helpers.browser import loaded
 from helpers.calibration_scenes import lens
 from helpers.data import REPOSITORY
+from helpers.rig_scenes import rig_views
 from report.test_first_screen import page_of, reported
 
 from rigkit.calibration.rig.calibrate import calibrate_rig

@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from calibration.test_rig import rig_views
 from helpers.calibration_scenes import BOARD, lens, random_views
 from helpers.reconstructions import make_reconstruction
+from helpers.rig_scenes import rig_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.rig.calibrate import calibrate_rig
