@@ -1,0 +1,54 @@
+"""Boards held before a lens whose calibration is checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+
+from helpers.calibration_scenes import BOARD, lens
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.base import Camera
+from rigkit.core.detections import BoardView
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import plan_views
+from rigkit.validation.sentinel.evidence import FreshView
+from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.validation.sentinel.watch import watched_camera
+
+NOISE_PX = 0.03
+CHANGED_PX = 0.25
+"""Change of the projection, rms after the best rotation: what three views show beyond doubt."""
+
+
+@cache
+def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3]:
+    """Return where boards are best held before a lens of `calibration_scenes`."""
+    camera = lens(name)
+    known = Knowledge.guessed(camera, CornerError(NOISE_PX))
+    plan = plan_views(known, [BOARD], projection_goal(camera), count, reach=reach)
+    return [view.cam_from_board for view in plan.views]
+
+
+def view_of(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator, noise_px: float = NOISE_PX) -> BoardView:
+    pixels, valid = camera.project(pose.apply(BOARD.points()))
+    valid &= camera.on_image(pixels)
+    noisy = np.clip(pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2)), 0.0, None)
+    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), noise_px))
+
+
+def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
+    poses = poses_held("reg", 3)
+    views = [FreshView(f"{k}", 0, view_of(camera, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
+    return check_views(watched_camera(calibration, "cam"), views)
+
+
+def changed_lens(what: Callable[[np.ndarray], np.ndarray]) -> Camera:
+    camera = lens("reg")
+    step = what(camera.parameters.copy()) - camera.parameters
+    size = np.sqrt(step @ projection_goal(camera).weight @ step)
+    return camera.with_parameters(camera.parameters + step * CHANGED_PX / size)

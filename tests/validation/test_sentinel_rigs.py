@@ -1,0 +1,237 @@
+"""The sentinel of rigs: mounts that moved, from boards and from scenes without any."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import lens
+from helpers.sentinel_scenes import NOISE_PX, poses_held, view_of
+
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.history_file import HistoryEntry
+from rigkit.planning.candidates import Reach
+from rigkit.report.check_page import check_words
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.certificate.propagation import measured_points
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
+from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
+from rigkit.workflows.check import length_costs
+from rigkit.workflows.next_views import TASK_CELLS
+
+MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
+
+
+MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
+TURN_DEG = [0.02, -0.015, 0.03]
+LENS_SIGMAS = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
+
+
+def _rig() -> Watched:
+    camera = lens("wide")
+    return Watched(
+        names=("left", "right"),
+        cameras=(camera, camera),
+        cam_from_rig=(Rigid3.identity(), MOUNT),
+        covariance=np.diag([*LENS_SIGMAS, *LENS_SIGMAS, *[2e-5] * 3, *[0.01] * 3]) ** 2,
+        sigma_px=NOISE_PX,
+        freedom=20.0,
+    )
+
+
+NEAR = Reach(nearest_mm=300.0)
+
+
+def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> SentinelCheck:
+    rig, views = _rig(), []
+    for k, held in enumerate(poses_held("wide", 3, NEAR)):
+        views.append(FreshView(f"{k}", 0, view_of(rig.cameras[0], held, f"{k}", rng)))
+        views.append(FreshView(f"{k}", 1, view_of(second, pose @ held, f"{k}", rng)))
+    return check_views(rig, views)
+
+
+def test_a_rig_that_nobody_touched_holds() -> None:
+    checks = [_rig_check(MOUNT, lens("wide"), np.random.default_rng(seed)) for seed in range(5)]
+    assert all(check.holds for check in checks)
+    powers = {(p.kind, p.camera): p for p in checks[0].powers}
+    assert set(powers) == {(k, c) for k in ("focus", "principal point", "distortion") for c in ("left", "right")} | {
+        ("rotation", "right")
+    }
+    # The turn that is found below is one that is said to be found.
+    assert powers["rotation", "right"].unit == "deg" and powers["rotation", "right"].found_from < np.linalg.norm(
+        TURN_DEG
+    )
+
+
+def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random.Generator) -> None:
+    turn = np.radians(TURN_DEG)
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    check = _rig_check(moved, lens("wide"), rng)
+    assert not check.holds and check.change is not None
+    assert (check.change.cause.kind, check.change.cause.camera) == ("rotation", "right")
+    assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
+    assert check.change.sigmas.max() < 0.01
+    # A rig's file may come from anywhere.
+    assert "never held" in check_words(check).sentences[-1]
+
+
+def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generator) -> None:
+    moved = Rigid3(MOUNT.rotation, 1.01 * MOUNT.translation_mm)
+    check = _rig_check(moved, lens("wide"), rng)
+    assert not check.holds and check.change is not None
+    assert check.change.cause.kind == "scale"
+    assert check.change.amounts == pytest.approx([1.0], abs=0.1)
+
+
+def _matches(pose: Rigid3, rng: np.random.Generator, noise_px: float = MATCH_NOISE_PX) -> PairMatches:
+    camera = lens("wide")
+    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (600, 2)))
+    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
+    pixels1, seen1 = camera.project(points)
+    pixels2, seen2 = camera.project(pose.apply(points))
+    both = seen1 & seen2 & camera.on_image(pixels2)
+    noisy = [p[both] + noise_px * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
+    # One match in ten is wrong.
+    wrong = rng.random(len(noisy[0])) < 0.1
+    noisy[1][wrong] += rng.uniform(-60.0, 60.0, (int(wrong.sum()), 2))
+    return PairMatches(0, 1, np.clip(noisy[0], 0.0, None), np.clip(noisy[1], 0.0, None))
+
+
+def test_a_scene_tells_of_a_mount_without_any_board() -> None:
+    quiet, named, draws = 0, 0, 3
+    turn = np.radians([0.05, 0.0, 0.0])
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    for seed in range(draws):
+        rng = np.random.default_rng(seed)
+        quiet += check_matches(_rig(), [_matches(MOUNT, rng)]).holds
+        alarmed = check_matches(_rig(), [_matches(moved, rng)])
+        assert not alarmed.holds
+        named += alarmed.change is not None and alarmed.change.cause.kind == "rotation"
+    assert quiet == named == draws
+
+
+def test_matches_that_say_nothing_are_told_from_those_that_say_little() -> None:
+    with pytest.raises(DegenerateError, match="texture"):
+        check_matches(_rig(), [])
+    # All in one corner of the image; and none that a lens sees.
+    few = _matches(MOUNT, np.random.default_rng(0))
+    near = (few.pixels1 < [800.0, 600.0]).all(axis=1) & (few.pixels1 > [406.0, 310.0]).all(axis=1)
+    assert check_matches(_rig(), [PairMatches(0, 1, few.pixels1[near], few.pixels2[near])]).corners == near.sum() > 20
+    # A mount that is said to be exact.
+    exact = replace(_rig(), covariance=np.diag([*np.array(LENS_SIGMAS) ** 2, *np.array(LENS_SIGMAS) ** 2, *[0.0] * 6]))
+    assert check_matches(exact, [few]).holds
+    with pytest.raises(DegenerateError, match="none of the matches"):
+        check_matches(_rig(), [PairMatches(0, 1, np.full((50, 2), np.nan), np.full((50, 2), np.nan))])
+
+
+def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Path) -> None:
+    rig = _rig()
+    far = FreshEvidence(
+        information=np.full((1, rig.size, rig.size), np.inf),
+        score=np.full((1, rig.size), np.inf),
+        variance_px2=0.01,
+        rms_px=50.0,
+        expected_px=0.1,
+        corners=100,
+        left_out=0,
+        overdispersion=1.0,
+        freedom=10.0,
+    )
+    check = judge_evidence(rig, lambda _: far)
+    assert check.unexplained and not check.holds and check.change is None
+    assert "nothing that moved explains it" in check_words(check).headline
+    assert HistoryEntry.of_check(check, tmp_path).verdict == "nothing that moved explains it"
+    # Where nothing is off, it is the calibration's numbers that are.
+    with pytest.raises(DegenerateError, match="calibration's numbers"):
+        judge_evidence(rig, lambda _: replace(far, rms_px=0.1))
+
+
+def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
+    """The old rig measures points that the changed one sees."""
+    watched, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
+    step = np.zeros(watched.size)
+    step[watched.lens(0)][:2] = 0.3
+    step[watched.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
+    now, (goal,) = watched.changed(step), length_costs(watched, task)
+    rays, valid = watched.cameras[0].unproject(grid_pixels(watched.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
+    points = measured_points(rays[valid], task, is_rig=True)[0]
+    seen, shown = np.ones(len(points), dtype=bool), []
+    for camera, pose in zip(now.cameras, now.cam_from_rig, strict=True):
+        pixels, sees = camera.project(pose.apply(points))
+        seen &= (sees & camera.on_image(pixels)).all(axis=1)
+        shown.append(pixels)
+    found = points.copy()
+    for _ in range(4):
+        rows, left = [], []
+        for camera, pose, pixels in zip(watched.cameras, watched.cam_from_rig, shown, strict=True):
+            projected, _, by_point, _ = camera.project_with_jacobians(pose.apply(found))
+            rows.append(by_point @ pose.rotation)
+            left.append(pixels - projected)
+        J, r = np.concatenate(rows, axis=-2)[seen], np.concatenate(left, axis=-1)[seen]
+        JT = np.swapaxes(J, -1, -2)
+        found[seen] += np.linalg.solve(JT @ J, JT @ r[..., None])[..., 0]
+    lengths = np.linalg.norm(found[seen][:, 1::2] - found[seen][:, ::2], axis=-1)
+    wrong = float(np.sqrt(((lengths - task.size_mm) ** 2).mean()))
+    assert goal.unit == "mm" and np.sqrt(step @ goal.weight @ step) == pytest.approx(wrong, rel=0.02)
+    far = Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=700.0)
+    with pytest.raises(DegenerateError, match="of no two cameras"):
+        length_costs(watched, far)
+
+
+def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
+    """A mount known to 0.06 degrees only: matches are off by many times their scatter, as the calibration says."""
+    sigmas = np.array([*LENS_SIGMAS, *LENS_SIGMAS, *[1e-3] * 3, *[0.01] * 3])
+    unsure = replace(_rig(), covariance=np.diag(sigmas**2))
+    for seed in range(9):
+        rng = np.random.default_rng(seed)
+        turn = 1e-3 * rng.standard_normal(3)
+        moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+        check = check_matches(unsure, [_matches(moved, rng)])
+        assert check.holds and not check.unexplained
+        assert check.rms_px < 3.0 * check.expected_px
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.random.Generator) -> None:
+    # Good matches, and a turn that moves them by many times their noise.
+    turn = np.radians(0.3) * np.eye(3)[axis]
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    check = check_matches(_rig(), [_matches(moved, rng, FINE_MATCH_NOISE_PX)])
+    assert check.expected_px < 2.0 * FINE_MATCH_NOISE_PX < 0.5 * check.rms_px
+    assert check.chance < 1e-9 and check.change is not None and check.change.cause.kind == "rotation"
+    assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_wrong_matches_that_lie_alone_do_not_rename_a_change(axis: int) -> None:
+    # A lens can bend to a few matches where there are no others: off by little, as those of tiles are by a period.
+    turn = np.radians(0.05) * np.eye(3)[axis]
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        whole = _matches(moved, rng, FINE_MATCH_NOISE_PX / 4.0)
+        alone = whole.pixels1[:, 0] < 400.0
+        few = np.flatnonzero(alone)[:12]
+        pixels2 = whole.pixels2 + 0.0
+        pixels2[few, 1] += 0.3
+        kept = np.concatenate([few, np.flatnonzero(~alone)])
+        check = check_matches(_rig(), [PairMatches(0, 1, whole.pixels1[kept], pixels2[kept])])
+        assert not check.holds and check.change is not None and check.change.cause.kind == "rotation"
+
+
+def test_the_size_of_a_change_is_not_that_of_its_uncertainty() -> None:
+    sizes = []
+    for seed in range(8):
+        matches = _matches(MOUNT, np.random.default_rng(seed))
+        check = check_matches(_rig(), [PairMatches(0, 1, matches.pixels1[:60], matches.pixels2[:60])])
+        assert check.change is not None
+        sizes.append(check.change.size_px)
+    # Nothing happened, and sixty matches do not say so well: of the estimates alone the median is 0.09 px.
+    assert np.median(sizes) < ALARM_PX / 2.0
