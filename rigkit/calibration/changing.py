@@ -46,8 +46,8 @@ which of them it was, however many corners there are."""
 
 
 MAX_LEFT_OF_CONTROL = 0.85
-"""A motion over rows leaves no more than this part of the squares that one over columns leaves. Both follow half of
-what any lens or board unlike its model leaves: in real captures held still rows leave 0.89 of it and more."""
+"""A motion over rows leaves no more than this part of the squares that one over columns leaves: both follow half of
+what any lens or board unlike its model leaves, in captures held still, too."""
 MIN_SHARE_TRIED = 0.2
 """Where a lens that changes explains this much at first order, it is solved for in every image."""
 LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
@@ -100,8 +100,7 @@ MOVED = _Way(
 are best, and both explain nearly all, far better than all else, it was a motion, unless a bend of each board is the
 main part, too: a lens or board unlike its model shows as that."""
 MIN_SHARE_MOVED = 0.9
-"""What a motion explains then: 0.97 and more where boards in hand move by pixels, 0.85 at most where all stood
-still."""
+"""What a motion explains then: 0.97 and more where simulated boards in hand move by pixels."""
 
 
 def changing(
