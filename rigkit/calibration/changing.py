@@ -118,11 +118,12 @@ def changing(
         first order.
     but : names of ways to change that are not to be told.
     """
-    changes = view_changes(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else {}
-    if not changes:
+    evidence = _evidence(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else None
+    changes = evidence.changes() if evidence is not None else {}
+    if evidence is None or not changes:
         return []
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
-        changes |= {way: _solved_for(way, calibration, *solved, changes[way]) for way in OF_LENS}
+        changes |= {way: _solved_for(way, evidence, calibration, *solved, changes[way]) for way in OF_LENS}
     best = min(changes, key=lambda way: changes[way].criterion)
     if best in OF_LENS and _leads(changes, best, but=OF_LENS):
         # A zoom about another centre is both; what is nearly as good with one of them is that one.
@@ -229,20 +230,22 @@ class _Evidence:
         squares = float((amount**2).sum()) + float((turned**2 / values[followed]).sum())
         return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
 
+    def changes(self) -> dict[str, ViewChange]:
+        """Return what each way to change explains; nothing where the residuals leave too little freedom."""
+        out = {}
+        for name, way in _columns(self.own.shape[1]).items():
+            squares, directions, _ = self.explained(way)
+            if self.freedom <= 2 * directions or not self.total > squares:
+                return {}
+            out[name] = ViewChange.of(1.0 - squares / self.total, self.freedom, directions)
+        return out
+
 
 def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
     """Return what each way to change explains; nothing where too few views have enough corners, or where the boards
     are bent alike in all of them while the calibration has them flat."""
     evidence = _evidence(calibration)
-    if evidence is None:
-        return {}
-    out = {}
-    for name, way in _columns(evidence.own.shape[1]).items():
-        squares, directions, _ = evidence.explained(way)
-        if evidence.freedom <= 2 * directions or not evidence.total > squares:
-            return {}
-        out[name] = ViewChange.of(1.0 - squares / evidence.total, evidence.freedom, directions)
-    return out
+    return {} if evidence is None else evidence.changes()
 
 
 def _evidence(calibration: Calibration) -> _Evidence | None:
@@ -283,21 +286,34 @@ def _evidence(calibration: Calibration) -> _Evidence | None:
 
 
 def _solved_for(
-    way: str, calibration: Calibration, observations: Observations, fit: Fit, at_first: ViewChange
+    way: str,
+    evidence: _Evidence,
+    calibration: Calibration,
+    observations: Observations,
+    fit: Fit,
+    at_first: ViewChange,
 ) -> ViewChange:
     """Return what a lens that changes in this way explains when all is solved with it; `at_first` order where that is
     more."""
-    weight, start, left = fit.weight(observations), fit.state, at_first.left
+    weight, start, residuals, left = fit.weight(observations), fit.state, fit.residuals, at_first.left
     before = ((fit.residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
-    freedom, directions = 1, 0
-    for _ in range(LENS_ROUNDS):
-        evidence = _evidence(calibration)
-        if evidence is None:
-            return at_first
-        views, columns = evidence.views, _columns(evidence.own.shape[1])
-        _, found, amounts = evidence.explained(columns[way])
-        if not directions:
-            freedom, directions = evidence.freedom, found
+    freedom, columns = evidence.freedom, _columns(evidence.own.shape[1])[way]
+    _, directions, amounts = evidence.explained(columns)
+    for rounds in range(LENS_ROUNDS):
+        if rounds:
+            poses = Rigid3.stack(start.rotation, start.translation_mm)
+            px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+            solved = replace(
+                calibration,
+                camera=start.camera,
+                views=ViewResult.of_views(observations.views, poses, px, fit.kept),
+                boards=board_shapes(observations, start.shape, start.unknowns),
+            )
+            now = _evidence(solved)
+            if now is None:
+                return at_first
+            evidence, (_, _, amounts) = now, now.explained(columns)
+        views = evidence.views
         zoom = amounts[:, 0] if way != "shift" else np.zeros(len(views))
         shift = amounts[:, -2:] if way != "focus" else np.zeros((len(views), 2))
         centre, _ = start.camera.project(np.array([0.0, 0.0, 1.0]))
@@ -308,14 +324,6 @@ def _solved_for(
         start, residuals = solution.state, solution.data.residuals[0]
         squares = ((residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
         left = min(left, float(squares.sum() / before.sum()))
-        px = np.where(residuals.valid[..., None], residuals.px, np.nan)
-        poses = Rigid3.stack(start.rotation, start.translation_mm)
-        calibration = replace(
-            calibration,
-            camera=start.camera,
-            views=ViewResult.of_views(observations.views, poses, px, fit.kept),
-            boards=board_shapes(observations, start.shape, start.unknowns),
-        )
     return ViewChange.of(left, freedom, directions) if left < at_first.left else at_first
 
 

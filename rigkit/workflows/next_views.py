@@ -73,7 +73,7 @@ def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task:
     _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=instrument.is_rig))
     if not seen.any():
         raise DegenerateError(
-            f"plan: nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
+            f"nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
             "length or another distance"
         )
     rows = by_calibration[seen].reshape(-1, count)

@@ -17,7 +17,8 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.tags.in_squares import beside_markers
-from rigkit.detection.targets.charuco import _between_markers, _marked_corners
+from rigkit.detection.targets.base import Search
+from rigkit.detection.targets.charuco import _between_markers, _by_squares, _marked_corners
 from rigkit.detection.twins import alike_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry
@@ -139,7 +140,12 @@ def test_parts_of_boards_alike_are_not_taken_for_one() -> None:
     camera = bench_camera("regular")
     places = [Rigid3(np.eye(3), np.array([x_mm, -80.0, 600.0])) for x_mm in (-420.0, 150.0)]
     scene = BenchScene("alike", tuple(PlacedBoard(BOARD, place) for place in places), (), camera)
-    found = [item for item in detect_boards(scene.render(), [BOARD]) if item.board_id]
+    image = scene.render()
+    lattices = Search(grey_image(image), [BOARD], 12, None).lattices
+    assert len(lattices) == 2
+    whole, left = _by_squares(grey_image(image), lattices, BOARD)
+    assert len(left) == 1 and whole.count == max(item.lattice.count for item in lattices)
+    found = [item for item in detect_boards(image, [BOARD]) if item.board_id]
     assert len(found) == 1
     truth = [t.lattice()[found[0].grid[:, 1], found[0].grid[:, 0]] for t in scene.truth()]
     assert min(np.nanmax(np.abs(found[0].pixels - one)) for one in truth) < 0.2

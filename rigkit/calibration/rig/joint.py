@@ -148,7 +148,7 @@ def solve_jointly(
         if known is not None:
             observations = known.hold(observations, solution.state, names)
         solution = solve_rig(observations, solution.state, sigma)
-        also = _disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1)
+        also = (_disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1),)
     return JointRig(
         observations=observations,
         solution=solution,
@@ -199,9 +199,7 @@ def _boards_px(seen: Sequence[FrameObservations]) -> float:
     return float(np.median(2.0 * np.sqrt(np.add.reduceat((off**2).sum(axis=1), start) / count)))
 
 
-def _disagreement(
-    cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool
-) -> tuple[Finding]:
+def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool) -> Finding:
     """Return what to say where sharing poses usually costs more than chance: `usual` px a corner, and sigmas."""
     usual_px, usual_sigmas = usual
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
@@ -216,7 +214,7 @@ def _disagreement(
         f"{frames}; the lenses are held near what each camera says alone, and the sigmas of the rig rest on how "
         "far its frames disagree"
     )
-    return (Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy),)
+    return Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
 
 
 def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:

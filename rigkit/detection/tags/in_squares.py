@@ -29,9 +29,6 @@ MAX_FORETOLD_GAIN = 8.0
 MARKERS_BESIDE = 2
 """Markers that touch a corner within the board."""
 
-MAX_MARKER_ROUNDS = 40
-"""Rounds in which squares beside known ones are read: more than any board has rows or columns."""
-
 
 def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
     """Return quarter turns and the shift (2,) that take a lattice to the grid of a ChArUco board; None where its
@@ -56,7 +53,7 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
     grown = np.pad(pixels, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
     rows, columns = places[:, 1, None] + np.array([0, 0, 1, 1]), places[:, 0, None] + np.array([0, 1, 1, 0])
     read = np.zeros(len(places), np.bool_)
-    for _ in range(MAX_MARKER_ROUNDS):
+    while not read.all():
         missing = np.isnan(grown[..., 0])
         beside = np.flatnonzero((~missing)[rows, columns].any(axis=1) & ~read)
         wanted = np.zeros_like(missing)
