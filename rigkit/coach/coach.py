@@ -49,6 +49,10 @@ def decoded(data: bytes) -> Image:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
 
 
+def ignored(_: object) -> None:
+    """Show, or tell, nobody."""
+
+
 class Take(Enum):
     """Whether a frame is kept: not at all, where it is worth it, or wherever a board is in it."""
 
@@ -61,11 +65,18 @@ class Coach:
     """A session of one camera, or of several whose frames are taken together. Frames may come from several threads;
     each is dealt with by itself."""
 
-    def __init__(self, options: GuideOptions, keeper: Keeper, finish: Callable[[], str]) -> None:
-        """Go on with what the keeper has. `finish` calibrates the session and says what came of it."""
+    def __init__(
+        self,
+        options: GuideOptions,
+        keeper: Keeper,
+        finish: Callable[[], str],
+        tell: Callable[[str], None] = ignored,
+    ) -> None:
+        """Go on with what the keeper has. `finish` calibrates the session and says what came of it; `tell` is given a
+        line for every frame that is kept, for every photo that is not, and for what came of it."""
         self.guide, self.keeper = RigGuide(keeper.names, options), keeper
         self.finished: str | None = None
-        self._finish = finish
+        self._finish, self._tell = finish, tell
         self._lock = threading.Lock()
         self._last: list[Glance | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
@@ -77,9 +88,11 @@ class Coach:
             if any(glance.view is not None for glance in seen):
                 self._add(name, seen)
 
-    def look(self, images: Sequence[Image], *, take: Take = Take.NO, photo: bool = False) -> dict[str, Any]:
+    def look(
+        self, images: Sequence[Image], *, take: Take = Take.NO, photo: bool = False, source: str = ""
+    ) -> dict[str, Any]:
         """Look at a frame, an image a camera, and say what to do, and whether it was kept. A `photo` was taken by
-        itself, of a board that was held as still as it shows.
+        itself, of a board that was held as still as it shows; `source` is the file that it is from.
 
         Raises InputError for other cameras' images.
         """
@@ -95,15 +108,22 @@ class Coach:
             if kept and any(glance.view is not None for glance in glances):
                 if not whole and max(self._shrink) > 1:
                     glances = self._glances(images, whole=True, photo=photo)
-                taken = self.keeper.keep(images)
-                self._add(taken, glances)
+                taken = self._keep(images, glances, source)
                 advice = self.guide.advise(glances)
             self._last = list(glances)
             self._offered = None if taken else (images, photo)
             self._show(glances, advice, taken=taken)
             if photo and not taken:
+                self._tell(f"{source or 'photo'}: not taken, as {_reason(glances)}")
                 self.say(f"Not taken, as {_reason(glances)}. {self._shown['words']}")
             return self._shown
+
+    def _keep(self, images: Sequence[Image], glances: Sequence[Glance], source: str) -> str:
+        """Write a frame and go on with it; return its name."""
+        name = self.keeper.keep(images)
+        self._add(name, glances)
+        self._tell(f"{source}: taken as {name}" if source else f"{name} taken")
+        return name
 
     def _add(self, name: str, glances: Sequence[Glance]) -> None:
         self._names.append(name)
@@ -159,7 +179,7 @@ class Coach:
                 return
             best = left.pop(int(np.argmax([a.worth for a in advice])))
             with self._lock:
-                self._add(self.keeper.keep(frames[best]), glances[best])
+                self._keep(frames[best], glances[best], "")
                 show(frames[best])
                 chosen = f"Choosing frames: {len(self.guide.frames)} so far"
                 self._show(glances[best], self.guide.advise(glances[best]), words=chosen)
@@ -169,6 +189,7 @@ class Coach:
         with self._lock:
             if not self._names:
                 raise InputError("coach: there is no frame to undo")
+            self._tell(f"{self._names[-1]} set aside")
             self.keeper.drop(self._names.pop())
             frames = self.guide.frames[:-1]
             self.guide = RigGuide(self.keeper.names, self.guide.options)
@@ -181,6 +202,7 @@ class Coach:
         """Calibrate the session, and say what came of it, and what is `missing`."""
         with self._lock:
             self.finished = self._finish() + missing
+            self._tell(self.finished)
             return self.finished
 
 

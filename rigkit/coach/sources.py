@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,9 +20,14 @@ POLL_S = 0.3
 SETTLED_S = 0.2
 """A file that has not grown for so long is whole."""
 
-Frame = list[NDArray[Any]]
-"""An image a camera, taken together."""
 _log = logging.getLogger(__name__)
+
+
+class Frame(NamedTuple):
+    """An image a camera, taken together, and the file that it is from; "" of a camera."""
+
+    images: list[NDArray[Any]]
+    source: str = ""
 
 
 def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
@@ -48,7 +53,7 @@ def _watched(folders: Sequence[Path], until_idle_s: float) -> Iterator[Frame]:
             seen.add(name)
             last = time.monotonic()
             try:
-                yield [read_image(path) for path in paths]
+                yield Frame([read_image(path) for path in paths], ", ".join(dict.fromkeys(path.name for path in paths)))
             except InputError as error:
                 _log.warning("left out: %s", error)
         time.sleep(POLL_S)
@@ -115,7 +120,7 @@ def _moment(sources: Sequence[cv2.VideoCapture], numbers: Sequence[int]) -> Fram
         raise InputError(
             f"coach: camera {', '.join(silent)} gives no picture; check the cable, and that no other program has it"
         )
-    return [np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read if frame is not None]
+    return Frame([np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)) for _, frame in read if frame is not None])
 
 
 def _release(sources: Sequence[cv2.VideoCapture]) -> None:

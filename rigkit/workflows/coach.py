@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
-from rigkit.coach.coach import Coach, Image, Take
+from rigkit.coach.coach import Coach, Image, Take, ignored
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.look import Glance
@@ -68,8 +68,8 @@ class CoachOptions:
     """Other machines in this network may use the page."""
 
 
-def open_coach(options: CoachOptions) -> Coach:
-    """Return the coach of a session's folder, which is made, or gone on with.
+def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored) -> Coach:
+    """Return the coach of a session's folder, which is made, or gone on with; `tell` as in `Coach`.
 
     Raises InputError where the folder holds another session, or cannot be one.
     """
@@ -86,7 +86,7 @@ def open_coach(options: CoachOptions) -> Coach:
             return goal_of(camera, guide.reach, length)
 
         guide = replace(guide, measured=measured)
-    return Coach(guide, keeper, lambda: finished_words(options.folder))
+    return Coach(guide, keeper, lambda: finished_words(options.folder), tell)
 
 
 def _names(options: CoachOptions) -> tuple[str, ...]:
@@ -122,31 +122,27 @@ def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Sever
     return f"Done: {what}, {error}, {written[0].name} written{more.get(verdict, '')}"
 
 
-def _unseen(images: Sequence[Image]) -> None:
-    """Show nothing."""
-
-
 def coach_frames(
     coach: Coach,
-    frames: Iterator[Sequence[Image]],
+    frames: Iterator[Frame],
     *,
     photos: bool,
-    show: Callable[[Sequence[Image]], None] = _unseen,
+    show: Callable[[Sequence[Image]], None] = ignored,
 ) -> None:
     """Offer frames to the coach until there are enough, or no more, or somebody finished it."""
-    for images in frames:
+    for images, source in frames:
         show(images)
         try:
-            state = coach.look(images, take=Take.WORTH, photo=photos)
+            state = coach.look(images, take=Take.WORTH, photo=photos, source=source)
         except RigkitError as error:
-            _log.warning("%s", error)
+            _log.warning("%s: %s", source or "frame", error)
             coach.say(str(error))
             continue
         if state["enough"] or coach.finished is not None:
             break
 
 
-def coach_recording(coach: Coach, videos: Sequence[Path], *, show: Callable[[Sequence[Image]], None] = _unseen) -> str:
+def coach_recording(coach: Coach, videos: Sequence[Path], *, show: Callable[[Sequence[Image]], None] = ignored) -> str:
     """Let the coach choose frames of a video, or of several that run together; return what the recording lacks, in
     words, "" where nothing.
 
@@ -188,7 +184,7 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
         with Video(path):
             pass
     frames = _frames(options)
-    coach = open_coach(options)
+    coach = open_coach(options, told)
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
     of_server = bool(options.video) or frames is not None
@@ -206,7 +202,7 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
             else:
                 coach_frames(coach, frames, photos=bool(options.watch), show=show)
             if coach.finished is None:
-                told(coach.finish(missing))
+                coach.finish(missing)
         except RigkitError as error:
             coach.say(str(error))
             told(str(error))

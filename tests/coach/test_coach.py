@@ -88,7 +88,8 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     for k, image in enumerate(pictures):
         cv2.imwrite(str(watched / f"{k:02d}.png"), image)
     (watched / "notes.png").write_text("no picture")
-    coach = open_coach(options(tmp_path / "session"))
+    told: list[str] = []
+    coach = open_coach(options(tmp_path / "session"), told.append)
     # The first picture once more: whoever took it is told that it brought nothing.
     cv2.imwrite(str(watched / "001.png"), pictures[0])
     said = []
@@ -105,6 +106,8 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
     assert coach.finish().startswith("Done")
+    assert "00.png: taken as frame-0001.png" in told and "001.png: not taken, as it brings little that is new" in told
+    assert len([line for line in told if ": taken as " in line]) == len(kept) and told[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")
     error = compare_cameras(CAMERA, found.camera).rms_px
     stated = float(projection_goal(found.camera).error(found.covariance))
