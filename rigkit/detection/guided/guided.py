@@ -25,6 +25,8 @@ from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, Boar
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.subpixel.correlation import with_uneven
+from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -132,17 +134,26 @@ def fit_corners(
     start: FloatArray,
     signs: FloatArray,
     blur: FloatArray | float,
+    bends: tuple[FloatArray, FloatArray] | None = None,
 ) -> EdgeFit:
     """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
 
-    `signs` (M,) as `Lattice.signs`; `blur` is the s expected. Windows end before the markers of a ChArUco board.
+    `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `bends` is the curvature of the lines and how well it is
+    known, (M, 2) each, where corners' sigmas tell more of it than `shape`. Windows end before the markers of a ChArUco
+    board.
     """
-    sides = shape.sides
-    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(np.ones_like(cells), cells))
+    sides, (curvature, loose) = shape.sides, bends or (shape.curvature(), None)
+    geometry = Geometry(sides, curvature, shape.gaps(), ends_of(np.ones_like(cells), cells))
     width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
-    # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-    plain = not isinstance(board.pattern, Charuco)
-    return fit_edges(image, start, geometry, signs, width, radius_px=RADIUS_PX, iterations=FIT_STEPS, mirrored=plain)
+    fit = fit_edges(
+        *(image, start, geometry, signs, width), radius_px=RADIUS_PX, iterations=FIT_STEPS, curvature_sigma=loose
+    )
+    if isinstance(board.pattern, Charuco):
+        # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
+        more = fit.residual / fit.noise
+        products = fit.products * (more**2)[:, None]
+        fit = replace(fit, sigma_px=fit.sigma_px * more, noise=fit.residual, products=products)
+    return fit
 
 
 def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
@@ -194,7 +205,7 @@ def _with_added(
     image: GreyImage, guide: Guide, found: BoardDetection, opened: BoardState, state: BoardState
 ) -> BoardDetection:
     """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
-    state = _together(image, guide.board, state)
+    state = _together(image, guide.board, _settled(image, guide.board, state, state.known & ~opened.known))
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
     sigma = _known_factor(found, state if state.together else opened) * state.sigma_px
     row, column = np.nonzero(added)
@@ -205,6 +216,22 @@ def _with_added(
         grid=grid[order],
         pixels=np.concatenate([found.pixels, state.pixels[row, column]])[order],
         sigma_px=np.concatenate([found.sigma_px, sigma[row, column]])[order],
+    )
+
+
+def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray) -> BoardState:
+    """Return the state with the `cells` fitted anew, now that there are corners around them on all sides."""
+    if not cells.any():
+        return state
+    known = state.known & np.isfinite(state.sigma_px)
+    shape = fit_cells(state.pixels, known)
+    bends = line_bends_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
+    blur = float(np.nanmedian(state.blur))
+    fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, bends)
+    return state.with_fit(
+        known,
+        with_uneven(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco)),
+        fit.valid & (fit.contrast > 0.0) & cells[known],
     )
 
 
@@ -310,6 +337,7 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
         return state
     blur = float(np.nanmedian(state.blur))
     fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
+    fit = with_uneven(fit, shape.sides[seen], RADIUS_PX, marked=isinstance(guide.board.pattern, Charuco))
     return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)
 
 

@@ -16,8 +16,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.correlation import sigma_factors
-from rigkit.detection.subpixel.edge_curvature import line_curvature
+from rigkit.detection.subpixel.correlation import sigma_factors, uneven_factors
+from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
 from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
@@ -33,10 +33,6 @@ FIRST_PASS = (8.0, 4, 0.02)
 LAST_PASS = (18.0, 8, 0.01)
 """Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
 lattice to a few hundredths of a pixel; after the last step of the last one there is a ten-thousandth to go."""
-
-LOOSE_CURVATURE = 0.5
-"""Curvatures are fitted where the lattice leaves them open by so much that the corner would move by more than this, in
-sigmas of the first pass: the edges then know them better. Everywhere it would take a quarter more time."""
 
 PAPER_ROUNDS, SETTLED_PX = 4, 0.03
 """What lies beyond the outermost squares is read with the corners as they are fitted so far, and again for those that
@@ -166,12 +162,8 @@ def _last_pass(
     """
     known = start.known
     shape = fit_cells(start.pixels, known)
-    lengths = np.maximum(np.hypot(shape.sides[..., 0], shape.sides[..., 1]), 1.0)
-    curvature, curvature_sigma = line_curvature(start.pixels, sigma_px, known, lengths)
     radius_px, iterations, converged_px = LAST_PASS
-    # A parabola k / 2 t^2 lies k / 6 r^2 beside the corner in the mean over |t| < r.
-    beside = curvature_sigma * np.minimum(radius_px, WINDOW_REACH * lengths) ** 2 / 6.0
-    curvature_sigma[(beside <= LOOSE_CURVATURE * sigma_px[known][:, None]).all(axis=1)] = 0.0
+    curvature, curvature_sigma = line_bends_to_fit(start.pixels, sigma_px, known, shape.sides, radius_px)
     owner = np.zeros(known.shape, np.int64)
     for k, part in enumerate(parts):
         owner[part] = k
@@ -196,10 +188,12 @@ def _last_pass(
         geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
     fit = _fitted_beside_paper(image, geometry, fit, fitted, signs[known], mine)
-    factors = sigma_factors(fit, fit.valid & (fit.contrast > 0.0), shape.sides, mine, len(parts), radius_px)
+    good = fit.valid & (fit.contrast > 0.0)
+    factors = sigma_factors(fit, good, shape.sides, mine, len(parts), radius_px)
+    uneven = uneven_factors(fit, good, shape.sides, mine, factors, radius_px)
     reached = np.zeros(known.shape, np.bool_)
     reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
-    return _spread(start, fit, fit.sigma_px * factors[mine]), reached, factors
+    return _spread(start, fit, fit.sigma_px * factors[mine] * uneven), reached, factors
 
 
 def _fitted_beside_paper(

@@ -19,10 +19,12 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
-from rigkit.detection.guided.guided import MARKER_BLURS, completed, fit_corners, gap_to_markers
+from rigkit.detection.guided.guided import MARKER_BLURS, RADIUS_PX, completed, fit_corners, gap_to_markers
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
+from rigkit.detection.subpixel.correlation import with_uneven
+from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
@@ -260,7 +262,10 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     lattice = refined.lattice
     known = lattice.known
     shape = fit_cells(lattice.pixels, known)
-    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur)
+    # A corner that a shadow crosses, or a finger, bends no lines: it is uncertain, and says so.
+    bends = line_bends_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
+    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, bends)
+    fit = with_uneven(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full((*known.shape, *values.shape[1:]), np.nan)
