@@ -106,7 +106,7 @@ class Coach:
             kept = take is Take.YES or (take is Take.WORTH and advice.take)
             taken = None
             if kept and any(glance.view is not None for glance in glances):
-                if not whole and max(self._shrink) > 1:
+                if not whole:
                     glances = self._glances(images, whole=True, photo=photo)
                 taken = self._keep(images, glances, source)
                 advice = self.guide.advise(glances)
@@ -134,12 +134,13 @@ class Coach:
         self._shown = self.guide.state(glances, advice) | {"looks": looks, "finished": self.finished, **more}
 
     def _glances(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[Glance]:
-        """Return what all cameras show; what is `whole` is not looked at in a smaller picture."""
+        """Return what all cameras show; what is not `whole` is looked at quickly, and where that is slow, in a
+        smaller picture."""
         out = []
         for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
             shrink = 1 if whole else self._shrink[c]
             began = time.thread_time()
-            glance = glance_at(image, self.guide.options.boards, "frame", self._last[c], shrink=shrink)
+            glance = glance_at(image, self.guide.options.boards, "frame", self._last[c], shrink=shrink, quick=not whole)
             if not whole:
                 # The work grows with the picture's area.
                 spent = (time.thread_time() - began) * shrink**2

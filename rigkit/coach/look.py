@@ -97,23 +97,28 @@ class Glance:
 
 
 def glance_at(
-    image: NDArray[Any], boards: Sequence[Board], name: str, last: Glance | None = None, *, shrink: int = 1
+    image: NDArray[Any],
+    boards: Sequence[Board],
+    name: str,
+    last: Glance | None = None,
+    *,
+    shrink: int = 1,
+    quick: bool = False,
 ) -> Glance:
     """Return what a frame shows, `last` having been seen before it; the board is looked for at a `shrink`-th of the
-    size, which takes less time and places corners less well."""
+    size, and quickly, which takes less time and places corners less well."""
     size_px = (int(image.shape[1]), int(image.shape[0]))
     smaller = (
         image
         if shrink == 1
         else cv2.resize(image, None, fx=1.0 / shrink, fy=1.0 / shrink, interpolation=cv2.INTER_AREA)
     )
-    views, _ = views_of_image(name, detect_boards(smaller, boards), boards)
+    views, _ = views_of_image(name, detect_boards(smaller, boards, quick=quick), boards)
     if not views:
         return Glance(size_px=size_px, view=None)
     view = max(views, key=lambda v: len(v.grid))
     if shrink > 1:
-        scale = np.array(size_px) / np.array([smaller.shape[1], smaller.shape[0]])
-        full = np.clip((view.pixels + 0.5) * scale - 0.5, -0.5, np.array(size_px) - 0.5)
+        full = np.clip((view.pixels + 0.5) * shrink - 0.5, -0.5, np.array(size_px) - 0.5)
         view = replace(view, pixels=full, sigma_px=shrink * view.sigma_px)
     low, high = np.floor(view.pixels.min(axis=0)), np.ceil(view.pixels.max(axis=0))
     cut = image[int(max(low[1], 0)) : int(high[1]) + 1, int(max(low[0], 0)) : int(high[0]) + 1]

@@ -113,13 +113,13 @@ class GridEvidence:
         return self.unexplained < 0.2 and self.misshapen < 0.08 and self.displaced < 0.04 and self.corners < 0.05
 
 
-def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES) -> list[CircleGrid]:
-    """Return the grids of circles in `grey`, the largest first."""
-    found = [grid for grid in seen_grids(grey) if len(grid) >= min_circles and grid.evidence.convincing]
+def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES, *, quick: bool = False) -> list[CircleGrid]:
+    """Return the grids of circles in `grey`, the largest first; `quick`: of blobs alone, each fitted once."""
+    found = [grid for grid in seen_grids(grey, quick=quick) if len(grid) >= min_circles and grid.evidence.convincing]
     return sorted(found, key=lambda grid: -len(grid))
 
 
-def seen_grids(grey: GreyImage) -> list[CircleGrid]:
+def seen_grids(grey: GreyImage, *, quick: bool = False) -> list[CircleGrid]:
     """Return all lattices of `grey` that may be grids, with what speaks for them."""
     # The graphs of scipy: starting rigkit takes a quarter longer with them.
     from rigkit.detection.circles.lattices import blob_lattices
@@ -128,7 +128,7 @@ def seen_grids(grey: GreyImage) -> list[CircleGrid]:
     out = []
     for found in blob_lattices(blobs):
         if len(found.index) >= MIN_CIRCLES and _wide(found.label):
-            grid = _grown(grey, blobs, found)
+            grid = _grown(grey, blobs, found, quick=quick)
             if grid is not None:
                 out.append(grid)
     return out
@@ -154,27 +154,27 @@ class _Draft:
         return replace(self, label=self.label[which], fit=_of(self.fit, which), around=_of(self.around, which))
 
 
-def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs) -> CircleGrid | None:
+def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) -> CircleGrid | None:
     own = blobs.chosen(found.index)
     around = local_maps(found.label, own.pixels, found.label, hexagonal=found.hexagonal, sigma_px=FIRST_SIGMA_PX)
     radius = _radius(own.shape, around.first)
     bright = bool(own.sign[0] > 0)
     fit = _fitted(grey, own.pixels, around, radius, np.full(len(own), FIRST_EDGE_BLUR))
     draft = _judged(_Draft(found.label, fit, around, radius, found.hexagonal, bright), FIRST_LENIENCE)
-    if not _enough(draft):
-        return None
-    draft = _again(grey, draft)
+    for step in () if quick else (_again, _with_all, _again):
+        if _enough(draft):
+            draft = step(grey, draft)
+    return _finished(draft, (grey.shape[1], grey.shape[0])) if _enough(draft) else None
+
+
+def _with_all(grey: GreyImage, draft: _Draft) -> _Draft:
+    """Return the draft grown by rings of circles that no blob shows."""
     for _ in range(ROUNDS):
-        if not _enough(draft):
-            return None
-        grown = _larger(grey, draft)
+        grown = _larger(grey, draft) if _enough(draft) else None
         if grown is None:
             break
         draft = grown
-    draft = _again(grey, draft)
-    if not _enough(draft):
-        return None
-    return _finished(draft, (grey.shape[1], grey.shape[0]))
+    return draft
 
 
 def _enough(draft: _Draft) -> bool:

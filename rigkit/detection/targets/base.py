@@ -28,6 +28,7 @@ class Search:
     min_corners : boards with fewer points are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known.
     stored : the grey levels before bad pixels were replaced: modules of small markers look like these.
+    quick : points to a tenth of a pixel or so are enough, if that takes less time.
     """
 
     def __init__(
@@ -37,12 +38,15 @@ class Search:
         min_corners: int,
         camera: Camera | None,
         stored: GreyImage | None = None,
+        *,
+        quick: bool = False,
     ) -> None:
         self.grey = grey
         self.stored = grey if stored is None else stored
         self.boards = tuple(boards)
         self.min_corners = min_corners
         self.camera = camera
+        self.quick = quick
         self._lattices: list[RefinedLattice] | None = None
 
     @property

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -72,12 +73,11 @@ def _charuco_boards(
     """
     image, rest = search.grey, list(found)
     pictures = [image] if search.stored is image else [image, search.stored]
-    eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
     out = []
     for board in boards:
         whole, left = _by_squares(image, rest, board)
         if not whole.count:
-            whole, left = _by_outlines(eight_bit, rest, board)
+            whole, left = _by_outlines(pictures, rest, board)
         if not whole.count:
             continue
         (refined,) = refine(image, [whole])
@@ -109,12 +109,13 @@ def _by_squares(
 
 
 def _by_outlines(
-    pictures: Sequence[np.ndarray], lattices: Sequence[RefinedLattice], board: Board
+    pictures: Sequence[GreyImage], lattices: Sequence[RefinedLattice], board: Board
 ) -> tuple[Lattice, list[RefinedLattice]]:
     """Return the corners of a board beside markers whose outlines are seen, those of lattices that have them first,
     and the lattices that have none."""
     whole, left = _empty(board), []
-    grid, pixels = max((_marked_corners(picture, board) for picture in pictures), key=lambda seen: len(seen[0]))
+    eight_bit = [np.clip(np.rint(picture), 0, 255).astype(np.uint8) for picture in pictures]
+    grid, pixels = max((_marked_corners(picture, board) for picture in eight_bit), key=lambda seen: len(seen[0]))
     for item in lattices:
         placed = _placed(item.lattice, grid, pixels, board) if len(grid) else None
         if placed is None:
@@ -170,10 +171,16 @@ def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tupl
 
 
 def _empty(board: Board) -> Lattice:
-    shape, ink = (board.rows, board.columns), board.ink()
-    # Across the first edge brightness grows downwards, with the angle, where the square below it is white; that has
-    # the colour of the square before the first corner.
-    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), ink.first_black == ink.inverted)
+    shape = (board.rows, board.columns)
+    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), _rising(board))
+
+
+@lru_cache(maxsize=64)
+def _rising(board: Board) -> bool:
+    """Say whether across the first edge brightness grows downwards, with the angle: where the square below it is white;
+    that has the colour of the square before the first corner."""
+    ink = board.ink()
+    return ink.first_black == ink.inverted
 
 
 def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:

@@ -17,10 +17,16 @@ class CirclesFinder(Finder):
     """Grids with a place in one board are named after it, if no other board and no other grid can be meant."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
+        """A quick look that sees no board may have missed its faint circles: the next one takes its time."""
+        found = self._seen(search, boards, quick=True) if search.quick else []
+        return found or self._seen(search, boards, quick=False)
+
+    @staticmethod
+    def _seen(search: Search, boards: Sequence[Board], *, quick: bool) -> list[BoardDetection]:
         fewest = min([search.min_corners, *(board.corner_count for board in boards)])
         out: list[BoardDetection] = []
         names: list[str | None] = []
-        for grid in find_grids(search.grey, fewest):
+        for grid in find_grids(search.grey, fewest, quick=quick):
             fits = boards_meant(grid, boards)
             if fits:
                 board, placed = fits[0]
