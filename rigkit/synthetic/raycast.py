@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -104,16 +105,16 @@ NONE, PART, FULL = 0, 1, 2
 class Chart:
     """Where the sub-samples of a tile meet a plane; polynomial where the lens is smooth, ray by ray at its rim."""
 
-    def __init__(self, camera: Camera, u: FloatArray, v: FloatArray, field_deg: float | None) -> None:
-        self.shape = (len(v), len(u))
-        node_u, weight_u = _chebyshev(u)
-        node_v, self.weight_v = _chebyshev(v)
-        self.weight_u = np.ascontiguousarray(weight_u.T)
-        self.nodes, valid = _unproject(camera, node_u, node_v)
-        self.lit: BoolArray | None = None
-        self.rays: FloatArray | None = None
-        if not valid.all():
-            self.rays, self.lit = _unproject(camera, u, v)
+    def __init__(
+        self, u: _Axis, v: _Axis, nodes: FloatArray, rays: tuple[FloatArray, BoolArray] | None, field_deg: float | None
+    ) -> None:
+        """Take the sub-samples' columns and rows, the rays at their nodes, and at the lens's rim the ray and the light
+        of every sub-sample."""
+        self.shape = (len(v.samples), len(u.samples))
+        self.weight_v = v.weights
+        self.weight_u = np.ascontiguousarray(u.weights.T)
+        self.nodes = nodes
+        self.rays, self.lit = rays if rays is not None else (None, None)
         if field_deg is not None:
             self._limit(np.cos(np.radians(0.5 * field_deg)))
         self.dark = self.lit is not None and not self.lit.any()
@@ -168,6 +169,20 @@ class Chart:
         return np.asarray(np.einsum("kvj,ju->kvu", lines, self.weight_u[:, columns]))
 
 
+def charts_of(
+    camera: Camera, columns: Sequence[FloatArray], rows: Sequence[FloatArray], field_deg: float | None
+) -> Iterator[Chart]:
+    """Return the charts of an image's tiles, row by row, from the columns u and the rows v of their sub-samples, px."""
+    across, down = [_Axis.of(u) for u in columns], [_Axis.of(v) for v in rows]
+    # The nodes of all tiles at once: a lens is asked many pixels as fast as few.
+    rays, valid = _unproject(camera, *(np.concatenate([axis.nodes for axis in axes]) for axes in (across, down)))
+    for i, v in enumerate(down):
+        for k, u in enumerate(across):
+            own = (slice(i * NODES, (i + 1) * NODES), slice(k * NODES, (k + 1) * NODES))
+            each = None if valid[own].all() else _unproject(camera, u.samples, v.samples)
+            yield Chart(u, v, np.ascontiguousarray(rays[own]), each, field_deg)
+
+
 def _unproject(camera: Camera, u: FloatArray, v: FloatArray) -> tuple[FloatArray, BoolArray]:
     return camera.unproject(np.stack(np.meshgrid(u, v), axis=-1))
 
@@ -178,17 +193,26 @@ def _divide(plane: FloatArray) -> FloatArray:
         return np.where(front, plane[:2] / plane[2], FAR_SQUARES)
 
 
-def _chebyshev(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return NODES nodes that span `samples`, and the weights (len(samples), NODES) that interpolate from them."""
-    low, high = samples[0], samples[-1]
-    angle = (2 * np.arange(NODES) + 1) * np.pi / (2 * NODES)
-    nodes = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle)
-    barycentric = (-1.0) ** np.arange(NODES) * np.sin(angle)
-    distance = samples[:, None] - nodes
-    exact = np.abs(distance) < 1e-9
-    with np.errstate(divide="ignore"):
-        terms = np.where(exact.any(axis=1, keepdims=True), exact, barycentric / distance)
-    return nodes, terms / terms.sum(axis=1, keepdims=True)
+@dataclass(frozen=True, eq=False, slots=True)
+class _Axis:
+    """Sub-samples of a tile along an axis, nodes that span them, and the weights (samples, NODES) that interpolate."""
+
+    samples: FloatArray
+    nodes: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, samples: FloatArray) -> _Axis:
+        """Lay Chebyshev nodes over the samples."""
+        low, high = samples[0], samples[-1]
+        angle = (2 * np.arange(NODES) + 1) * np.pi / (2 * NODES)
+        nodes = 0.5 * (low + high) + 0.5 * (high - low) * np.cos(angle)
+        barycentric = (-1.0) ** np.arange(NODES) * np.sin(angle)
+        distance = samples[:, None] - nodes
+        exact = np.abs(distance) < 1e-9
+        with np.errstate(divide="ignore"):
+            terms = np.where(exact.any(axis=1, keepdims=True), exact, barycentric / distance)
+        return cls(samples, nodes, terms / terms.sum(axis=1, keepdims=True))
 
 
 def paint(fine: Float32, surface: Surface, chart: Chart, per_pixel: int) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry, develop
-from rigkit.synthetic.raycast import FULL, PART, Chart, Float32, Surface, board_surface, paint, panel_surface
+from rigkit.synthetic.raycast import FULL, PART, Chart, Float32, Surface, board_surface, charts_of, paint, panel_surface
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 TILE = 64
@@ -111,12 +112,16 @@ def radiance(
     surfaces += [panel_surface(p, cam_from_world) for p in occluders]
     reduce = _Reduction(optics)
     out = np.empty((height, width))
-    for top in range(0, height, TILE):
-        for left in range(0, width, TILE):
-            shape = (min(TILE, height - top), min(TILE, width - left))
-            chart = Chart(camera, *reduce.grid((left, top), shape), optics.field_deg)
-            tile = _render_tile(chart, surfaces, shape, reduce, background)
-            out[top : top + shape[0], left : left + shape[1]] = tile
+    tops, lefts = range(0, height, TILE), range(0, width, TILE)
+    charts = charts_of(
+        camera,
+        [reduce.axis(left, width) for left in lefts],
+        [reduce.axis(top, height) for top in tops],
+        optics.field_deg,
+    )
+    for (top, left), chart in zip(product(tops, lefts), charts, strict=True):
+        tile = out[top : top + TILE, left : left + TILE]
+        tile[:] = _render_tile(chart, surfaces, tile.shape, reduce, background)
     return out
 
 
@@ -135,11 +140,9 @@ class _Reduction:
         self.matrix = csr_array(_reduction_matrix(self.offsets, self.step, optics.blur_px).astype(np.float32))
         self.spread = _spread_kernel(optics)
 
-    def grid(self, corner: tuple[int, int], shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return the columns u and the rows v of all sub-samples that a tile at `corner` (u, v) needs, px."""
-        u = self.offsets[: (shape[1] + 2 * self.reach) * self.count] + corner[0]
-        v = self.offsets[: (shape[0] + 2 * self.reach) * self.count] + corner[1]
-        return np.asarray(u), np.asarray(v)
+    def axis(self, first: int, size: int) -> FloatArray:
+        """Return where, px, the sub-samples lie that a tile needs which begins at `first` of an image of `size` px."""
+        return np.asarray(self.offsets[: (min(TILE, size - first) + 2 * self.reach) * self.count] + first)
 
     def __call__(self, fine: Float32, shape: tuple[int, int]) -> FloatArray:
         if self.spread is not None:

@@ -59,7 +59,7 @@ def server(tmp_path: Path) -> Iterator[str]:
     (tmp_path / "served").mkdir()
     (tmp_path / "served" / "01.png").write_bytes(CONTENT)
     own = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(tmp_path / "served")))
-    thread = threading.Thread(target=own.serve_forever)
+    thread = threading.Thread(target=own.serve_forever, args=(0.01,))
     thread.start()
     yield f"http://127.0.0.1:{own.server_port}"
     own.shutdown()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -105,7 +106,9 @@ def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pyte
     assert len(coach.guide.frames) == 1 and "frame-0001.png" in caplog.text
     assert coach.keeper.keep([np.zeros((4, 5, 3), np.uint8)]) == "frame-0003.png"
     caplog.clear()
-    assert len(list(watched_frames([place / "pairs"], until_idle_s=1.5))) == 2 and "bad.png" in caplog.text
+    for path in (place / "pairs").iterdir():
+        os.utime(path, (0.0, 0.0))  # written long ago
+    assert len(list(watched_frames([place / "pairs"], until_idle_s=0.1))) == 2 and "bad.png" in caplog.text
     (place / "coach/session.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"session\.toml"):
         open_coach(options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from rigkit.core.arrays import FloatArray
@@ -28,8 +29,7 @@ def picture(
     edge = (centre[:, None] + matrix @ w + 0.5 * bend @ squares).T
     u, v = np.meshgrid(np.arange(size_px[0]), np.arange(size_px[1]))
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
-    nearest = np.linalg.norm(pixels[:, None] - edge, axis=2)
-    at = nearest.argmin(axis=1)
+    at = cKDTree(edge).query(pixels)[1]
     before, after = edge[at - 1], edge[(at + 1) % len(edge)]
     tangent = after - before
     normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=-1) / np.linalg.norm(tangent, axis=1, keepdims=True)
