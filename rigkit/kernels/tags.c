@@ -193,7 +193,7 @@ INLINE int64_t block_pixels(
         const float x = here.at[0][i], y = here.at[1][i];
         /* Where the polynomial has turned over it shows the tag once more, mirrored. */
         const float area = here.grow[0][0][i] * here.grow[1][1][i] - here.grow[0][1][i] * here.grow[1][0][i];
-        pixels->counts[i] *= (x >= low) & (x <= high) & (y >= low) & (y <= high) & (area > 0.0f) ? 1.0f : 0.0f;
+        pixels->counts[i] *= ((x >= low) & (x <= high) & (y >= low) & (y <= high) & (area > 0.0f)) ? 1.0f : 0.0f;
         const float share[SHARES] = {
             (1.0f - x) * (1.0f - y), x * (1.0f - y), (1.0f - x) * y, x * y, 4.0f * x * (1.0f - x), 4.0f * y * (1.0f - y)};
         for (int part = 0; part < SHARES; part++)

@@ -114,7 +114,10 @@ class Chart:
         self.weight_v = v.weights
         self.weight_u = np.ascontiguousarray(u.weights.T)
         self.nodes = nodes
-        self.rays, self.lit = rays if rays is not None else (None, None)
+        self.rays: FloatArray | None = None
+        self.lit: BoolArray | None = None
+        if rays is not None:
+            self.rays, self.lit = rays
         if field_deg is not None:
             self._limit(np.cos(np.radians(0.5 * field_deg)))
         self.dark = self.lit is not None and not self.lit.any()

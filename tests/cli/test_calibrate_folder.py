@@ -204,7 +204,7 @@ def test_corners_from_a_file(
     for path in folder.glob("*.JPG"):
         path.rename(path.with_name(f"x{path.name}"))
     assert main([*arguments, "--force"]) == 2
-    assert "names none of the 9 images" in capsys.readouterr().err
+    assert f"names none of the {FRAMES} images" in capsys.readouterr().err
 
 
 def write_vnl(csv: Path, vnl: Path) -> None:

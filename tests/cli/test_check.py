@@ -48,7 +48,8 @@ def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: P
     folder.mkdir()
     for k, pose in enumerate(_poses(3)):
         placed = [PlacedBoard(BOARD, pose), *others]
-        image = render(placed, camera, Rigid3.identity(), photometry=Photometry(noise_levels=1.0), rng=rng)
+        optics, photometry = Optics(0.6, supersample=2), Photometry(noise_levels=1.0)
+        image = render(placed, camera, Rigid3.identity(), optics=optics, photometry=photometry, rng=rng)
         cv2.imwrite(str(folder / f"{k}.png"), image)
     return folder
 

@@ -136,9 +136,9 @@ def test_a_register_loses_nothing(place: Path, capsys: pytest.CaptureFixture[str
         "entry = load_history('history.jsonl')[0]\n"
         "for k in range(50): add_entry(Path('grown.jsonl'), replace(entry, source=f'{sys.argv[1]}-{k}'))\n"
     )
-    programs = [subprocess.Popen([sys.executable, "-c", add, str(k)]) for k in range(3)]
-    assert [program.wait(60) for program in programs] == [0, 0, 0]
-    assert len({entry.source for entry in load_history("grown.jsonl")}) == 150
+    programs = [subprocess.Popen([sys.executable, "-c", add, str(k)]) for k in range(2)]
+    assert [program.wait(60) for program in programs] == [0, 0]
+    assert len({entry.source for entry in load_history("grown.jsonl")}) == 100
     lines = Path("history.jsonl").read_text().splitlines()
     for damage in (lines[1][:30], lines[1].replace("21.5", '"warm"'), "[" * 100_000, lines[1].replace("0.4", "7")):
         Path("history.jsonl").write_text("\n".join([lines[0], damage, *lines[2:]]) + "\n")

@@ -19,7 +19,7 @@ from rigkit.synthetic.render import Optics, render
 CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.04, 0.02])), [-90.0, 1.0, 2.0])
 BOARD = Board("board", 9, 6, 30.0, 30.0)
-FRAMES = 9
+FRAMES = 7
 
 
 def write_pictures(folder: Path) -> None:

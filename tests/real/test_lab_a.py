@@ -37,7 +37,7 @@ def load_accuracy() -> Any:
     return module
 
 
-@pytest.fixture(scope="module", params=["raw", "rectified"])
+@pytest.fixture(scope="module", params=["raw", pytest.param("rectified", marks=pytest.mark.thorough)])
 def measured(request: pytest.FixtureRequest) -> dict[str, Any]:
     folder: Path = shared_data("lab-a")
     found = load_accuracy().measure(folder, chain=request.param, jobs=1)

@@ -109,7 +109,7 @@ def mounted(folder: Path, images: list[Path], boards: list[Board], model: str) -
     )
 
 
-@pytest.mark.parametrize("lens", ["regular", "fisheye"])
+@pytest.mark.parametrize("lens", [pytest.param("regular", marks=pytest.mark.thorough), "fisheye"])
 def test_the_laboratory_s_own_boards(lens: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Three boards that look alike and the same turned, at right angles, in eight images; nothing else is known."""
     images = sorted((shared_data("lab-a") / "captures").glob(f"{lens}-*/view?.jpg"))

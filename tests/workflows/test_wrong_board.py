@@ -16,7 +16,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image
 from rigkit.workflows.identify_board import explained
 
-BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_1000", 22.5))
+BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def calibrate(folder: Path, board: str, tmp_path: Path, *more: str) -> int:
-    words = f"charuco:{board}x30,dictionary=DICT_4X4_1000,marker_mm=22.5"
+    words = f"charuco:{board}x30,dictionary=DICT_4X4_100,marker_mm=22.5"
     return main(["calibrate", str(folder), "--board", words, "-o", str(tmp_path / "out.json"), *more])
 
 
