@@ -23,6 +23,8 @@ COMPARABLE = 1.5
 """Corners are outliers only if every model with a scatter within this factor of the best one says so."""
 MIN_KEPT_SHARE = 0.5
 """A view in which fewer of the corners agree with the other views is dropped."""
+DISAGREES_WITH_VIEWS = "agree with the other views; retake it"
+"""How the reason for it ends."""
 DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
 """Sizes tried of models that come in several, where none is asked for,"""
 DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
@@ -111,7 +113,7 @@ def agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArr
     total = observations.present.sum(axis=1)
     keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
     reasons = tuple(
-        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' agree with the other views; retake it")
+        (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' {DISAGREES_WITH_VIEWS}")
         for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
         if not ok
     )

@@ -16,10 +16,12 @@ from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent,
 from rigkit.calibration.changing import MOTION, changing
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.mixed import two_cameras
+from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.two_kinds import APART, fewest_of_a_kind
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.usable import BESIDE
 from rigkit.cameras.base import image_center
@@ -97,6 +99,7 @@ def judge(
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
+        *_of_another_kind(calibration),
         *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS)),
         *unlike,
         *judge_capture(calibration, extent, far, clusters),
@@ -166,9 +169,28 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
     ]
 
 
+def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[str]:
+    """Return the images that hardly agree with the others in any corner, where these are too many for mishaps."""
+    used = {view.image for view in views}
+    out = list(dict.fromkeys(i for i, reason in dropped if reason.endswith(DISAGREES_WITH_VIEWS) and i not in used))
+    return out if len(out) >= fewest_of_a_kind(len(used) + len(out)) else []
+
+
+def _of_another_kind(c: Calibration) -> list[Finding]:
+    """Whatever the error of the rest: so many images are of another lens, setting or board, or the rest is."""
+    images = _contradicting(c.dropped, c.views)
+    if not images:
+        return []
+    total = len({view.image for view in c.views}) + len(images)
+    what = f"{len(images)} of {total} images contradict the others and are left out, '{images[0]}' the first"
+    return [_look(what, APART, images[0])]
+
+
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
     """Name the images left out, or how many for each reason. What lies beside a board in an image that is used is no
     cause to look."""
+    told = set(_contradicting(dropped, views))
+    dropped = [(image, reason) for image, reason in dropped if image not in told]
     used = {view.image for view in views}
     parts = [(image, reason) for image, reason in dropped if image in used and reason != BESIDE]
     found = [_look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts]

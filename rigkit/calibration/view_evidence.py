@@ -1,0 +1,220 @@
+"""What residuals say of each image: how much of them is a longer focal length, a shifted picture, a bent board ...
+
+At first order, after each image's own pose, and with all that the images have in common free to follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.core.arrays import FloatArray, IntArray, Points
+
+MIN_TELLING_CORNERS = 20
+"""A view with fewer corners says too little of its own after its pose."""
+MIN_TELLING_VIEWS = 6
+MIN_OWN_PART = 1e-6
+"""A way to change that the pose, or the ways before, follow but for this part of it is none of its own."""
+MIN_COMMON_PART = 1e-6
+"""Of what is common to all images, a direction that a way to change follows but for this part of its square is open."""
+MIN_SHARE_LEFT = 0.5
+"""A bow that all images share takes no more than the rest of the squares."""
+NO_CHANGE = "columns"
+"""No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
+model."""
+WAY_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
+"""How many rows of `_rows` each way to change has, in their order before the residual; bends are common, too."""
+COMMON = slice(6, -(sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1))
+"""Rows of `_rows` that are common to all images: not of the pose, nor of one image's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewChange:
+    """How much of the residuals a way to change from image to image explains.
+
+    Attributes
+    ----------
+    ratio : variance along it over that of the rest; 1 by chance.
+    share : of all squares, beyond chance.
+    left : part of all squares that it leaves.
+    criterion : its Bayesian information criterion less that of no change.
+    """
+
+    ratio: float
+    share: float
+    left: float
+    criterion: float
+
+    @classmethod
+    def of(cls, left: float, freedom: int, directions: int) -> ViewChange:
+        """Return that of a way with so many directions, of residuals with so many degrees of freedom."""
+        rest = left / (freedom - directions)
+        squares = 1.0 - left
+        criterion = freedom * np.log(left) + directions * np.log(freedom)
+        return cls(squares / directions / rest, squares - directions * rest, left, float(criterion))
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class ViewEvidence:
+    """What the residuals of V views say, as products of rows of `_rows` without the pose.
+
+    Attributes
+    ----------
+    views : which of the calibration's.
+    own, length : products (V, K, K), and the lengths (V, K) of the rows with it.
+    along : (V, K) products with the residuals, what is common to all images followed.
+    gram, scale : products (C, C) of what is common, to a unit diagonal by the scales (C,).
+    total, freedom : sum of squares of the residuals, and its degrees of freedom.
+    """
+
+    views: list[int]
+    own: FloatArray
+    length: FloatArray
+    along: FloatArray
+    gram: FloatArray
+    scale: FloatArray
+    total: float
+    freedom: int
+
+    def common_covariance(self) -> FloatArray:
+        """Return the inverse (C, C) of the products of what is common, as far as the images tell it."""
+        values, vectors = np.linalg.eigh(self.gram)
+        root = vectors * np.where(values > MIN_COMMON_PART, values, np.inf) ** -0.5 / self.scale[:, None]
+        return np.asarray(root @ root.T)
+
+    def explained(self, way: slice) -> tuple[float, int, FloatArray]:
+        """Return the squares that a way to change explains when all that is common to the images follows, how many
+        directions it has, and its amounts (V, n)."""
+        # Directions of the unit vectors' own part, and how much of the residual, and of what is common, lies along
+        # each.
+        size, common = self.length[:, way], COMMON
+        sizes, axes = np.linalg.eigh(self.own[:, way, way] / (size[:, :, None] * size[:, None]))
+        known = sizes > MIN_OWN_PART**2
+        back = np.swapaxes(axes * np.where(known, sizes, np.inf)[:, None] ** -0.5, -1, -2) / size[:, None]
+        amount = (back @ self.along[:, way, None])[..., 0]
+        shared = back @ self.own[:, way, common] / self.scale
+        every = shared.reshape(-1, len(self.scale))
+        left = self.gram - every.T @ every
+        pull = self.along[:, common].sum(axis=0) / self.scale - amount.ravel() @ every
+        values, vectors = np.linalg.eigh(left)
+        followed = values > MIN_COMMON_PART
+        turned = vectors[:, followed].T @ pull
+        step = vectors[:, followed] @ (turned / values[followed])
+        squares = float((amount**2).sum()) + float((turned**2 / values[followed]).sum())
+        return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
+
+    def changes(self) -> dict[str, ViewChange]:
+        """Return what each way to change explains; nothing where the residuals leave too little freedom."""
+        out = {}
+        for name, way in columns_of(self.own.shape[1]).items():
+            squares, directions, _ = self.explained(way)
+            if self.freedom <= 2 * directions or not self.total > squares:
+                return {}
+            out[name] = ViewChange.of(1.0 - squares / self.total, self.freedom, directions)
+        return out
+
+
+def view_evidence(calibration: Calibration) -> ViewEvidence | None:
+    """Return what the residuals say; None where that is nothing."""
+    telling = [k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
+    if len(telling) < MIN_TELLING_VIEWS:
+        return None
+    rows, count = _rows(calibration, [calibration.views[k] for k in telling])
+    # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
+    told = np.logical_and.reduceat(np.isfinite(rows).all(axis=(0, 1)), np.cumsum(count) - count)
+    if np.count_nonzero(told) < MIN_TELLING_VIEWS:
+        return None
+    stops = np.cumsum(count)
+    each = [rows[..., stop - n : stop] for n, stop in zip(count[told], stops[told], strict=True)]
+    products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
+    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    own = _without_pose(products, length)
+    residual = -1
+    gram, score = own[:, COMMON, COMMON].sum(axis=0), own[:, COMMON, residual].sum(axis=0)
+    scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    scaled = gram / np.outer(scale, scale)
+    step = np.linalg.lstsq(scaled, score / scale, rcond=MIN_OWN_PART)[0] / scale
+    before = float(own[:, residual, residual].sum())
+    total = before - float(step @ (2.0 * score - gram @ step))
+    if total < (1.0 - MIN_SHARE_LEFT) * before:
+        # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
+        return None
+    return ViewEvidence(
+        views=[k for k, tells in zip(telling, told.tolist(), strict=True) if tells],
+        own=own,
+        length=length,
+        along=own[:, :, residual] - own[:, :, COMMON] @ step,
+        gram=scaled,
+        scale=scale,
+        total=total,
+        freedom=sum(2 * n - 6 for n in count[told].tolist()) - len(step),
+    )
+
+
+def columns_of(count: int) -> dict[str, slice]:
+    """Return where the ways to change are among `count` rows of `_rows`."""
+    stops = count - 1 - sum(WAY_COLUMNS.values()) + np.cumsum(list(WAY_COLUMNS.values()))
+    out = {
+        name: slice(stop - size, stop) for (name, size), stop in zip(WAY_COLUMNS.items(), stops.tolist(), strict=True)
+    }
+    return out | {"lens": slice(out["focus"].start, out["shift"].stop)}
+
+
+def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
+    """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
+
+    With what is, in this order: the pose (6), what all images share (the camera's parameters and the 3 bows of the
+    boards), the other ways to change, and the residual last.
+    """
+    count = np.array([np.count_nonzero(view.kept) for view in views])
+    start, view = np.cumsum(count) - count, np.repeat(np.arange(len(views)), count)
+
+    def centred(values: FloatArray) -> FloatArray:
+        return np.asarray(values - (np.add.reduceat(values, start, axis=-1) / count)[..., view])
+
+    points = _points(calibration, views).T
+    rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
+    turned = (rotation * points).sum(axis=1)
+    in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
+    p = calibration.camera.parameters.size
+    rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
+    by_point = rows[:, 3:6]
+    u, v, valid = calibration.camera.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
+    pixels = np.where(valid, [u, v], np.nan)
+    lever, flat = centred(turned), centred(points[:2])
+    x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
+    centre, _ = calibration.camera.project(np.array([0.0, 0.0, 1.0]))
+    along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        np.multiply(lever[i], by_point[:, j], out=rows[:, k])
+        rows[:, k] -= lever[j] * by_point[:, i]
+    ways = {name: rows[:, way] for name, way in columns_of(rows.shape[1]).items()}
+    out_of_plane = (by_point * rotation[:, 2]).sum(axis=1)
+    for k, bow in enumerate((x * x, x * y, y * y)):
+        np.multiply(out_of_plane, bow, out=ways["bend"][:, k])
+    np.subtract(pixels, centre[:, None], out=ways["focus"][:, 0])
+    ways["shift"][0, 0] = ways["shift"][1, 1] = 1.0
+    np.multiply(rows[:, :6], along_v, out=ways["rows"])
+    np.multiply(rows[:, :6], along_u, out=ways[NO_CHANGE])
+    rows[:, -1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
+    return rows, count
+
+
+def _points(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
+    """Return the points (N, 3) of the boards that the kept corners of the views are."""
+    shapes = {board.board_id: board for board in calibration.boards}
+    return np.concatenate([shapes[view.board_id].at(view.grid[view.kept]) for view in views])
+
+
+def _without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
+    """Return the products (V, K, K) of rows with the part taken out that the first six follow, the pose; `length`
+    (V, K) is that of the rows. Directions that the corners leave open are none of the pose."""
+    pose = length[:, :6]
+    sizes, axes = np.linalg.eigh(products[:, :6, :6] / (pose[:, :, None] * pose[:, None]))
+    whitened = np.where(sizes > MIN_OWN_PART**2, sizes, np.inf) ** -0.5
+    back = np.swapaxes(axes * whitened[:, None], -1, -2) @ (products[:, :6] / pose[:, :, None])
+    return np.asarray(products - np.swapaxes(back, -1, -2) @ back)

@@ -1,0 +1,104 @@
+"""Images of two kinds, unlike each other in how their lens shows things: named, and told from what only looks so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.cameras.base import Camera
+from rigkit.core.detections import BoardView
+from rigkit.core.findings import Severity
+
+NOISE_PX = 0.03
+KINDS = "the images are of two kinds"
+
+
+def seen(camera: Camera, count: int, rng: np.random.Generator, first: int = 0) -> list[BoardView]:
+    views = random_views(camera, count, rng, reach_deg=33.0, noise_px=NOISE_PX)[0]
+    return [replace(view, image=f"{first + k:03d}.png") for k, view in enumerate(views)]
+
+
+def told(views: list[BoardView], rng: np.random.Generator, model: str = "brown") -> tuple[str, list[str]]:
+    """Return the first verdict and all, of images in any order."""
+    verdicts = calibrate([views[k] for k in rng.permutation(len(views))], SIZE, model=model, board="flat").verdicts
+    assert verdicts[0].severity is not Severity.GOOD
+    return verdicts[0].text, [str(verdict) for verdict in verdicts]
+
+
+def off_the_middle() -> Camera:
+    return lens("reg", np.array([790.0, 640.0]))
+
+
+def without_distortion(view: BoardView, camera: Camera) -> BoardView:
+    """Return the view as a program leaves it that undistorts images."""
+    rays, _ = camera.unproject(view.pixels)
+    pixels = camera.parameters[:2] * rays[:, :2] / rays[:, 2:] + camera.parameters[2:4]
+    inside = camera.on_image(pixels)
+    return replace(view, pixels=pixels[inside], grid=view.grid[inside], sigma_px=view.sigma_px[inside])
+
+
+def turned(view: BoardView) -> BoardView:
+    return replace(view, pixels=np.array(SIZE) - 1.0 - view.pixels)
+
+
+def mirrored(view: BoardView) -> BoardView:
+    """Return the view of a mirrored picture, in which the board is found from its other side."""
+    pixels = np.stack([SIZE[0] - 1.0 - view.pixels[:, 0], view.pixels[:, 1]], axis=-1)
+    grid = np.stack([BOARD.columns - 1 - view.grid[:, 0], view.grid[:, 1]], axis=-1)
+    return replace(view, pixels=pixels, grid=grid)
+
+
+def test_some_images_without_their_distortion(rng: np.random.Generator) -> None:
+    camera = lens("reg")
+    views = [without_distortion(v, camera) if k % 2 == 0 else v for k, v in enumerate(seen(camera, 18, rng))]
+    first, _ = told(views, rng)
+    assert f"{KINDS}, as if two lenses had taken them, or one at two settings: " in first
+    assert first.count(": 9 like '") == 1 and " and 9 like '" in first
+    assert "undistorted" in first and "as if some were" not in first
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [(turned, "as if some were turned by half a turn"), (mirrored, "as if some were mirrored")]
+)
+def test_some_pictures_turned_or_mirrored(change: object, words: str, rng: np.random.Generator) -> None:
+    assert callable(change)
+    views = [change(v) if k % 2 else v for k, v in enumerate(seen(off_the_middle(), 20, rng))]
+    first, every = told(views, rng)
+    assert KINDS in first and words in first
+    assert not any("stabilisation" in verdict or "rolling shutter" in verdict for verdict in every)
+
+
+@pytest.mark.parametrize("spread", ["normal", "even"])
+def test_a_focus_that_wanders_is_of_no_two_kinds(spread: str, rng: np.random.Generator) -> None:
+    for _ in range(2):
+        views: list[BoardView] = []
+        for k in range(20):
+            longer = 1.0 + 0.01 * (rng.normal() if spread == "normal" else rng.uniform(-1.7, 1.7))
+            camera = lens("reg")
+            views += seen(camera.with_parameters(camera.parameters * [longer, longer, *[1.0] * 7]), 1, rng, first=k)
+        first, _ = told(views, rng)
+        assert KINDS not in first and "the focal length differs from image to image" in first
+
+
+def test_boards_left_and_right_before_a_lens_unlike_its_model(rng: np.random.Generator) -> None:
+    """What tells the images apart is where the boards were, and that explains it as well."""
+    views = seen(lens("reg"), 80, rng)
+    order = np.argsort([view.pixels[:, 0].mean() for view in views])
+    _, every = told([views[k] for k in (*order[:12], *order[-12:])], rng, model="pinhole")
+    assert not any(KINDS in verdict for verdict in every)
+
+
+def test_a_third_of_the_images_contradicts_the_others(rng: np.random.Generator) -> None:
+    """So few that the others hold: they are left out, and said to be of another kind; two are mishaps."""
+    camera = lens("reg")
+    views = seen(camera, 18, rng)
+    some = [without_distortion(v, camera) if k % 3 == 0 else v for k, v in enumerate(views)]
+    first, every = told(some, rng)
+    assert "but 6 of 18 images contradict the others and are left out" in first and "undistorted" in first
+    assert not any("is left out:" in verdict for verdict in every)
+    two = [without_distortion(v, camera) if k in (4, 9) else v for k, v in enumerate(views)]
+    assert "contradict" not in str(calibrate(two, SIZE, model="brown", board="flat").verdicts)
