@@ -25,8 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="BOARD",
         help="9x6 (inner corners), aprilgrid:6x6x88,spacing=0.3 (tags, mm, keys of board files), a file, or identify",
     )
-    parser.add_argument("images", nargs="*", type=Path, help="with BOARD identify: images, or folders of images")
-    parser.add_argument("--square-mm", type=float, help="side of a square (with COLUMNSxROWS)")
+    parser.add_argument(
+        "images", nargs="*", type=Path, metavar="IMAGE|FOLDER", help="with BOARD identify: images, or folders of images"
+    )
+    parser.add_argument("--square-mm", type=float, metavar="MM", help="side of a square (with COLUMNSxROWS)")
     parser.add_argument("--paper", default="a4", help="a4 (default), a3, a2, a1, a0, letter or tabloid")
     parser.add_argument("-o", "--output", metavar="NAME", help="write NAME.pdf, NAME.svg and NAME.toml")
     parser.add_argument("--force", action="store_true", help="replace existing files")

@@ -1,4 +1,4 @@
-"""`rigkit detect`: every chessboard of every image, to a corners file and pictures."""
+"""`rigkit detect`: every board of every image, to a corners file and pictures."""
 
 from __future__ import annotations
 

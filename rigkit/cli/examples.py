@@ -84,8 +84,8 @@ EXAMPLES: dict[str, str] = {
   rigkit reconstruct --images a.png b.png --camera calibration.json --baseline-mm 250 -o scene
 """,
     "mesh": """\
-  rigkit mesh scene/cloud.ply
-  rigkit mesh scene/cloud.ply -o surface.ply --depth 10 --cut 0.05
+  rigkit mesh scene/scene.ply
+  rigkit mesh scene/scene.ply -o surface.ply --depth 10 --cut 0.05
 """,
     "validate": """\
   rigkit validate lab                             tables, page and clouds in out/lab

@@ -11,7 +11,9 @@ from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS,
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("source", type=Path, help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)")
+    parser.add_argument(
+        "source", type=Path, metavar="SOURCE", help="a camera file, a rig, a cloud as PLY, or a data set (then --pair)"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, help="file to write (a folder for a COLMAP model)")
     parser.add_argument(
         "--to", choices=sorted({*CAMERA_FORMATS, *CLOUD_FORMATS}), help="format (default: by the ending)"

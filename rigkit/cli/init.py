@@ -12,9 +12,13 @@ from rigkit.core.errors import ExitCode, InputError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     repeatable: dict[str, Any] = {"action": "append", "default": []}
-    parser.add_argument("folder", type=Path, help="folder with the images of the pairs, or of the cameras")
+    parser.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="folder with the images of the pairs, or of the cameras"
+    )
     parser.add_argument("--name", help="name of the data set (default: the folder's)")
-    parser.add_argument("--square-mm", type=float, help="side of a square, as measured on the printed board")
+    parser.add_argument(
+        "--square-mm", type=float, metavar="MM", help="side of a square, as measured on the printed board"
+    )
     parser.add_argument(
         "--calibration",
         **repeatable,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 
 import rigkit
@@ -23,5 +24,7 @@ def source_hash(*packages: str) -> str:
         if not folder.is_dir():
             raise ValueError(f"rigkit has no part '{folder.name}'")
         for path in sorted(p for p in folder.rglob("*") if p.suffix in SOURCE_SUFFIXES):
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+            # Files of a moment, such as an editor's lock that links nowhere, come and go beside the code.
+            with suppress(FileNotFoundError):
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

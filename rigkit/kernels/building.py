@@ -28,13 +28,14 @@ def library_name(platform: str = sys.platform) -> str:
 
 def sources(folder: Path) -> list[Path]:
     """Return the C files of `folder`."""
-    return sorted(folder.glob("*.c"))
+    return sorted(folder.glob("[!.]*.c"))
 
 
 def source_hash(folder: Path) -> str:
     """Return a hash of the C files and headers of `folder`, and of how they are compiled."""
     digest = hashlib.sha256(" ".join(FLAGS).encode())
-    for path in sorted([*folder.glob("*.c"), *folder.glob("*.h")]):
+    # What begins with a dot is an editor's, and may link nowhere.
+    for path in sorted([*sources(folder), *folder.glob("[!.]*.h")]):
         # Line ends differ between systems and mean nothing.
         digest.update(path.name.encode() + b"\0" + path.read_bytes().replace(b"\r\n", b"\n"))
     return digest.hexdigest()[:16]

@@ -1,0 +1,25 @@
+"""Which code computed a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.io.sources import source_hash
+from rigkit.kernels import building
+
+
+def test_an_editor_s_lock_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Editors put links that lead nowhere beside the files that they change."""
+    monkeypatch.setattr("rigkit.__path__", [str(tmp_path)])
+    for name in ("module.py", "kernel.c", "kernel.h"):
+        (tmp_path / name).write_text("content")
+    before = source_hash.__wrapped__(), building.source_hash(tmp_path)
+    for name in ("module.py", "kernel.c", "kernel.h"):
+        (tmp_path / f".#{name}").symlink_to("person@machine.1")
+    assert (source_hash.__wrapped__(), building.source_hash(tmp_path)) == before
+    assert building.sources(tmp_path) == [tmp_path / "kernel.c"]
+    for name in ("module.py", "kernel.h"):
+        (tmp_path / name).write_text("other content")
+    assert source_hash.__wrapped__() != before[0] and building.source_hash(tmp_path) != before[1]
