@@ -89,7 +89,7 @@ def choose_views(
         before = float(goal.error(covariance_of(information)))
         after = goal.error(covariance_of(information + views[left]))
         best = float(after.min())
-        if not np.isfinite(best):
+        if not (np.isfinite(before) and np.isfinite(best)):
             raise DegenerateError(
                 "plan: nothing can be said of any view: the calibration's numbers, or its board, are no real ones; "
                 "calibrate again"
@@ -97,7 +97,9 @@ def choose_views(
         if effort is None:
             pick = int(np.argmin(after))
         else:
-            good = np.flatnonzero(after <= best + nearly * min(before - best, best))
+            # Rounding may make the error grow a little: then the best view alone is as good as the best.
+            gain = max(before - best, 0.0)
+            good = np.flatnonzero(after <= best + nearly * min(gain, best))
             pick = int(good[np.argmin(effort(last)[left[good]])])
         last = int(left[pick])
         information = information + views[last]
