@@ -35,13 +35,9 @@ from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, rotation_angle
 from rigkit.geometry.triangulation import correct_hartley_sturm, correct_lindstrom, triangulate_rays
+from rigkit.kernels.minimal import five_rows, six_rows
 from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
-from rigkit.relative_pose.solvers.minimal import (
-    essential_from_five_rows,
-    essential_from_six_rows,
-    fundamental_from_seven_rows,
-)
 from rigkit.relative_pose.solvers.planar import solve_planar_batch
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
@@ -189,10 +185,6 @@ def minimal_rows(rng: np.random.Generator, problems: int = 2000) -> Iterator[Row
     pixels = [q.reshape(problems, 7, 2)[:LOOPED] for q in (m.pixels1, m.pixels2)]
     rays = [np.ascontiguousarray(f.reshape(problems, 7, 3)[:LOOPED, :5]) for f in (m.rays1, m.rays2)]
 
-    def opencv_seven() -> None:
-        for a, b in zip(*pixels, strict=True):
-            cv2.findFundamentalMat(a, b, cv2.FM_7POINT)
-
     def opencv_five() -> None:
         for a, b in zip(*pixels, strict=True):
             cv2.findEssentialMat(a[:5], b[:5], CAMERA.K, method=0)
@@ -203,17 +195,14 @@ def minimal_rows(rng: np.random.Generator, problems: int = 2000) -> Iterator[Row
 
     poselib = optional("poselib")
     yield row(
-        "minimal F, 7 points", problems, lambda: fundamental_from_seven_rows(points), OpenCV=(LOOPED, opencv_seven)
-    )
-    yield row(
         "minimal E, 5 points",
         problems,
-        lambda: essential_from_five_rows(points[:, :5]),
+        lambda: five_rows(points[:, :5]),
         OpenCV=(LOOPED, opencv_five),
         PoseLib=poselib and (LOOPED, lambda: poselib_five(poselib)),
     )
     mixed = np.concatenate([points[:, :2], affine[:, :4]], axis=1)
-    yield row("minimal E, 2 affine correspondences", problems, lambda: essential_from_six_rows(mixed))
+    yield row("minimal E, 2 affine correspondences", problems, lambda: six_rows(mixed))
 
 
 def triangulation_rows(rng: np.random.Generator, count: int = 100_000, few: int = 2000) -> Iterator[Row]:

@@ -16,7 +16,7 @@ from rigkit.affine.registry import affines_from_directions
 from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.matches import DirectionPairs
 from rigkit.relative_pose.refinement.refine import estimate_pose
-from rigkit.relative_pose.solvers.minimal import planar_from_two_rows
+from rigkit.relative_pose.solvers.planar import planar_from_two_rows
 from rigkit.relative_pose.solvers.pose import choose_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, point_rows

@@ -9,7 +9,8 @@ from helpers.epipolar_scenes import FISHEYE, pair, pose_errors_deg
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.relative_pose.solvers.planar import PlanarSolver, rotated_matches, solve_planar_batch
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
+from rigkit.relative_pose.solvers.planar import PlanarSolver, solve_planar_batch
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
 
 GRID_REL = 1e-9
@@ -78,9 +79,9 @@ def test_one_affine_correspondence_and_a_fisheye_are_enough(rng):
 def test_cameras_that_are_not_level_are_levelled_first(rng):
     m, pose, _ = pair(rng, 12, "planar", sigma_A=0.0)
     R1, R2 = exp_so3([0.1, 0.02, -0.2]), exp_so3([-0.05, 0.1, 0.15])
-    tilted = rotated_matches(m, R1, R2)
+    tilted, frames = LevelFrames(R1, R2).matches(m), LevelFrames(R1.T, R2.T)
     true = Rigid3(R2, np.zeros(3)) @ pose @ Rigid3(R1, np.zeros(3)).inverse()
-    E21 = PlanarSolver(R1.T, R2.T).solve(tilted).E21
+    E21 = R2 @ PlanarSolver().solve(frames.matches(tilted)).E21 @ R1.T
     expected = essential_from_pose(true)
     assert min(np.abs(E21 - expected).max(), np.abs(E21 + expected).max()) < 1e-9
     level = PlanarSolver().solve(tilted).E21

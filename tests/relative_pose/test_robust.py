@@ -34,7 +34,7 @@ def contaminated(rng, kind, count=120, outliers=0.4, noise_px=0.5, sigma_A=0.03)
 
 
 @pytest.mark.parametrize("kind", ["general", "planar", "standard"])
-@pytest.mark.parametrize("sample", ["points", "affine", "mixed"])
+@pytest.mark.parametrize("sample", ["points", "affine"])
 def test_outliers_do_not_matter(rng, kind, sample):
     wild, pose, bad = contaminated(rng, kind)
     found = robust_pose(wild, rng, pose_type=kind, sample=sample)
@@ -76,13 +76,11 @@ def test_what_is_missing_is_said(rng):
         robust_pose(wild, rng, sample="lines")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    "options", [{"max_noise": 1.0}, {"max_noise": np.nan}, {"confidence": 1.0}, {"confidence": 0.0}, {"max_trials": 0}]
-)
-def test_options_without_a_meaning_are_refused(rng, options):
+@pytest.mark.parametrize("max_noise", [1.0, np.nan])
+def test_a_noise_level_without_a_meaning_is_refused(rng, max_noise):
     wild, _, _ = contaminated(rng, "general", count=20)
-    with pytest.raises(InputError, match=next(iter(options))):
-        robust_pose(wild, rng, **options)
+    with pytest.raises(InputError, match="max_noise"):
+        robust_pose(wild, rng, max_noise=max_noise)
 
 
 def test_the_same_match_again_says_nothing_more(rng):
@@ -136,7 +134,7 @@ def test_nothing_but_outliers_gives_few_inliers_or_an_error(rng):
     wild, _, bad = contaminated(rng, "general", outliers=1.0, count=60)
     assert bad.all()
     try:
-        found = robust_pose(wild, rng, max_trials=200)
+        found = robust_pose(wild, rng)
     except DegenerateError:
         return
     assert found.inliers.mean() < 0.6

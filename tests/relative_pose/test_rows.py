@@ -9,7 +9,7 @@ from tolerances import EXACT_REL
 
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
-from rigkit.relative_pose.solvers.planar import rotated_matches
+from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.rows import (
     PLANAR_ENTRIES,
@@ -75,7 +75,7 @@ def test_turned_matches_obey_the_turned_geometry(rng):
     """Levelling rotations of cameras that are not level: rows, affinities included, stay exact."""
     m, pose, _ = pair(rng, 20, sigma_A=0.0)
     R1, R2 = exp_so3(rng.normal(size=3) * 0.3), exp_so3(rng.normal(size=3) * 0.3)
-    turned = rotated_matches(m, R1, R2)
+    turned = LevelFrames(R1, R2).matches(m)
     level = Rigid3(R2, np.zeros(3)) @ pose @ Rigid3(R1, np.zeros(3)).inverse()
     e = essential_from_pose(level).ravel()
     rows = affinity_rows(turned.rays1, turned.rays2, turned.jacobians1, turned.jacobians2, affinities(turned))

@@ -1,19 +1,16 @@
-"""Standard stereo with rows that are not known to correspond, and translations that are known to be level."""
+"""Standard stereo with rows that are not known to correspond."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import REGULAR, pair, pixel_fundamental, pose_errors_deg
+from helpers.epipolar_scenes import REGULAR, pair, pixel_fundamental
 from tolerances import EXACT_REL
 
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate
-from rigkit.relative_pose.solvers.pose import choose_pose
 from rigkit.relative_pose.solvers.standard import RowsSolver
-from rigkit.relative_pose.solvers.translation import TranslationSolver
 
 SLOPE, SHIFT_PX = 0.93, 41.0
 """Row of image 2 = SLOPE * row of image 1 + SHIFT_PX: another focal length and another principal point."""
@@ -70,15 +67,3 @@ def test_what_the_rows_relation_cannot_be_found_from(rng):
     )  # fmt: skip
     with pytest.raises(DegenerateError, match="one row"):
         RowsSolver().solve(flat)
-
-
-def test_a_level_translation_has_no_height(rng):
-    pose = Rigid3(np.eye(3), [250.0, 0.0, 160.0])
-    m, _, _ = pair(rng, 20, pose=pose, noise_px=0.5)
-    level = TranslationSolver(horizontal=True)
-    found = choose_pose(level.solve(m).E21, m.rays1, m.rays2)
-    assert level.degrees_of_freedom == 1
-    assert abs(found.translation_mm[1]) < EXACT_REL
-    assert max(pose_errors_deg(found, pose)) < 0.5
-    exact, _, _ = pair(rng, 2, pose=pose)
-    assert max(pose_errors_deg(choose_pose(level.solve(exact).E21, exact.rays1, exact.rays2), pose)) < 1e-6

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.relative_pose.solvers.planar import rotated_matches
 
 UPSIDE_DOWN = 1e-6
 """Sine of the angle below which a camera hangs upside down, and any axis turns it upright."""
@@ -39,8 +38,20 @@ class LevelFrames:
         return cls(_upright(down1), _upright(down2))
 
     def matches(self, matches: Matches) -> Matches:
-        """Return the matches as level cameras would see them."""
-        return rotated_matches(matches, self.level1_from_cam1, self.level2_from_cam2)
+        """Return the matches as level cameras would see them.
+
+        Pixels, and with them affinities and sigmas, stay: only the rays turn, and no longer belong to a pinhole.
+        """
+        first, second = self.level1_from_cam1, self.level2_from_cam2
+        return replace(
+            matches,
+            rays1=matches.rays1 @ first.T,
+            rays2=matches.rays2 @ second.T,
+            jacobians1=first @ matches.jacobians1,
+            jacobians2=second @ matches.jacobians2,
+            K1=None,
+            K2=None,
+        )
 
     def level_pose(self, cam2_from_cam1: Rigid3) -> Rigid3:
         """Return level2_from_level1."""

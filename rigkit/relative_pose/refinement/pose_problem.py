@@ -110,7 +110,6 @@ class PoseProblem:
     matches: Matches
     kind: str
     level_sigma_rad: float | None
-    covariance_A: FloatArray | None
     robust: RobustWeights | None
     point_weights: FloatArray | None
 
@@ -121,8 +120,7 @@ class PoseProblem:
     def minimum(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
         """Return the minimum near a pose; raises InputError where the residuals are too few."""
         loss = self._loss()
-        plain = self.level_sigma_rad is None and self.covariance_A is None
-        if plain and loss is not None:
+        if self.level_sigma_rad is None and loss is not None:
             affine, which = whitened_affinities(self.matches)
             self._require(len(self.matches) + 2 * len(which))
             packed, limits = SampsonRows.of(self.matches).packed, (MAX_REFINEMENTS, STEP_TOLERANCE)
@@ -141,7 +139,7 @@ class PoseProblem:
         return self._descend(R, t)
 
     def _descend(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
-        """Return the minimum near a pose where there are priors or covariances of affinities, which no kernel takes."""
+        """Return the minimum near a pose with a level's prior, which the kernel does not take."""
         start = self._linearise((R, t))
         self._require(len(start.residuals))
         iterations, converged, state, here = 0, True, (R, t), start
@@ -182,7 +180,7 @@ class PoseProblem:
         """Return residuals (M,), Jacobian (M, 5) and the match of each (M,), -1 for the prior; no weights yet."""
         basis = translation_basis(t)
         r, jacobian = point_terms(self.matches, R, t, basis)
-        ra, ja, which = affinity_terms(self.matches, R, t, basis, self.covariance_A)
+        ra, ja, which = affinity_terms(self.matches, R, t, basis)
         rows, by, of = [r, ra.reshape(-1)], [jacobian, ja.reshape(-1, 5)], [np.arange(len(r)), np.repeat(which, 2)]
         if self.level_sigma_rad is not None:
             deviation, by_pose = level_terms(self.kind, R, t, basis)

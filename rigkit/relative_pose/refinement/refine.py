@@ -69,7 +69,6 @@ def refine_pose(
     pose_type: PoseType | str = PoseType.GENERAL,
     level_sigma_rad: float | None = None,
     *,
-    covariance_A: FloatArray | None = None,
     robust: RobustWeights | None = None,
     point_weights: FloatArray | None = None,
     level_frames: LevelFrames | None = None,
@@ -78,12 +77,11 @@ def refine_pose(
 
     Parameters
     ----------
-    matches : affinities take part where they have a sigma_A (or `covariance_A`): leave it out for affinities that were
-        computed from the epipolar geometry or from the very same corners.
+    matches : affinities take part where they have a sigma_A: leave it out for affinities that were computed from the
+        epipolar geometry or from the very same corners.
     start : its translation's length does not matter.
     pose_type : exact constraint, unless `level_sigma_rad` makes it a prior.
     level_sigma_rad : standard deviation of each deviation from the pose type.
-    covariance_A : (N, 4, 4) covariance of the row-major entries of A21.
     robust : weight function for contaminated matches, `cauchy_weights` for example.
     point_weights : (N,) fixed factors of the squared residuals of each match.
     level_frames : in which the pose type is meant to hold; None: those of the cameras.
@@ -104,7 +102,7 @@ def refine_pose(
     if level_frames is not None:
         matches, start = level_frames.matches(matches), level_frames.level_pose(start)
     exact = level_sigma_rad is None
-    problem = PoseProblem(matches, str(pose_type), level_sigma_rad, covariance_A, robust, point_weights)
+    problem = PoseProblem(matches, str(pose_type), level_sigma_rad, robust, point_weights)
     R, t = project_to_type(start, pose_type) if exact else _split(start)
     found = _result(problem, problem.minimum(R, t))
     if level_frames is None:
@@ -119,7 +117,6 @@ def estimate_pose(
     level_sigma_rad: float | None = None,
     *,
     weights: WeightRule | RowWeights | None = None,
-    robust: RobustWeights | None = None,
 ) -> RefinedPose:
     """Return the refined pose from scratch: linear solution, cheirality, maximum likelihood.
 
@@ -143,7 +140,7 @@ def estimate_pose(
     ends: list[RefinedPose] = []
     for start in starts:
         try:
-            ends.append(refine_pose(matches, start, pose_type, level_sigma_rad, robust=robust))
+            ends.append(refine_pose(matches, start, pose_type, level_sigma_rad))
         except DegenerateError as error:
             failure = failure or error
     if not ends:

@@ -5,9 +5,8 @@ The pose is (R, t), |t| = 1, perturbed by R <- exp(w) R and t <- t + b1 T1 + b2 
 Points: the reprojection error itself, not its first-order approximation. For each pair of pixels the nearest pair that
 satisfies the epipolar geometry is found (two linearisations); the residual is the signed length of that displacement
 in sigmas, and by the envelope theorem its derivative is that of the constraint at the corrected rays over its standard
-deviation. Affinities: (A^T n2 + n1) whitened by M C M^T, C the covariance of A and M = d(A^T n2)/dA, and what the
-pixels' noise adds to it (weights.pixel_share); with C = sigma_A^2 I that is division by the root of sigma_A^2 |n2|^2
-and that share.
+deviation. Affinities: A^T n2 + n1 over the root of its variance, sigma_A^2 |n2|^2 and what the pixels' noise adds to it
+(weights.pixel_share).
 """
 
 from __future__ import annotations
@@ -43,18 +42,17 @@ def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArra
 
 
 def affinity_terms(
-    matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray, covariance_A: FloatArray | None
+    matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return whitened affinity residuals (K, 2), their Jacobian (K, 2, 5) and which matches (K,) they belong to.
+    """Return affinity residuals (K, 2) in sigmas, their Jacobian (K, 2, 5) and which matches (K,) they belong to.
 
-    `covariance_A` (N, 4, 4) of the row-major entries of A21; None takes sigma_A of the matches. Without either there
-    are no affinity residuals.
+    Affinities without a sigma_A take no part.
     """
-    which = _chosen(matches, covariance_A)
+    which = _chosen(matches)
     if not len(which):
         return np.zeros((0, 2)), np.zeros((0, 2, 5)), which
     m = matches.select(which)
-    assert m.A21 is not None
+    assert m.A21 is not None and m.sigma_A is not None
     f1, f2, b1, b2, A = m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.A21
     turned = f1 @ R.T
     # E f1 = t x (R f1) and E^T f2 = R^T (f2 x t), and their derivatives by (w, b).
@@ -67,23 +65,12 @@ def affinity_terms(
     dn1 = np.swapaxes(b1, -1, -2) @ (R.T @ by1)
     g = (n2[:, None, :] @ A)[:, 0] + n1
     dg = np.swapaxes(A, -1, -2) @ dn2 + dn1
-    share = pixel_share(m, skew(t) @ R)
-    if covariance_A is None:
-        assert m.sigma_A is not None
-        variance = m.sigma_A**2 * np.sum(n2**2, axis=1) + share
-        variance = np.where(variance > 0.0, variance, np.inf)
-        along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_slope(m, R, t, basis)
-        along /= variance[:, None]
-        scale = 1.0 / np.sqrt(variance)
-        jacobian = (dg - g[:, :, None] * along[:, None, :]) * scale[:, None, None]
-        return g * scale[:, None], jacobian, which
-    M = np.zeros((which.size, 2, 4))
-    M[:, 0, 0], M[:, 0, 2] = n2[:, 0], n2[:, 1]
-    M[:, 1, 1], M[:, 1, 3] = n2[:, 0], n2[:, 1]
-    of_g = M @ covariance_A[which] @ np.swapaxes(M, -1, -2) + share[:, None, None] * np.eye(2)
-    floor = 1e-12 * np.trace(of_g, axis1=1, axis2=2)[:, None, None] + 1e-300
-    whiten = np.linalg.inv(np.linalg.cholesky(of_g + floor * np.eye(2)))
-    return (whiten @ g[..., None])[..., 0], whiten @ dg, which
+    variance = m.sigma_A**2 * np.sum(n2**2, axis=1) + pixel_share(m, skew(t) @ R)
+    variance = np.where(variance > 0.0, variance, np.inf)
+    along = m.sigma_A[:, None] ** 2 * np.sum(n2[:, :, None] * dn2, axis=1) + _half_slope(m, R, t, basis)
+    along /= variance[:, None]
+    scale = 1.0 / np.sqrt(variance)
+    return g * scale[:, None], (dg - g[:, :, None] * along[:, None, :]) * scale[:, None, None], which
 
 
 def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
@@ -104,7 +91,7 @@ def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
     Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, the variances of its
     entries and of the pixels of both images.
     """
-    which = _chosen(matches, None)
+    which = _chosen(matches)
     if not len(which):
         return np.zeros((25, 0)), which
     assert matches.A21 is not None and matches.sigma_A is not None
@@ -115,16 +102,12 @@ def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
     return np.concatenate([*rays, *columns, entries, sigmas**2]), which
 
 
-def _chosen(matches: Matches, covariance_A: FloatArray | None) -> IntArray:
+def _chosen(matches: Matches) -> IntArray:
     """Return which matches (K,) have an affinity of known uncertainty."""
-    usable = usable_affinities(matches)
-    if covariance_A is not None:
-        usable &= np.isfinite(covariance_A).all(axis=(-2, -1))
-    elif matches.sigma_A is not None:
-        usable &= np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
-    else:
-        usable[:] = False
-    return np.flatnonzero(usable).astype(np.int64)
+    if matches.sigma_A is None:
+        return np.zeros(0, dtype=np.int64)
+    known = np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
+    return np.flatnonzero(usable_affinities(matches) & known).astype(np.int64)
 
 
 def level_terms(

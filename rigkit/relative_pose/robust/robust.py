@@ -19,20 +19,30 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.kernels.minimal import five_rows, six_rows
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import QUANTILE, MarginalLoss, marginal_quality
 from rigkit.relative_pose.refinement.refine import SIGNIFICANT, RefinedPose, refine_pose
-from rigkit.relative_pose.solvers.minimal import essential_from_five_rows, essential_from_six_rows, planar_from_two_rows
-from rigkit.relative_pose.solvers.planar import solve_planar_batch
+from rigkit.relative_pose.solvers.planar import planar_from_two_rows, solve_planar_batch
 from rigkit.relative_pose.solvers.planar_ambiguity import compare_poses, other_ambiguous_poses
 from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
 from rigkit.relative_pose.solvers.weights import affinity_distances, usable_affinities
 
-Sample = Literal["points", "affine", "mixed"]
-"""What minimal samples consist of: points only; affine correspondences only; one affine correspondence and points."""
+Sample = Literal["points", "affine"]
+"""What minimal samples consist of: points, or affine correspondences. Of these two are enough instead of five, one
+instead of two."""
+SAMPLE_SIZES: dict[tuple[str, Sample], int] = {
+    ("general", "points"): 5,
+    ("general", "affine"): 2,
+    ("planar", "points"): 2,
+    ("planar", "affine"): 1,
+}
+CONFIDENCE = 0.999
+"""Of having drawn a sample without outliers, given the share of inliers found so far."""
+MAX_TRIALS = 4000
 
 NO_POSE = (
     "no pose that enough matches agree with, from in front of both cameras, in {} samples; check that the cameras are "
@@ -85,9 +95,6 @@ def robust_pose(
     pose_type: PoseType | str = PoseType.GENERAL,
     sample: Sample = "points",
     max_noise: float = 6.0,
-    confidence: float = 0.999,
-    max_trials: int = 4000,
-    level_sigma_rad: float | None = None,
 ) -> RobustPose:
     """Return the pose that most matches agree with.
 
@@ -95,28 +102,27 @@ def robust_pose(
     ----------
     matches : contaminated; their sigmas are the smallest noise expected.
     pose_type : general or planar are sampled; standard and forward have nothing to sample and are only refined.
-    sample : see Sample. Affine correspondences need fewer draws: two instead of five, one instead of two.
     max_noise : highest noise level considered, in sigmas of the matches.
-    confidence : of having drawn a sample without outliers, given the share of inliers found so far.
 
     Raises
     ------
     InputError
-        Too few matches for a sample, or affinities asked for where there are none; options without a meaning.
+        Too few matches or affinities for a sample; a noise level that is not above the sigmas.
     DegenerateError
         No sample gave a pose; the matches that fit leave another one open, all on one plane, or have no baseline.
     """
-    _check_options(max_noise, confidence, max_trials)
+    if not (np.isfinite(max_noise) and max_noise > 1.0):
+        raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
     kind = str(pose_type)
     rows = SampsonRows.of(matches)
-    finalists, trials = _finalists(matches, rows, rng, kind, sample, max_noise, confidence, max_trials)
+    finalists, trials = _finalists(matches, rows, rng, kind, sample, max_noise)
     noise = _shown_noise(rows, finalists, max_noise)
     finalists = rows.improved(finalists, kind, noise)[0]
     loss = MarginalLoss(noise)
 
     def finished(start: Rigid3, plausible: BoolArray) -> tuple[RobustPose, FloatArray]:
         own = plausible.astype(np.float64)
-        end = refine_pose(matches, start, kind, level_sigma_rad, robust=loss, point_weights=own)
+        end = refine_pose(matches, start, kind, robust=loss, point_weights=own)
         r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
         qualities = marginal_quality(r, noise) * plausible
         inliers = plausible & (np.abs(r) < QUANTILE * noise)
@@ -138,15 +144,6 @@ def robust_pose(
     raise DegenerateError(NO_POSE.format(trials))
 
 
-def _check_options(max_noise: float, confidence: float, max_trials: int) -> None:
-    if not (np.isfinite(max_noise) and max_noise > 1.0):
-        raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"robust estimation: confidence must be between 0 and 1, got {confidence}")
-    if max_trials < 1:
-        raise InputError(f"robust estimation: max_trials must be 1 at least, got {max_trials}")
-
-
 def _finalists(
     matches: Matches,
     rows: SampsonRows,
@@ -154,8 +151,6 @@ def _finalists(
     kind: str,
     sample: Sample,
     max_noise: float,
-    confidence: float,
-    max_trials: int,
 ) -> tuple[Mat3, int]:
     """Return the best essential matrices (H, 3, 3) of the samples, and how many were drawn; options of `robust_pose`.
 
@@ -164,7 +159,7 @@ def _finalists(
     if kind in (PoseType.STANDARD, PoseType.FORWARD):
         return fundamental_for(kind).solve(matches, "points").E21[None], 0
     size = _sample_size(matches, kind, sample)
-    finalists, trials = _Search(matches, rows, kind, sample, size, max_noise).run(rng, confidence, max_trials)
+    finalists, trials = _Search(matches, rows, kind, sample, size, max_noise).run(rng)
     if not len(finalists):
         raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
     return finalists, trials
@@ -264,14 +259,15 @@ class _Search:
     size: int
     max_noise: float
 
-    def run(self, rng: np.random.Generator, confidence: float, max_trials: int) -> tuple[Mat3, int]:
+    def run(self, rng: np.random.Generator) -> tuple[Mat3, int]:
         """Return the best essential matrices (H, 3, 3), locally optimised, best first, and the number of samples."""
         best = np.zeros((0, 3, 3))
-        trials, needed, best_rank = 0, float(max_trials), 0.0
-        affine = np.flatnonzero(usable_affinities(self.matches))
+        trials, needed, best_rank = 0, float(MAX_TRIALS), 0.0
+        every = np.ones(len(self.matches), dtype=bool)
+        among = np.flatnonzero(every if self.sample == "points" else usable_affinities(self.matches))
         while trials < needed:
             trials += BATCH
-            index = _draw(rng, len(self.matches), affine, self.sample, self.size)
+            index = _draw(rng, among, self.size)
             candidates = _hypotheses(self.matches, index, self.kind, self.sample)
             if not len(candidates):
                 continue
@@ -285,7 +281,7 @@ class _Search:
             share = float(np.mean(np.abs(self.rows.residuals(best[:1])[0]) < QUANTILE * self.max_noise))
             # Affinities are noisy: of the samples without outliers only some are good enough to start from.
             hit = share**self.size * (1.0 if self.sample == "points" else GOOD_AFFINE)
-            needed = min(float(max_trials), float(np.log(1.0 - confidence) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
+            needed = min(MAX_TRIALS, float(np.log(1.0 - CONFIDENCE) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
         return best, trials
 
     def improved(self, E21: Mat3) -> Mat3:
@@ -307,57 +303,37 @@ class _Search:
 
 def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
     """Return how many matches a sample holds; raises InputError where the matches cannot provide it."""
-    sizes = {
-        "general": {"points": 5, "affine": 2, "mixed": 3},
-        "planar": {"points": 2, "affine": 1, "mixed": 2},
-    }
-    if kind not in sizes or sample not in sizes[kind]:
+    size = SAMPLE_SIZES.get((kind, sample))
+    if size is None:
         raise InputError(f"robust estimation knows no samples of kind '{sample}' for pose type '{kind}'")
-    size = sizes[kind][sample]
     different = len({pair.tobytes() for pair in np.concatenate([matches.pixels1, matches.pixels2], axis=1)})
     if different < size + 1:
         raise InputError(f"robust estimation: {different} different matches, at least {size + 1} are needed")
     have = int(usable_affinities(matches).sum())
-    wanted = {"points": 0, "affine": size, "mixed": 1}[sample]
-    if have < wanted:
-        raise InputError(f"samples '{sample}' need {wanted} affinities, the matches have {have}; use sample='points'")
+    if sample == "affine" and have < size:
+        raise InputError(f"samples '{sample}' need {size} affinities, the matches have {have}; use sample='points'")
     return size
 
 
-def _draw(rng: np.random.Generator, count: int, affine: IntArray, sample: Sample, size: int) -> IntArray:
-    """Return indices (BATCH, size) without repetition in a row; "mixed" begins with an affine correspondence."""
-    if sample == "affine":
-        return np.asarray(affine[_distinct(rng, len(affine), np.zeros((BATCH, 0), dtype=np.int64), size)])
-    first = rng.choice(affine, (BATCH, 1)) if sample == "mixed" else np.zeros((BATCH, 0), dtype=np.int64)
-    return _distinct(rng, count, first, size)
-
-
-def _distinct(rng: np.random.Generator, count: int, taken: IntArray, size: int) -> IntArray:
-    """Return `taken` (B, k) and numbers below `count` after it, (B, size), all different within a row."""
+def _draw(rng: np.random.Generator, among: IntArray, size: int) -> IntArray:
+    """Return indices (BATCH, size) of `among`, without repetition in a row."""
+    taken = np.zeros((BATCH, 0), dtype=np.int64)
     while taken.shape[1] < size:
-        fresh = rng.integers(0, count - taken.shape[1], len(taken))
+        fresh = rng.integers(0, len(among) - taken.shape[1], BATCH)
         # The fresh-th of the numbers not taken yet.
         for passed in np.sort(taken, axis=1).T:
             fresh += fresh >= passed
         taken = np.concatenate([taken, fresh[:, None]], axis=1)
-    return taken
+    return np.asarray(among[taken])
 
 
-def _hypotheses(matches: Matches, index: IntArray, kind: str, sample: Sample) -> Mat3:
+def _hypotheses(m: Matches, index: IntArray, kind: str, sample: Sample) -> Mat3:
     """Return all essential matrices (H, 3, 3) of samples (B, size)."""
-    f1, f2 = matches.rays1[index], matches.rays2[index]
+    f1, f2 = m.rays1[index], m.rays2[index]
     rows = point_rows(f1, f2)
-    affinities = 0 if sample == "points" else (index.shape[1] if sample == "affine" else 1)
-    if affinities:
-        which = index[:, :affinities]
-        assert matches.A21 is not None
-        more = affinity_rows(
-            f1[:, :affinities],
-            f2[:, :affinities],
-            matches.jacobians1[which],
-            matches.jacobians2[which],
-            matches.A21[which],
-        )
+    if sample == "affine":
+        assert m.A21 is not None
+        more = affinity_rows(f1, f2, m.jacobians1[index], m.jacobians2[index], m.A21[index])
         rows = np.concatenate([rows, more.reshape(len(index), -1, 9)], axis=1)
     if kind == PoseType.PLANAR:
         rows = rows[..., np.array(PLANAR_ENTRIES)]
@@ -365,9 +341,7 @@ def _hypotheses(matches: Matches, index: IntArray, kind: str, sample: Sample) ->
             found = planar_from_two_rows(rows)
         else:
             found = essential_from_planar(solve_planar_batch(np.swapaxes(rows, 1, 2) @ rows)[0])[:, None]
-    elif rows.shape[1] == 5:
-        found = essential_from_five_rows(rows)
     else:
-        found = essential_from_six_rows(rows)
+        found = five_rows(rows) if sample == "points" else six_rows(rows)
     flat = found.reshape(-1, 3, 3)
     return np.asarray(flat[np.isfinite(flat[:, 0, 0])])

@@ -11,40 +11,12 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
-from rigkit.relative_pose.solvers.rows import affinity_rows, point_rows, right_singular
+from rigkit.relative_pose.solvers.rows import LinearRows, affinity_rows, point_rows, right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
 
-class NormalisedRows:
-    """The rows of all matches in normalised coordinates; the weights come later."""
-
-    def __init__(self, matches: Matches) -> None:
-        self.transform1, self.transform2 = _whitening(matches.rays1), _whitening(matches.rays2)
-        x1, x2 = matches.rays1 @ self.transform1.T, matches.rays2 @ self.transform2.T
-        self.points = point_rows(x1, x2)
-        self.affinities: FloatArray | None = None
-        if matches.A21 is not None:
-            d1, d2 = self.transform1 @ matches.jacobians1, self.transform2 @ matches.jacobians2
-            self.affinities = affinity_rows(x1, x2, d1, d2, np.nan_to_num(matches.A21))
-
-    def weighted(self, weights: RowWeights) -> FloatArray:
-        """Return the rows that count (M, 9), multiplied by their weights."""
-        use = weights.points > 0.0
-        rows = self.points[use] * weights.points[use, None]
-        also = weights.affinities > 0.0
-        if self.affinities is not None and also.any():
-            more = self.affinities[also] * weights.affinities[also, None, None]
-            rows = np.concatenate([rows, more.reshape(-1, 9)])
-        return rows
-
-    def denormalised(self, f: FloatArray) -> FloatArray:
-        """Return (..., 3, 3) on rays of solutions (..., 9) in normalised coordinates."""
-        matrix = f.reshape(*f.shape[:-1], 3, 3)
-        return np.asarray(self.transform2.T @ matrix @ self.transform1)
-
-
-def linear_epipolar(rows: NormalisedRows, weights: RowWeights) -> Mat3:
-    """Return the rank-two matrix (3, 3) on rays (unit norm) that minimises the weighted algebraic error.
+def linear_epipolar(rows: LinearRows, weights: RowWeights) -> Mat3:
+    """Return the rank-two matrix (3, 3) in the rows' coordinates that minimises the weighted algebraic error.
 
     Raises DegenerateError where a second solution fits exactly too (all points on one plane, or no baseline).
     """
@@ -55,9 +27,16 @@ def linear_epipolar(rows: NormalisedRows, weights: RowWeights) -> Mat3:
             "add points off that plane or declare the pose type"
         )
     u, s3, wt = np.linalg.svd(vt[8].reshape(3, 3))
-    flat = ((u * [s3[0], s3[1], 0.0]) @ wt).reshape(9)
-    matrix = rows.denormalised(flat)
-    return np.asarray(matrix / np.linalg.norm(matrix))
+    return np.asarray((u * [s3[0], s3[1], 0.0]) @ wt)
+
+
+def normalised(m: Matches) -> tuple[LinearRows, Mat3, Mat3]:
+    """Return the rows of matches in normalised coordinates, and T1, T2: E on rays is T2^T E T1."""
+    T1, T2 = _whitening(m.rays1), _whitening(m.rays2)
+    x1, x2, affinities = m.rays1 @ T1.T, m.rays2 @ T2.T, None
+    if m.A21 is not None:
+        affinities = affinity_rows(x1, x2, T1 @ m.jacobians1, T2 @ m.jacobians2, np.nan_to_num(m.A21))
+    return LinearRows(point_rows(x1, x2), affinities), T1, T2
 
 
 def essential_nearest(matrix: FloatArray) -> Mat3:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from rigkit.core.arrays import Mat3
 from rigkit.core.matches import Matches
-from rigkit.relative_pose.solvers.eight_point import NormalisedRows, essential_nearest, linear_epipolar
+from rigkit.relative_pose.solvers.eight_point import essential_nearest, linear_epipolar, normalised
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
 from rigkit.relative_pose.solvers.planar_ambiguity import refuse_planar_ambiguity
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
@@ -28,11 +30,11 @@ class GeneralSolver:
         Raises DegenerateError where one plane explains the matches to within their noise.
         """
         check_baseline(matches)
-        rows = NormalisedRows(matches)
+        rows, T1, T2 = normalised(matches)
 
         def linear(row_weights: RowWeights) -> Mat3:
             check_count(matches, row_weights, 8, "general epipolar geometry")
-            return linear_epipolar(rows, row_weights)
+            return np.asarray(T2.T @ linear_epipolar(rows, row_weights) @ T1)
 
         matrix, used = reweighted(matches, weights, linear)
         refuse_planar_ambiguity(matches, used)

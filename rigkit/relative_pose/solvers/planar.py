@@ -20,7 +20,7 @@ from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.estimate import EpipolarEstimate, check_baseline, check_count, finish, reweighted
-from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, essential_from_planar, point_rows
+from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, LinearRows, essential_from_planar
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
 J_SIGN = np.array([1.0, -1.0, -1.0, 1.0])
@@ -29,40 +29,20 @@ BISECTIONS = 50
 STATIONARY = 1e-10
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, slots=True)
 class PlanarSolver:
-    """Two degrees of freedom; at least three equations (three points or one affine correspondence).
+    """Two degrees of freedom; at least three equations (three points or one affine correspondence)."""
 
-    Attributes
-    ----------
-    level1_from_cam1, level2_from_cam2 : (3, 3) rotations into frames whose y axis is vertical, where the cameras are
-        not level (from an accelerometer, say); None where they are.
-    """
-
-    level1_from_cam1: Mat3 | None = None
-    level2_from_cam2: Mat3 | None = None
     degrees_of_freedom: int = 2
 
     def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
         """Return the globally optimal planar E21; see FundamentalSolver."""
-        level1 = np.eye(3) if self.level1_from_cam1 is None else np.asarray(self.level1_from_cam1)
-        level2 = np.eye(3) if self.level2_from_cam2 is None else np.asarray(self.level2_from_cam2)
-        level = rotated_matches(matches, level1, level2)
-        entries = np.array(PLANAR_ENTRIES)
-        points = point_rows(level.rays1, level.rays2)[:, entries]
-        affinities = None
-        if level.A21 is not None:
-            affinities = affinity_rows(
-                level.rays1, level.rays2, level.jacobians1, level.jacobians2, np.nan_to_num(level.A21)
-            )[..., entries]
+        rows = LinearRows.of(matches, np.eye(9)[list(PLANAR_ENTRIES)])
 
         def best(row_weights: RowWeights) -> FloatArray:
             check_count(matches, row_weights, 3, "planar motion")
-            rows = points * row_weights.points[:, None]
-            if affinities is not None:
-                more = affinities * row_weights.affinities[:, None, None]
-                rows = np.concatenate([rows, more.reshape(-1, 4)])
-            gram = rows.T @ rows
+            weighted = rows.weighted(row_weights)
+            gram = weighted.T @ weighted
             values = np.linalg.eigvalsh(gram)
             if values[2] <= 1e-14 * values[3]:
                 raise DegenerateError(
@@ -72,8 +52,7 @@ class PlanarSolver:
             return essential_from_planar(solve_planar_batch(gram[None])[0][0])
 
         check_baseline(matches)
-        E_level, used = reweighted(level, weights, best)
-        E21 = level2.T @ E_level @ level1
+        E21, used = reweighted(matches, weights, best)
         return finish(matches, E21, E21, used)
 
 
@@ -95,6 +74,22 @@ def solve_planar_batch(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
     e = _unit_pairs(e)
     e = _polished(G, e)
     return e, np.einsum("bi,bij,bj->b", e, G, e) * size
+
+
+def planar_from_two_rows(rows: FloatArray) -> Mat3:
+    """Return up to two planar E (B, 2, 3, 3) of rows (B, 2, 4) on the planar entries: e^T J e = 0 in the null space."""
+    vt = np.linalg.svd(rows, full_matrices=True)[2]
+    a, b = vt[:, 2], vt[:, 3]
+    sign = np.array([1.0, -1.0, -1.0, 1.0])
+    aa, ab, bb = (np.sum(x * sign * y, axis=1) for x, y in ((a, a), (a, b), (b, b)))
+    # cos^2 aa + 2 sin cos ab + sin^2 bb = m + r cos(2w - w0) = 0.
+    mean, radius = 0.5 * (aa + bb), np.hypot(0.5 * (aa - bb), ab)
+    real = np.abs(mean) <= radius
+    turn = np.arccos(np.where(real, -mean / np.where(radius > 0.0, radius, 1.0), 0.0))
+    centre = np.arctan2(ab, 0.5 * (aa - bb))
+    angle = 0.5 * (centre[:, None] + np.stack([turn, -turn], axis=1))
+    e = a[:, None] * np.cos(angle)[..., None] + b[:, None] * np.sin(angle)[..., None]
+    return np.where(real[:, None, None, None], essential_from_planar(e), np.nan)
 
 
 def _dual_optimum(G: FloatArray) -> FloatArray:
@@ -185,26 +180,3 @@ def _polished(G: FloatArray, e: FloatArray) -> FloatArray:
         better = moved_cost <= cost
         e, cost = np.where(better[:, None], moved, e), np.where(better, moved_cost, cost)
     return e
-
-
-def rotated_matches(matches: Matches, rotation1: Mat3, rotation2: Mat3) -> Matches:
-    """Return the matches as cameras turned by `rotation1` and `rotation2` (new_from_old) would see them.
-
-    Pixels, and with them affinities and sigmas, stay: only the rays turn, and no longer belong to a pinhole.
-    """
-    return Matches(
-        pixels1=matches.pixels1,
-        pixels2=matches.pixels2,
-        rays1=matches.rays1 @ rotation1.T,
-        rays2=matches.rays2 @ rotation2.T,
-        jacobians1=rotation1 @ matches.jacobians1,
-        jacobians2=rotation2 @ matches.jacobians2,
-        sigma1_px=matches.sigma1_px,
-        sigma2_px=matches.sigma2_px,
-        board_index=matches.board_index,
-        grid=matches.grid,
-        K1=None,
-        K2=None,
-        A21=matches.A21,
-        sigma_A=matches.sigma_A,
-    )

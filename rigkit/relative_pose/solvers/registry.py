@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from rigkit.core.errors import InputError
 from rigkit.relative_pose.solvers.estimate import FundamentalSolver
-from rigkit.relative_pose.solvers.fixed import FixedSolver
-from rigkit.relative_pose.solvers.forward import ForwardRollSolver
+from rigkit.relative_pose.solvers.family import FORWARD, FORWARD_WITH_ROLL, FREE_TRANSLATION, STANDARD
 from rigkit.relative_pose.solvers.general import GeneralSolver
 from rigkit.relative_pose.solvers.planar import PlanarSolver
 from rigkit.relative_pose.solvers.standard import RowsSolver
-from rigkit.relative_pose.solvers.translation import TranslationSolver
 
 SOLVERS: dict[str, FundamentalSolver] = {
     "general": GeneralSolver(),
     "planar": PlanarSolver(),
-    "standard": FixedSolver((1.0, 0.0, 0.0)),
-    "forward": FixedSolver((0.0, 0.0, 1.0)),
-    "translation": TranslationSolver(),
+    "standard": STANDARD,
+    "forward": FORWARD,
+    "translation": FREE_TRANSLATION,
     "standard-rows": RowsSolver(),
-    "forward-roll": ForwardRollSolver(),
+    "forward-roll": FORWARD_WITH_ROLL,
 }
-"""Pose types, and motions that may override them: "translation" for those without rotation, "standard-rows" for
-standard stereo of perspective views, "forward-roll" for forward motion, each with what the fixed solver takes as known
-left to be estimated."""
+"""Pose types, and motions that may override them: "translation" has no rotation; "standard-rows" estimates the relation
+of the rows that standard stereo takes as known, "forward-roll" the roll of forward motion."""
 
 
 def fundamental_for(pose_type: str, *, motion: str | None = None) -> FundamentalSolver:

@@ -16,9 +16,13 @@ Hajder, "Affine Correspondences in Stereo Vision", estimation of F from points a
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
+from rigkit.core.matches import Matches
+from rigkit.relative_pose.solvers.weights import RowWeights
 
 PLANAR_ENTRIES = (1, 3, 5, 7)
 """Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]. Of a rotation by
@@ -37,6 +41,37 @@ def affinity_rows(
     first = rays2[..., None, :, None] * np.swapaxes(jacobians1, -1, -2)[..., :, None, :]
     second = np.swapaxes(jacobians2 @ A21, -1, -2)[..., :, :, None] * rays1[..., None, None, :]
     return np.asarray((first + second).reshape(*rays1.shape[:-1], 2, 9))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LinearRows:
+    """The rows of N matches on K unknowns; the weights come later.
+
+    Attributes
+    ----------
+    points, affinities : (N, K), and (N, 2, K) or None where there are no affinities.
+    """
+
+    points: FloatArray
+    affinities: FloatArray | None
+
+    @classmethod
+    def of(cls, m: Matches, family: FloatArray) -> LinearRows:
+        """Return the rows of matches on the unknowns x of vec(E) = x `family`, `family` (K, 9)."""
+        points, affinities = point_rows(m.rays1, m.rays2) @ family.T, None
+        if m.A21 is not None:
+            rows = affinity_rows(m.rays1, m.rays2, m.jacobians1, m.jacobians2, np.nan_to_num(m.A21))
+            affinities = rows @ family.T
+        return cls(points, affinities)
+
+    def weighted(self, weights: RowWeights) -> FloatArray:
+        """Return the rows that count (M, K), multiplied by their weights."""
+        use, also = weights.points > 0.0, weights.affinities > 0.0
+        rows = self.points[use] * weights.points[use, None]
+        if self.affinities is None or not also.any():
+            return rows
+        more = self.affinities[also] * weights.affinities[also, None, None]
+        return np.concatenate([rows, more.reshape(-1, rows.shape[1])])
 
 
 def essential_from_planar(e: FloatArray) -> FloatArray:

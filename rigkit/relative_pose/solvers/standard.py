@@ -3,7 +3,7 @@
 F = [[0, 0, 0], [0, 0, a], [0, b, c]]: the vertical coordinates of the normalised images obey a y2 + b y1 + c = 0. The
 rows on (a, b, c) are [y2, y1, 1] of a point and [a3, 0, 0], [a4, 1, 0] of an affinity A = [[a1, a2], [a3, a4]]: two
 degrees of freedom. For any central camera the affinity's rows are [g2 A, g1, 0] with g = d y / d pixel. Where the
-cameras are known nothing is left to estimate: `fixed.FixedSolver`.
+cameras are known nothing is left to estimate: `family.STANDARD`.
 
 Reference: L. Hajder, "Affine Correspondences in Stereo Vision", standard stereo.
 """

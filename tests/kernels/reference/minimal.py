@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, Mat3
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.relative_pose.solvers.eight_point import essential_nearest
-from rigkit.relative_pose.solvers.minimal import REAL, _null_space, _unit
+
+REAL = 1e-8
+"""An eigenvalue with a larger imaginary part (relative) is complex."""
 
 _CUBIC = ("300", "210", "201", "120", "111", "102", "030", "021", "012", "003")
 _LOWER = ("200", "110", "101", "020", "011", "002", "100", "010", "001", "000")
@@ -73,3 +75,15 @@ def _constraint_coefficients(basis: FloatArray, degrees: FloatArray) -> FloatArr
     cubic = (2.0 * EEt @ E - trace * E).reshape(*E.shape[:2], 9)
     values = np.concatenate([cubic, np.linalg.det(E)[..., None]], axis=2)
     return np.asarray(np.einsum("mp,bpc->bcm", np.linalg.pinv(monomials), values))
+
+
+def _null_space(rows: FloatArray, dimension: int) -> FloatArray:
+    """Return an orthonormal basis (B, dimension, 3, 3) of what the rows (B, 9 - dimension, 9) leave."""
+    vt = np.linalg.svd(rows, full_matrices=True)[2]
+    return np.asarray(vt[:, 9 - dimension :].reshape(-1, dimension, 3, 3))
+
+
+def _unit(matrices: Mat3, real: BoolArray) -> Mat3:
+    size: FloatArray = np.sqrt(np.sum(matrices**2, axis=(-2, -1), keepdims=True))
+    real = real & (size.reshape(real.shape) > 0.0)
+    return np.asarray(np.where(real[..., None, None], matrices / np.where(size > 0.0, size, 1.0), np.nan))
