@@ -1,7 +1,7 @@
 """The table of truth: rigkit and its peers on real captures of which somebody measured something.
 
     python scripts/bench_truth.py [SET ...] [--data DIR] [--work DIR] [--model MODEL] [--json FILE]
-        [--page datasets/public/README.md] [--short docs/pages/accuracy.md]
+        [--page datasets/public/README.md] [--short docs/pages/accuracy-truth.md]
 
 rigkit runs with its defaults on all sets (model and board's shape chosen by itself). OpenCV, mrcal (Debian: apt-get
 install mrcal python3-mrcal) and COLMAP (pycolmap) get the corners that rigkit kept, so that calibrations are compared

@@ -20,6 +20,8 @@ MADE_BY_THE_BUILD = ("made/", "api.md", "code.md", "keys.md")
 BLOCK = re.compile(r"^( *)```(console|python)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
 NEEDS = re.compile(r"<!-- with: ([a-z ]+) -->")
 LINK = re.compile(r"\]\(([^)\s]+)\)")
+INCLUDED = re.compile(r'^--8<-- "(?!made/)(.+)"$', re.MULTILINE)
+FIGURE = re.compile(r"\d+(?:[.,]\d+)*")
 
 
 def set_up(needs: str, folder: Path, images: Path) -> None:
@@ -65,7 +67,8 @@ def test_a_page_does_what_it_says(
 
 def test_every_link_leads_somewhere() -> None:
     for path in [*PAGES.glob("*.md"), REPOSITORY / "README.md"]:
-        text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+        text = INCLUDED.sub(lambda found: (REPOSITORY / found[1]).read_text(encoding="utf-8"), path.read_text("utf-8"))
+        text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
         for target in LINK.findall(text):
             if target.startswith(("http", "#", *MADE_BY_THE_BUILD)):
                 continue
@@ -75,3 +78,25 @@ def test_every_link_leads_somewhere() -> None:
             if anchor:
                 heads = re.findall(r"^#+ (.*)$", there.read_text(encoding="utf-8"), flags=re.MULTILINE)
                 assert anchor in {re.sub(r"[^a-z0-9 -]", "", h.lower()).replace(" ", "-") for h in heads}, target
+
+
+def figures(text: str) -> set[str]:
+    return set(FIGURE.findall(text))
+
+
+def test_figures_of_summaries_stand_on_the_pages_that_say_how_they_were_measured() -> None:
+    """The overview's tables on the pages that their section links to, README's evidence on any of them."""
+    overview = (PAGES / "accuracy.md").read_text(encoding="utf-8")
+    evidence = (REPOSITORY / "README.md").read_text(encoding="utf-8").partition("## Evidence")[2].partition("\n## ")[0]
+    homes = [*PAGES.glob("accuracy-*.md"), PAGES / "speed.md"]
+    summaries = [(evidence, homes)]
+    for section in overview.split("\n## ")[1:]:
+        pages = [PAGES / target for target in LINK.findall(section) if target.endswith(".md")]
+        summaries.append((section, pages))
+    checked = 0
+    for text, pages in summaries:
+        known = figures("\n".join(page.read_text(encoding="utf-8") for page in pages))
+        for row in re.findall(r"^\|.*\d.*\|$", text, re.MULTILINE):
+            assert figures(LINK.sub("", row)) <= known, f"{figures(row) - known} of: {row}"
+            checked += 1
+    assert checked > 30
