@@ -3,60 +3,79 @@
 ::
 
     schema = "rigkit.board/1"
-    type = "chessboard"      # optional: of `rigkit.core.patterns.registry`; by default chessboard, with markers charuco
-    columns = 9              # inner corners; of an AprilGrid, tags
+    type = "charuco"             # of `rigkit.core.patterns.registry`; by default chessboard, with a dictionary charuco
+    columns = 9                  # inner corners; of an AprilGrid, tags
     rows = 6
-    square_mm = 30.0         # or square_x_mm and square_y_mm; of an AprilGrid tag_mm
-    square_sigma_mm = 0.05   # optional: how well it was measured
-    id = "a9x6_30"           # optional: by default the file's name
-    printed_x_mm = 30.0      # optional, both: squares as laid out for printing, which `rigkit board` notes when the
-    printed_y_mm = 30.0      # measured print goes into the file
+    square_mm = 30.0             # or square_x_mm and square_y_mm; of an AprilGrid tag_mm
+    dictionary = "DICT_5X5_100"  # further keys are those of the type
+    marker_mm = 22.0
 
-What else there is depends on the type. A ChArUco board::
-
-    dictionary = "DICT_5X5_100"  # of its markers, by the name in OpenCV
-    marker_mm = 22.0             # side of a marker with its black border
-    first_marker = 0             # optional: number of the first marker
-    legacy_pattern = false       # optional: true for boards drawn by OpenCV before 4.6
-    inverted = false             # optional: true where black and white are exchanged
-
-An AprilGrid::
-
-    type = "aprilgrid"
-    columns = 6                  # tags
-    rows = 6
-    tag_mm = 88.0                # side of a tag with its black border; tag_x_mm, tag_y_mm, tag_sigma_mm likewise
-    spacing = 0.3                # from tag to tag, in sides of a tag
-    family = "tag36h11"          # optional, and so are:
-    border = 2                   # modules of the black border: Kalibr's 2, OpenCV's 1
-    first_tag = 0
-    numbering = "kalibr"         # rows of tags from the bottom; "opencv": from the top
-    corner_squares = true        # small black squares between the tags, as Kalibr prints them
+`BOARD_KEYS` has every key with its meaning, and `rigkit schema board --keys` prints them.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError
-from rigkit.core.patterns.base import Key, Pattern, Value
+from rigkit.core.patterns.base import Pattern, Value
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.core.patterns.registry import PATTERNS, pattern_type
+from rigkit.core.patterns.registry import PATTERNS
 from rigkit.io.foreign_boards import foreign_board
-from rigkit.io.json_reader import real, whole
-from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.io.schema_words import COUNT, NAME, PLAIN_KINDS, POSITIVE, Schema, choice, file, obj, optional, said
+from rigkit.io.toml_reader import TomlTable, read_toml, toml_text
 
 BOARD_SCHEMA = "rigkit.board/1"
 MAX_CORNERS = 1000
 """Along one side: no image resolves more."""
-BOTH_PRINTED = "printed_x_mm = 30.0 and printed_y_mm = 30.0"
+PRINTED = ("printed_x_mm", "printed_y_mm")
 SQUARES_MM = (0.1, 5000.0)
 """Sizes outside are slips of the unit, 0.03 for 0.03 m."""
+
+
+def _pattern_keys() -> dict[str, Schema]:
+    """Return the keys of all patterns, each with the hint that its pattern gives."""
+    out: dict[str, Schema] = {}
+    for name, pattern in PATTERNS.items():
+        for key in pattern.keys:
+            kind = POSITIVE if key.kind is float else PLAIN_KINDS[key.kind]
+            known = out.get(key.name, {}).get("description", "")
+            out[key.name] = said(kind, f"{known}{'; ' if known else ''}{name}: {key.hint}")
+    return out
+
+
+def _sizes() -> dict[str, Schema]:
+    what = {"square": "side of a square", "tag": "AprilGrid: side of a tag with its border"}
+    out: dict[str, Schema] = {}
+    for word in dict.fromkeys(pattern.size_word for pattern in PATTERNS.values()):
+        side = what.get(word, f"{word} between the centres of two circles")
+        out[f"{word}_mm?"] = said(POSITIVE, f"{side}, as measured over many of them", 30.0)
+        out[f"{word}_x_mm?"] = said(POSITIVE, f"{side} along x, where the two differ", 30.0)
+        out[f"{word}_y_mm?"] = said(POSITIVE, f"{side} along y", 30.0)
+        out[f"{word}_sigma_mm?"] = said(POSITIVE, "how well it was measured: goes into every length", 0.05)
+    return out
+
+
+BOARD_KEYS: Mapping[str, Schema] = {
+    "type?": said(choice(*PATTERNS), "what is printed; by default chessboard, with a dictionary charuco"),
+    "columns": said(COUNT, "inner corners along x; of an AprilGrid tags, of a circle grid circles", 9),
+    "rows": said(COUNT, "the same along y", 6),
+    **_sizes(),
+    "printed_x_mm?": said(
+        POSITIVE, "squares as laid out for printing, which rigkit board notes; with printed_y_mm", 30.0
+    ),
+    "printed_y_mm?": said(POSITIVE, "the same along y", 30.0),
+    **optional(_pattern_keys()),
+}
+BOARD_FILE = file(
+    BOARD_SCHEMA,
+    "A board as a person measured it",
+    {"id?": said(NAME, "its name; by default the file's"), **BOARD_KEYS},
+)
+DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board files")
 
 
 def load_board(path: str | Path) -> Board:
@@ -66,11 +85,7 @@ def load_board(path: str | Path) -> Board:
 
     Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
     """
-    values = foreign_board(path)
-    table = read_toml(path, BOARD_SCHEMA) if values is None else TomlTable(values, Path(path))
-    board = board_from_table(table, Path(path).stem)
-    table.done()
-    return board
+    return measured_board(_table_of(path), Path(path).stem)
 
 
 def load_layout(path: str | Path) -> Board:
@@ -78,73 +93,64 @@ def load_layout(path: str | Path) -> Board:
 
     Raises InputError like `load_board`.
     """
-    board = load_board(path)
-    printed = _printed(read_toml(path, BOARD_SCHEMA)) if foreign_board(path) is None else None
-    return board if printed is None else board.with_squares(*printed)
+    table = _table_of(path)
+    board = measured_board(table, Path(path).stem)
+    return board.with_squares(*(table[key] for key in PRINTED)) if PRINTED[0] in table else board
 
 
-def _printed(table: TomlTable) -> tuple[float, float] | None:
-    """Return the sides of the squares as laid out for printing where the file has them."""
-    if not (table.has("printed_x_mm") or table.has("printed_y_mm")):
-        return None
-    return table.number("printed_x_mm", hint=BOTH_PRINTED), table.number("printed_y_mm", hint=BOTH_PRINTED)
+def _table_of(path: str | Path) -> TomlTable:
+    foreign = foreign_board(path)
+    return read_toml(path, BOARD_FILE) if foreign is None else TomlTable(foreign, DECLARED_BOARD, Path(path))
 
 
-def board_from_table(table: TomlTable, default_id: str) -> Board:
-    """Return the board that a table of any file describes by the keys above; the caller calls `table.done()`."""
-    board_id = table.identifier("id", hint='id = "plane1"') if table.has("id") else default_id
-    kind = _type_of(table)
-    columns = table.integer("columns", hint=f"columns = 9 ({kind.count_word} along x)", at_least=1)
-    rows = table.integer("rows", hint=f"rows = 6 ({kind.count_word} along y)", at_least=1)
-    for key, count in (("columns", columns), ("rows", rows)):
+def measured_board(table: TomlTable, default_id: str) -> Board:
+    """Return the board that a person described by the keys above in a table of any file, as `board_from_table`.
+
+    Raises InputError also for sizes that nobody prints, and a pattern that cannot be printed.
+    """
+    board = board_from_table(table, default_id)
+    word, per = board.pattern.size_word, board.pattern.points_per_count
+    for key, count in (("columns", board.columns // per), ("rows", board.rows // per)):
         if count > MAX_CORNERS:
-            raise table.error(
-                f"'{key}' is {count}, more than {MAX_CORNERS}; count the {kind.count_word} along one side"
-            )
-    word = kind.size_word
-    if table.has(f"{word}_x_mm") or table.has(f"{word}_y_mm"):
-        both = f"{word}_x_mm = 30.0 and {word}_y_mm = 30.0"
-        if table.has(f"{word}_mm"):
-            raise table.error(f"'{word}_mm' together with '{word}_x_mm' or '{word}_y_mm'; keep one of the two forms")
-        x, y = table.number(f"{word}_x_mm", hint=both), table.number(f"{word}_y_mm", hint=both)
-    else:
-        x = y = table.number(f"{word}_mm", hint=f"{word}_mm = 30.0 (measured with a ruler over many {word}s)")
-    for side in (x, y, *(_printed(table) or ())):
+            words = board.pattern.count_word
+            raise table.error(f"'{key}' is {count}, more than {MAX_CORNERS}; count the {words} along one side")
+    for side in (*board.squares_mm, *(table[key] for key in PRINTED if any(key in table for key in PRINTED))):
         if not SQUARES_MM[0] <= side <= SQUARES_MM[1]:
             raise table.error(f"{word}s of {side:g} mm are outside {SQUARES_MM[0]:g} to {SQUARES_MM[1]:g} mm; write mm")
-    sigma = None
-    if table.has(f"{word}_sigma_mm"):
-        sigma = table.number(f"{word}_sigma_mm", hint=f"{word}_sigma_mm = 0.05")
-    try:
-        values = {key.name: _value(table, key) for key in kind.keys if key.required or table.has(key.name)}
-        pattern = kind.from_keys(values)
-        per = pattern.points_per_count
-        board = Board(board_id, per * columns, per * rows, x, y, square_sigma_mm=sigma, pattern=pattern)
+    with table.located("; correct the board"):
         board.ink()
-    except InputError as error:
-        raise error if str(table.path) in str(error) else table.error(f"{error}; correct the board") from error
     return board
 
 
+def board_from_table(table: TomlTable, default_id: str) -> Board:
+    """Return the board of a table with the keys above, such as `board_values` writes them."""
+    kind = _type_of(table)
+    word = kind.size_word
+    sizes = [f"{word}{end}_mm" for end in ("", "_x", "_y", "_sigma")]
+    table.allow_only(["schema", "id", "type", "columns", "rows", *PRINTED, *sizes, *(key.name for key in kind.keys)])
+    columns, rows = table["columns"], table["rows"]
+    if sizes[0] in table and (sizes[1] in table or sizes[2] in table):
+        raise table.error(f"'{word}_mm' together with '{word}_x_mm' or '{word}_y_mm'; keep one of the two forms")
+    x, y = (table[key] for key in (sizes[1:3] if sizes[1] in table or sizes[2] in table else (sizes[0],) * 2))
+    for key in kind.keys:
+        if key.required and key.name not in table:
+            raise table.error(f"'{key.name}' is missing; add {key.hint}")
+    with table.located("; correct the board"):
+        pattern = kind.from_keys({key.name: table[key.name] for key in kind.keys if key.name in table})
+        per, sigma = pattern.points_per_count, table.get(sizes[3])
+        name = table.get("id", default_id)
+        return Board(name, per * columns, per * rows, x, y, square_sigma_mm=sigma, pattern=pattern)
+
+
 def _type_of(table: TomlTable) -> type[Pattern]:
-    if table.has("type"):
-        return PATTERNS[table.text("type", hint='type = "chessboard"', choices=tuple(PATTERNS))]
-    if table.has("dictionary"):
+    if "type" in table:
+        return PATTERNS[table["type"]]
+    if "dictionary" in table:
         return Charuco
     for key in Charuco.keys:
-        if table.has(key.name):
+        if key.name in table:
             raise table.error(f"'{key.name}' without 'dictionary'; add dictionary = \"DICT_5X5_100\", or remove it")
     return Chessboard
-
-
-def _value(table: TomlTable, key: Key) -> Value:
-    if key.kind is bool:
-        return table.boolean(key.name, hint=key.hint)
-    if key.kind is int:
-        return table.integer(key.name, hint=key.hint)
-    if key.kind is float:
-        return table.number(key.name, hint=key.hint)
-    return table.text(key.name, hint=key.hint)
 
 
 def board_values(board: Board) -> dict[str, Value]:
@@ -159,22 +165,8 @@ def board_values(board: Board) -> dict[str, Value]:
 
 
 def board_of_values(values: Mapping[str, Any], board_id: str) -> Board:
-    """Return the board of `board_values`; raises InputError, KeyError, TypeError or ValueError for others."""
-    kind = pattern_type(str(values["type"]))
-    given = {key.name: values[key.name] for key in kind.keys if key.name in values}
-    known = {"type", "columns", "rows", *given, *(f"{kind.size_word}_{end}_mm" for end in ("x", "y", "sigma"))}
-    if unknown := sorted(set(values) - known):
-        raise InputError(f"a board of type {kind.type} has no {', '.join(unknown)}")
-    for key in kind.keys:
-        if key.name in given and key.kind is not float and type(given[key.name]) is not key.kind:
-            raise TypeError(f"'{key.name}' is {given[key.name]!r}, not {key.kind.__name__}")
-        if key.name in given and key.kind is float:
-            given[key.name] = real(given[key.name])
-    pattern = kind.from_keys(given)
-    columns, rows = (pattern.points_per_count * whole(values[name]) for name in ("columns", "rows"))
-    x, y = (real(values[f"{kind.size_word}_{axis}_mm"]) for axis in "xy")
-    sigma = values.get(f"{kind.size_word}_sigma_mm")
-    return Board(board_id, columns, rows, x, y, square_sigma_mm=None if sigma is None else real(sigma), pattern=pattern)
+    """Return the board of `board_values`; raises InputError for others."""
+    return board_from_table(TomlTable(values, DECLARED_BOARD, Path(f"board '{board_id}'")), board_id)
 
 
 def board_text(board: Board, comment: str, path: Path, *, layout: Board | None = None) -> str:
@@ -185,7 +177,7 @@ def board_text(board: Board, comment: str, path: Path, *, layout: Board | None =
     lines += [] if isinstance(pattern, Chessboard) else [f'type = "{pattern.type}"']
     lines += [f"columns = {board.columns // per}", f"rows = {board.rows // per}"]
     if board.board_id != path.stem:
-        lines.append(f"id = {_written(board.board_id)}")
+        lines.append(f"id = {toml_text(board.board_id)}")
     lines += [f"{word}_x_mm = {board.square_x_mm:.6g}", f"{word}_y_mm = {board.square_y_mm:.6g}"]
     if layout is not None:
         lines += [f"printed_x_mm = {layout.square_x_mm:.6g}", f"printed_y_mm = {layout.square_y_mm:.6g}"]
@@ -196,4 +188,4 @@ def board_text(board: Board, comment: str, path: Path, *, layout: Board | None =
 
 
 def _written(value: Value) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+    return f"{value:.6g}" if isinstance(value, float) else toml_text(value)

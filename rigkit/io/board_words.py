@@ -11,7 +11,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS, pattern_type
-from rigkit.io.board_file import board_from_table, load_board
+from rigkit.io.board_file import DECLARED_BOARD, load_board, measured_board
 from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
 from rigkit.io.reading import usable_path
 from rigkit.io.toml_reader import TomlTable
@@ -50,10 +50,7 @@ def board_in_words(words: str) -> Board | None:
     name = "-".join(
         filter(None, (match["type"] or "board", f"{match['columns']}x{match['rows']}x{float(match['mm']):g}"))
     )
-    table = TomlTable(values, Path(f"board '{words}'"))
-    board = board_from_table(table, name)
-    table.done()
-    return board
+    return measured_board(TomlTable(values, DECLARED_BOARD, Path(f"board '{words}'")), name)
 
 
 def board_of_words(words: str) -> Board:

@@ -14,15 +14,101 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.board_file import board_from_table, load_board
+from rigkit.io.board_file import BOARD_KEYS, load_board, measured_board
 from rigkit.io.reading import usable_path
+from rigkit.io.schema_words import (
+    NAME,
+    NUMBER,
+    TEXT,
+    Schema,
+    choice,
+    file,
+    obj,
+    optional,
+    row,
+    rows,
+    said,
+    table,
+    texts,
+)
 from rigkit.io.session import SESSION_NAME, files_of_session
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_csv import load_truth_csv
-from rigkit.io.truth_file import truth_from_table
+from rigkit.io.truth_file import TRUTH_KEYS, measured, truth_from_table
 
 DATASET_SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"
+_DOWN = [0.0, 0.98, 0.17]
+_LEVEL: Schema = {
+    **obj(
+        {
+            "sigma_deg?": said({**NUMBER, "minimum": 0}, "how well it held; 0 means exactly level", 0.2),
+            "down1?": said(row(3), "which way is down in camera 1, for planar motion", _DOWN),
+            "down2?": said(row(3), "the same in camera 2", _DOWN),
+        },
+        "the spirit level; by default a carefully set one",
+    ),
+    "examples": [{"sigma_deg": 0.2}],
+    "dependentRequired": {"down1": ["down2"], "down2": ["down1"]},
+}
+_PAIR_KEYS: Mapping[str, Schema] = {
+    "id": said(NAME, "its name", "left-right"),
+    "camera1": said(TEXT, "that took image1", "left"),
+    "camera2": said(TEXT, "that took image2", "right"),
+    "image1": said(TEXT, "file", "images/view1.jpg"),
+    "image2": said(TEXT, "file", "images/view2.jpg"),
+    "boards": said(texts(1), "those that stand there", ["plane1", "plane2"]),
+    "pose_type": said(
+        choice(*map(str, PoseType)),
+        "general; planar: turned about the vertical, moved in the horizontal plane; standard: moved along x; forward: "
+        "along z; auto: the images say",
+    ),
+    "level?": _LEVEL,
+    "layout?": said(
+        table(choice(*BOARD_SIDES)),
+        "where boards that look alike stand, from camera 1",
+        {"plane1": "left", "plane2": "floor", "plane3": "right"},
+    ),
+    "planes?": said(choice(*PLANE_CHOICES), "of this pair, where it differs"),
+    "truth?": obj(
+        {"baseline?": obj(measured("mm"), "distance of the two lenses"), **TRUTH_KEYS}, "what a person measured"
+    ),
+}
+DATASET_FILE = file(
+    DATASET_SCHEMA,
+    "Pairs of images, and what a person measured of them",
+    {
+        "name": said(NAME, "of the data set", "my-lab"),
+        "boards": rows(
+            {
+                "id": said(NAME, "its name", "plane1"),
+                "file?": said(TEXT, "of the board, or its keys here", "board.toml"),
+                **optional(BOARD_KEYS),
+            },
+            "the boards that stand there",
+            least=1,
+        ),
+        "cameras": rows(
+            {
+                "id": said(NAME, "its name", "left"),
+                "calibration": said(TEXT, "its file", "calibration.json"),
+                "session?": said(
+                    TEXT, "to calibrate it from; by default session.toml beside the calibration", SESSION_NAME
+                ),
+            },
+            "the cameras; one that was moved is one",
+            least=1,
+        ),
+        "pairs": rows(_PAIR_KEYS, "two images of the same boards each", least=1),
+        "images?": said(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
+        "planes?": said(
+            choice(*PLANE_CHOICES),
+            "what planes, angles and clouds are built on: each point by itself (free, the default), the points of a "
+            "board in one plane, or on its known lattice",
+        ),
+        "truth_table?": said(TEXT, "a CSV file with what was measured, kept in a spreadsheet", "truth.csv"),
+    },
+)
 
 Entry = TypeVar("Entry")
 
@@ -145,31 +231,27 @@ def load_dataset(path: str | Path) -> Dataset:
         what = f"folder '{given}' has no {MANIFEST}" if given.is_dir() else f"data set '{given}' does not exist"
         raise InputError(f"{what}; write one, or let `rigkit init` start it")
     source = source.resolve()
-    top = read_toml(source, DATASET_SCHEMA)
-    name = top.identifier("name", hint='name = "my-lab"')
-    images = top.text("images", hint='images = "real"', choices=("real", "rendered")) if top.has("images") else None
-    boards = tuple(_board(t) for t in top.tables("boards", hint='[[boards]] with id = "plane1" and file or sizes'))
-    cameras = tuple(_camera(t) for t in top.tables("cameras", hint='[[cameras]] with id = "left" and calibration'))
-    _refuse_twice(top, "boards", [b.board_id for b in boards])
-    _refuse_twice(top, "cameras", [c.camera_id for c in cameras])
-    planes = _planes(top) if top.has("planes") else "free"
-    pairs = tuple(_pair(t, boards, cameras, planes) for t in top.tables("pairs", hint='[[pairs]] with id = "first"'))
-    _refuse_twice(top, "pairs", [p.pair_id for p in pairs])
-    if top.has("truth_table"):
+    top = read_toml(source, DATASET_FILE)
+    for what in ("boards", "cameras", "pairs"):
+        names = [entry["id"] for entry in top[what]]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise top.error(f"[[{what}]]: '{twice[0]}' is declared twice; give every one its own id")
+    boards = tuple(map(_board, top["boards"]))
+    cameras = tuple(map(_camera, top["cameras"]))
+    pairs = tuple(_pair(entry, boards, cameras, top.get("planes", "free")) for entry in top["pairs"])
+    if "truth_table" in top:
         pairs = _with_table(top, pairs)
-    top.done()
-    named = [table.path_to("file", hint="") for table in top.tables("boards", hint="") if table.has("file")]
-    if top.has("truth_table"):
-        named.append(top.path_to("truth_table", hint=""))
     return Dataset(
-        name=name,
+        name=top["name"],
         root=source.parent,
         manifest=source,
         boards=boards,
         cameras=cameras,
         pairs=pairs,
-        sources=tuple(named),
-        images=images,
+        sources=tuple(
+            t.beside(t[key]) for t, key in (*((b, "file") for b in top["boards"]), (top, "truth_table")) if key in t
+        ),
+        images=top.get("images"),
     )
 
 
@@ -181,117 +263,74 @@ def _files_of(session: Path) -> tuple[Path, ...]:
         return (session,)
 
 
-def _board(table: TomlTable) -> Board:
-    board_id = table.identifier("id", hint='id = "plane1"')
-    if table.has("file"):
-        path = table.path_to("file", hint='file = "board.toml"')
-        with table.located():
-            board = replace(load_board(path), board_id=board_id)
-    else:
-        board = board_from_table(table, board_id)
-    table.done()
-    return board
+def _board(entry: TomlTable) -> Board:
+    if "file" not in entry:
+        return measured_board(entry, entry["id"])
+    entry.allow_only(("id", "file"))
+    with entry.located():
+        return replace(load_board(entry.beside(entry["file"])), board_id=entry["id"])
 
 
-def _camera(table: TomlTable) -> CameraEntry:
-    camera_id = table.identifier("id", hint='id = "left"')
-    calibration = table.path_to("calibration", hint='calibration = "calibration.json"')
+def _camera(entry: TomlTable) -> CameraEntry:
+    calibration = entry.beside(entry["calibration"])
     session: Path | None = calibration.with_name(SESSION_NAME)
-    if table.has("session"):
-        session = table.path_to("session", hint='session = "session.toml"')
+    if "session" in entry:
+        session = entry.beside(entry["session"])
         if not session.is_file():
-            raise table.error(f"session '{session}' does not exist; correct the path")
+            raise entry.error(f"session '{session}' does not exist; correct the path")
     elif session is not None and not session.is_file():
         session = None
     if session is None and not calibration.is_file():
-        raise table.error(
+        raise entry.error(
             f"calibration '{calibration}' does not exist, nor a {SESSION_NAME} beside it to calibrate from; correct "
             "the path"
         )
-    table.done()
-    return CameraEntry(camera_id, calibration, session)
+    return CameraEntry(entry["id"], calibration, session)
 
 
-def _planes(table: TomlTable) -> Planes:
-    given = table.text("planes", hint='planes = "coplanar"', choices=PLANE_CHOICES)
-    return next(choice for choice in PLANE_CHOICES if choice == given)
-
-
-def _pair(table: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry], default_planes: Planes) -> Pair:
-    pair_id = table.identifier("id", hint='id = "left-right"')
-    by_camera = {c.camera_id: c for c in cameras}
-    by_board = {b.board_id: b for b in boards}
-    place = f"{table.path}: {table.where}"
-    camera1, camera2 = (
-        _named(table.text(key, hint=f'{key} = "{cameras[0].camera_id}"'), by_camera, f"{place}: {key}")
-        for key in ("camera1", "camera2")
-    )
-    image1 = table.path_to("image1", hint='image1 = "images/view1.jpg"')
-    image2 = table.path_to("image2", hint='image2 = "images/view2.jpg"')
-    kinds = [str(kind) for kind in PoseType]
-    pose_type = PoseType(table.text("pose_type", hint=f'pose_type = "general" ({", ".join(kinds)})', choices=kinds))
-    names = table.texts("boards", hint="boards = [" + ", ".join(f'"{b}"' for b in by_board) + "]")
-    if not names:
-        raise table.error("'boards' is empty; name the boards that stand in this pair")
-    chosen = tuple(_named(n, by_board, f"{place}: board") for n in names)
-    level, down = _level(table, pose_type) if table.has("level") else (None, None)
-    truth = PairTruth()
-    if table.has("truth"):
-        truth = truth_from_table(table.table("truth", hint="[pairs.truth]"), chosen)
-    layout = _layout(table, names) if table.has("layout") else {}
-    planes = _planes(table) if table.has("planes") else default_planes
-    table.done()
+def _pair(entry: TomlTable, boards: Sequence[Board], cameras: Sequence[CameraEntry], default_planes: Planes) -> Pair:
+    by_camera, by_board = {c.camera_id: c for c in cameras}, {b.board_id: b for b in boards}
+    place = f"{entry.path}: {entry.where}"
+    camera1, camera2 = (_named(entry[key], by_camera, f"{place}: {key}") for key in ("camera1", "camera2"))
+    pose_type = PoseType(entry["pose_type"])
+    chosen = tuple(_named(name, by_board, f"{place}: board") for name in entry["boards"])
+    layout = dict(entry.get("layout", {}))
+    for board_id in layout:
+        _named(board_id, dict.fromkeys(entry["boards"], 0), f"{place}, 'layout': board")
+    level, down = _level(entry["level"], pose_type) if "level" in entry else (None, None)
     return Pair(
-        pair_id=pair_id,
+        pair_id=entry["id"],
         camera1=camera1,
         camera2=camera2,
-        image1=image1,
-        image2=image2,
+        image1=entry.beside(entry["image1"]),
+        image2=entry.beside(entry["image2"]),
         pose_type=pose_type,
         level_sigma_deg=level,
         boards=chosen,
-        truth=truth,
+        truth=truth_from_table(entry.get("truth", {}), chosen),
         layout=layout,
-        planes=planes,
+        planes=entry.get("planes", default_planes),
         down=down,
     )
 
 
 def _level(
-    table: TomlTable, pose_type: PoseType
+    level: TomlTable, pose_type: PoseType
 ) -> tuple[float | None, tuple[tuple[float, ...], tuple[float, ...]] | None]:
     """Return how well the level held, and which way is down in either camera where that was said."""
-    inner = table.table("level", hint="level = { sigma_deg = 0.2 }")
-    has_down = [inner.has(key) for key in ("down1", "down2")]
-    sigma, down = None, None
-    if inner.has("sigma_deg") or not any(has_down):
-        sigma = inner.number("sigma_deg", hint="sigma_deg = 0.2", positive=False)
-        if sigma < 0.0:
-            raise inner.error(f"'sigma_deg' must not be negative, got {sigma:g}; 0 means exactly level")
-    if any(has_down):
-        if pose_type is not PoseType.PLANAR:
-            raise inner.error(f"'down1' and 'down2' are for planar motion, not for '{pose_type}'; leave them out")
-        first, second = (inner.numbers(key, hint=f"{key} = [0.0, 0.98, 0.17]") for key in ("down1", "down2"))
-        for key, values in (("down1", first), ("down2", second)):
-            if len(values) != 3 or not any(values):
-                raise inner.error(f"'{key}' must be three numbers, not all zero, got {list(values)}")
-        down = (first, second)
-    inner.done()
-    return sigma, down
-
-
-def _layout(table: TomlTable, names: Sequence[str]) -> dict[str, str]:
-    inner = table.table("layout", hint='layout = { plane1 = "left", plane2 = "floor", plane3 = "right" }')
-    out = {}
-    for board_id in inner.names():
-        _named(board_id, dict.fromkeys(names, 0), f"{inner.path}: {inner.where}: board")
-        out[board_id] = inner.text(board_id, hint=f'{board_id} = "left"', choices=tuple(BOARD_SIDES))
-    return out
+    if "down1" not in level:
+        return level["sigma_deg"], None
+    if pose_type is not PoseType.PLANAR:
+        raise level.error(f"'down1' and 'down2' are for planar motion, not for '{pose_type}'; leave them out")
+    for key in ("down1", "down2"):
+        if not any(level[key]):
+            raise level.error(f"'{key}' must be three numbers, not all zero, got {list(level[key])}")
+    return level.get("sigma_deg"), (level["down1"], level["down2"])
 
 
 def _with_table(top: TomlTable, pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     """Add what a spreadsheet says to the pairs; a pair's truth is either there or in the manifest."""
-    source = top.path_to("truth_table", hint='truth_table = "truth.csv"')
+    source = top.beside(top["truth_table"])
     stated = load_truth_csv(source, {pair.pair_id: pair.boards for pair in pairs})
     for pair in pairs:
         if pair.truth.count and pair.pair_id in stated:
@@ -303,9 +342,3 @@ def _named(name: str, known: Mapping[str, Entry], where: str) -> Entry:
     if name not in known:
         raise InputError(f"{where} '{name}' is not declared; known: {', '.join(known)}")
     return known[name]
-
-
-def _refuse_twice(table: TomlTable, what: str, names: Sequence[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise table.error(f"[[{what}]]: '{name}' is declared twice; give every one its own id")

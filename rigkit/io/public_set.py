@@ -10,13 +10,7 @@
     licence = "CC-BY-4.0"
     folder = "public/bumblebee2"     # where its files are in a folder of captures
 
-    [[boards]]                       # as in a board's file, with an `id`
-    id = "board"
-    columns = 4
-    rows = 6
-    square_mm = 30.0
-
-    [[measured]]
+    [[measured]]                     # and [[boards]], as in a board's file
     id = "baseline"
     value = 120.0
     sigma = 0.1                      # optional: where nobody stated it, it is not there
@@ -26,27 +20,51 @@
     [files]                          # SHA-256 of each file
     "left01.jpg" = "..."
 
-    [urls]                           # whence to fetch them; a file without is not fetchable yet
-    "left01.jpg" = "https://..."
-    "left02.jpg" = "https://.../archive.tar.gz#folder/left02.jpg"      # in a .tar or .zip
+    [urls]                           # where to fetch them; a file without is not fetchable yet
+    "left01.jpg" = "https://.../archive.tar.gz#folder/left01.jpg"      # # names a file in a .tar or .zip
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.io.board_file import board_from_table
+from rigkit.io.board_file import BOARD_KEYS, measured_board
+from rigkit.io.schema_words import BOOLEAN, NAME, NUMBER, POSITIVE, TEXT, choice, file, rows, said, table
 from rigkit.io.toml_reader import TomlTable, read_toml
 
-PUBLIC_SCHEMA = "rigkit.public/1"
-MEASURED_UNITS = ("mm", "deg", "px")
-URL = re.compile(r"^(https?|file)://\S+$")
-SHA256 = re.compile(r"^[0-9a-f]{64}$")
+_HASH = "a SHA-256; write the 64 characters of 0-9 and a-f that `sha256sum` prints"
+PUBLIC_FILE = file(
+    "rigkit.public/1",
+    "A public capture, and what somebody measured of it",
+    {
+        "name": said(NAME, "of the set", "bumblebee2"),
+        "about": said(TEXT, "what it is", "11 stereo pairs of a chessboard"),
+        "source": said(TEXT, "where it comes from", "https://github.com/..."),
+        "licence": said(TEXT, "of its files", "CC-BY-4.0"),
+        "rendered": said(BOOLEAN, "images of a computer, not of a camera", False),
+        "folder": said(TEXT, "where its files are in a folder of captures", "public/bumblebee2"),
+        "boards?": rows({"id?": said(NAME, "its name", "board"), **BOARD_KEYS}, "boards in its images"),
+        "measured?": rows(
+            {
+                "id": said(TEXT, "what was measured", "baseline"),
+                "value": said(NUMBER, "how much", 120.0),
+                "sigma?": said(POSITIVE, "where somebody stated one", 0.1),
+                "unit": choice("mm", "deg", "px"),
+                "how": said(TEXT, "by what it was measured: steel rule, set square, calipers", "calipers"),
+            },
+            "what is known of it",
+        ),
+        "files": said(table(said({**TEXT, "pattern": "^[0-9a-f]{64}$"}, _HASH)), "SHA-256 of each file"),
+        "urls?": said(
+            table(said({**TEXT, "pattern": r"^(https?|file)://\S+$"}, "an address (https://...)")),
+            "where to fetch them; after # a file in a .tar or .zip",
+        ),
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,71 +118,31 @@ class PublicSet:
 def load_public_set(path: str | Path) -> PublicSet:
     """Return the description of a public capture; raises InputError for a missing or unknown key, a path that leaves
     the set, something that is no hash or address, or an address of a file that is not listed."""
-    table = read_toml(path, PUBLIC_SCHEMA)
-    boards: tuple[Board, ...] = ()
-    if table.has("boards"):
-        boards = tuple(_board(entry) for entry in table.tables("boards", hint="[[boards]] with id, columns, rows"))
-    measured: tuple[PublicMeasurement, ...] = ()
-    if table.has("measured"):
-        entries = table.tables("measured", hint="[[measured]] with id, value, unit and how")
-        measured = tuple(_measurement(entry) for entry in entries)
-    sha256 = _texts(table, "files", SHA256, "a SHA-256; write the 64 characters of 0-9 and a-f that `sha256sum` prints")
-    urls = _texts(table, "urls", URL, "an address (https://...)") if table.has("urls") else {}
+    top = read_toml(path, PUBLIC_FILE)
+    sha256, urls = ({_inside(top, f): value for f, value in top.get(key, {}).items()} for key in ("files", "urls"))
+    for key, listed in (("files", sha256), ("urls", urls)):
+        if key in top and not listed:
+            raise top.error(f"[{key}] is empty; list the files of the set")
     for name in urls:
         if name not in sha256:
-            raise table.error(f"[urls]: '{name}' is not in [files]; add its hash")
-    found = PublicSet(
+            raise top.error(f"[urls]: '{name}' is not in [files]; add its hash")
+    return PublicSet(
         path=Path(path),
-        name=table.identifier("name", hint='name = "bumblebee2"'),
-        about=table.text("about", hint='about = "11 stereo pairs of a chessboard"'),
-        source=table.text("source", hint='source = "https://github.com/..."'),
-        licence=table.text("licence", hint='licence = "CC-BY-4.0"'),
-        rendered=table.boolean("rendered", hint="rendered = false"),
-        folder=_inside(table, table.text("folder", hint='folder = "public/bumblebee2"')),
-        boards=boards,
-        measured=measured,
+        **{key: top[key] for key in ("name", "about", "source", "licence", "rendered")},
+        folder=_inside(top, top["folder"]),
+        boards=tuple(measured_board(entry, "board") for entry in top.get("boards", ())),
+        measured=tuple(
+            PublicMeasurement(entry["id"], entry["value"], entry.get("sigma"), entry["unit"], entry["how"])
+            for entry in top.get("measured", ())
+        ),
         sha256=sha256,
         urls=urls,
     )
-    table.done()
-    return found
 
 
-def _board(entry: TomlTable) -> Board:
-    board = board_from_table(entry, "board")
-    entry.done()
-    return board
-
-
-def _measurement(entry: TomlTable) -> PublicMeasurement:
-    sigma = entry.number("sigma", hint="sigma = 0.1") if entry.has("sigma") else None
-    found = PublicMeasurement(
-        entry.text("id", hint='id = "baseline"'),
-        entry.number("value", hint="value = 120.0", positive=False),
-        sigma,
-        entry.text("unit", hint='unit = "mm"', choices=MEASURED_UNITS),
-        entry.text("how", hint='how = "calipers"'),
-    )
-    entry.done()
-    return found
-
-
-def _texts(table: TomlTable, key: str, pattern: re.Pattern[str], kind: str) -> dict[str, str]:
-    """Return a table of texts by path in the set, each of the pattern."""
-    own = table.table(key, hint=f"[{key}]")
-    out = {}
-    for name in own.names():
-        out[_inside(own, name)] = value = own.text(name, hint=kind)
-        if not pattern.match(value):
-            raise own.error(f"'{name}' is '{value[:80]}', which is not {kind}")
-    if not out:
-        raise table.error(f"[{key}] is empty; list the files of the set")
-    return out
-
-
-def _inside(table: TomlTable, name: str) -> str:
+def _inside(top: TomlTable, name: str) -> str:
     """Return a path that stays in its folder."""
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name:
-        raise table.error(f"'{name}' leaves the folder of the set; give a path in it, with /")
+        raise top.error(f"'{name}' leaves the folder of the set; give a path in it, with /")
     return path.as_posix()

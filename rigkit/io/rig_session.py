@@ -3,34 +3,26 @@
 ::
 
     schema = "rigkit.session/1"
-    board = "board.toml"             # or boards = [...]
+    boards = ["left.toml", "floor.toml"]
     model = "brown"                  # of all cameras; a camera may have its own `model` and `degree`
-    frames = "number"                # optional: which images were taken at the same moment (below)
-    rig = "rig.json"                 # optional: cameras in this rig stay as they are, lens and mount; others are added
 
-    [[cameras]]
+    [[cameras]]                      # at least two
     id = "left"
     images = "left*.jpg"
-    calibration = "left.json"        # optional: this lens stays as it is; only its mount is found
 
-    [[cameras]]
-    id = "right"
-    images = "right*.jpg"
-
-    [[baselines]]                    # optional: what a person measured between two lenses
+    [[baselines]]                    # what a person measured between two lenses
     a = "left"
     b = "right"
     value_mm = 100.0
     sigma_mm = 1.0
     how = "steel rule"
 
-    [[rigid_boards]]                 # optional: boards that are mounted to each other
-    boards = ["left", "floor", "right"]
-    layout = { left = "left", floor = "floor", right = "right" }  # optional: which is which, of boards that look alike
-    angles = [ { a = "left", b = "floor", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]      # optional
-    distances = [ { a = "left.centre", b = "floor", value_mm = 150.0, sigma_mm = 1.0, how = "rule" } ]   # optional
+    [[rigid_boards]]                 # boards that are mounted to each other
+    boards = ["left", "floor"]
+    angles = [ { a = "left", b = "floor", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]
 
-A session of one camera with [[rigid_boards]] has `images` as ever.
+Every key, with its meaning, stands in `rigkit.io.session.SESSION_FILE`. A session of one
+camera with [[rigid_boards]] has `images` as ever.
 
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
 number at the end of that name ("number": left07 and right07), or the same place in the sorted list ("order"). Where
@@ -49,14 +41,10 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredLength, PairTruth
-from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.session import SESSION_SCHEMA, Session, beside_session, boards_of, images_of, options_of
+from rigkit.io.session import ONE_CAMERA_KEYS, SESSION_FILE, Session, beside_session, boards_of, images_of, options_of
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.io.truth_file import measured_value, truth_from_table
 
-FRAMES = ("name", "number", "order")
-HINT_ID = 'id = "left"'
-HINT_RIGID = 'boards = ["left", "floor", "right"]'
 ONE = "camera"
 """What the only camera of a session without [[cameras]] is called."""
 
@@ -112,8 +100,8 @@ class RigSession:
 
 def is_rig_session(path: str | Path) -> bool:
     """Say whether the session has several cameras or boards on one mount; raises InputError like `load_session`."""
-    table = read_toml(path, SESSION_SCHEMA)
-    return table.has("cameras") or table.has("rigid_boards")
+    table = read_toml(path, SESSION_FILE)
+    return "cameras" in table or "rigid_boards" in table
 
 
 def load_rig_session(path: str | Path) -> RigSession:
@@ -123,94 +111,61 @@ def load_rig_session(path: str | Path) -> RigSession:
     between cameras that are not there, and boards on a mount that are not listed or are on two.
     """
     source = Path(path)
-    table = read_toml(source, SESSION_SCHEMA)
+    table = read_toml(source, SESSION_FILE)
     boards = boards_of(table)
-    model, degree, shape = options_of(table)
+    options = options_of(table)
     rigid = _rigid_boards(table, boards)
-    if rigid and not table.has("cameras"):
-        one = Session(
-            path=source, images=images_of(table), boards=boards, model=model, degree=degree, board_shape=shape
-        )
-        table.done()
+    if rigid and "cameras" not in table:
+        table.allow_only((*ONE_CAMERA_KEYS, "rigid_boards"))
+        one = Session(path=source, images=images_of(table), boards=boards, **options)
         return RigSession(path=source, cameras={ONE: one}, frames=None, baselines=(), rigid_boards=rigid)
-    if table.has("images"):
+    if "images" in table:
         raise table.error("'images' together with [[cameras]]; give every camera its own images")
-    frames = None
-    if table.has("frames"):
-        frames = table.text("frames", hint='frames = "number"', choices=FRAMES)
-    known_rig = table.path_to("rig", hint='rig = "rig.json"') if table.has("rig") else None
     cameras: dict[str, Session] = {}
     lenses: dict[str, Path] = {}
-    for entry in table.tables("cameras", hint='[[cameras]] with id = "left" and images = "left*.jpg"'):
-        name = entry.identifier("id", hint=HINT_ID)
+    for entry in table["cameras"]:
+        name = entry["id"]
         if name in cameras:
             raise entry.error("its id must be its own; give it another")
-        own, own_degree = model, degree
-        if entry.has("model"):
-            own, own_degree, _ = options_of(entry)
-        images = images_of(entry)
-        if entry.has("calibration"):
-            lenses[name] = entry.path_to("calibration", hint='calibration = "left.json"')
-        entry.done()
-        cameras[name] = Session(
-            path=source, images=images, boards=boards, model=own, degree=own_degree, board_shape=shape, camera=name
-        )
-    if len(cameras) < 2:
-        raise table.error("a rig has at least two [[cameras]]; for one, write its `images` without [[cameras]]")
-    baselines = _baselines(table, tuple(cameras))
-    table.done()
+        if "calibration" in entry:
+            lenses[name] = entry.beside(entry["calibration"])
+        own = options_of(entry, options)
+        cameras[name] = Session(path=source, images=images_of(entry), boards=boards, camera=name, **own)
     return RigSession(
         path=source,
         cameras=cameras,
-        frames=frames,
-        baselines=baselines,
+        frames=table.get("frames"),
+        baselines=tuple(_baseline(entry, list(cameras)) for entry in table.get("baselines", ())),
         rigid_boards=rigid,
         lenses=lenses,
-        known_rig=known_rig,
+        known_rig=table.beside(table["rig"]) if "rig" in table else None,
     )
 
 
 def _rigid_boards(table: TomlTable, boards: Sequence[Board]) -> tuple[RigidBoards, ...]:
-    if not table.has("rigid_boards"):
-        return ()
     known = {b.board_id: b for b in boards}
     out: list[RigidBoards] = []
-    for entry in table.tables("rigid_boards", hint=f"[[rigid_boards]] with {HINT_RIGID}"):
-        names = entry.texts("boards", hint=HINT_RIGID)
+    for entry in table.get("rigid_boards", ()):
+        names, layout = entry["boards"], dict(entry.get("layout", {}))
         for name in names:
             if name not in known:
                 raise entry.error(f"no board is called '{name}'; known: {', '.join(known)}")
             if any(name in other.boards for other in out):
                 raise entry.error(f"board '{name}' is on two mounts; remove it from one")
-        if len(names) < 2:
-            raise entry.error(f"one board has no mount to share; write {HINT_RIGID}")
-        layout: dict[str, str] = {}
-        if entry.has("layout"):
-            sides = entry.table("layout", hint='layout = { left = "left", floor = "floor" }')
-            layout = {
-                name: sides.text(name, hint=f'{name} = "left"', choices=tuple(BOARD_SIDES)) for name in sides.names()
-            }
-            for name in layout:
-                if name not in names:
-                    raise entry.error(f"layout: '{name}' is none of its boards; use {' or '.join(names)}")
-        if entry.has("baseline"):
-            raise entry.error("'baseline' is between cameras: write [[baselines]]")
+        for name in layout:
+            if name not in names:
+                raise entry.error(f"layout: '{name}' is none of its boards; use {' or '.join(names)}")
         out.append(RigidBoards(names, layout, truth_from_table(entry, [known[name] for name in names])))
     return tuple(out)
 
 
-def _baselines(table: TomlTable, names: Sequence[str]) -> tuple[MeasuredBaseline, ...]:
-    if not table.has("baselines"):
-        return ()
-    out = []
-    for entry in table.tables("baselines", hint="[[baselines]] with a, b, value_mm, sigma_mm and how"):
-        a, b = (entry.text(key, hint=f'{key} = "{names[0]}"', choices=names) for key in "ab")
-        if a == b:
-            raise entry.error(f"'a' and 'b' are both '{a}'; name two cameras")
-        measured = measured_value(entry, "mm")
-        entry.done()
-        out.append(MeasuredBaseline(a, b, MeasuredLength(*measured)))
-    return tuple(out)
+def _baseline(entry: TomlTable, names: Sequence[str]) -> MeasuredBaseline:
+    for end in ("a", "b"):
+        if entry[end] not in names:
+            raise entry.error(f"'{end}' is '{entry[end]}', which is unknown; known: {', '.join(names)}")
+    if entry["a"] == entry["b"]:
+        raise entry.error(f"'a' and 'b' are both '{entry['a']}'; name two cameras")
+    return MeasuredBaseline(entry["a"], entry["b"], MeasuredLength(*measured_value(entry, "mm")))
 
 
 def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None) -> dict[str, dict[str, str]]:

@@ -6,14 +6,24 @@ import json
 from collections.abc import Iterator
 
 from rigkit.core.errors import InputError
-from rigkit.io import schema_calibration, schema_results, schema_toml
+from rigkit.io import schema_calibration, schema_results
+from rigkit.io.board_file import BOARD_FILE
+from rigkit.io.manifest import DATASET_FILE
+from rigkit.io.public_set import PUBLIC_FILE
 from rigkit.io.schema_words import ANY_OF, Schema
+from rigkit.io.session import SESSION_FILE
+from rigkit.io.study_file import STUDY_FILE
 
-SCHEMAS: dict[str, Schema] = {
-    str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
-    for module in (schema_toml, schema_calibration, schema_results)
+_OF_PEOPLE = (BOARD_FILE, DATASET_FILE, PUBLIC_FILE, SESSION_FILE, STUDY_FILE)
+_RESULTS = [
+    schema
+    for module in (schema_calibration, schema_results)
     for name, schema in sorted(vars(module).items())
     if name.endswith("_FILE")
+]
+SCHEMAS: dict[str, Schema] = {
+    str(schema["properties"]["schema"]["const"]).removeprefix("rigkit.").partition("/")[0]: schema
+    for schema in (*_OF_PEOPLE, *_RESULTS)
 }
 """By name, such as "session" or "calibration"."""
 _KIND_WORDS = {"string": "text", "object": "table", "boolean": "true or false", "integer": "whole number"}

@@ -6,7 +6,7 @@ from __future__ import annotations
 from rigkit.calibration.result import Calibration, Candidate, Convergence, Outlier
 from rigkit.cameras.registry import MODELS
 from rigkit.core.findings import Severity
-from rigkit.io.schema_toml import BOARD_KEYS
+from rigkit.io.board_file import DECLARED_BOARD
 from rigkit.io.schema_words import (
     ANY_OF,
     BOOLEAN,
@@ -76,7 +76,6 @@ _VIEW = obj(
         "kept": said(array(BOOLEAN), "false for outliers"),
     }
 )
-DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board files")
 _SHAPE = obj(
     {
         "board_id": said(TEXT, "which board"),

@@ -16,12 +16,15 @@ NUMBER: Schema = {"type": "number"}
 POSITIVE: Schema = {"type": "number", "exclusiveMinimum": 0}
 INTEGER: Schema = {"type": "integer", "minimum": 0}
 BOOLEAN: Schema = {"type": "boolean"}
+NAME: Schema = {"type": "string", "format": "identifier"}
+"""What something is called: see `rigkit.core.identifiers`."""
+COUNT: Schema = {"type": "integer", "minimum": 1}
 PLAIN_KINDS: Mapping[type, Schema] = {str: TEXT, float: NUMBER, int: INTEGER, bool: BOOLEAN}
 
 
-def said(schema: Schema, words: str) -> Schema:
-    """Return the schema with what it means."""
-    return {**schema, "description": words}
+def said(schema: Schema, words: str, *examples: object) -> Schema:
+    """Return the schema with its meaning and, for people who write it, an example."""
+    return {**schema, "description": words, **({"examples": list(examples)} if examples else {})}
 
 
 def choice(*values: str) -> Schema:
@@ -37,6 +40,11 @@ def nullable(schema: Schema) -> Schema:
 def array(items: Schema, least: int = 0) -> Schema:
     """Return the schema of a list of at least so many."""
     return {"type": "array", "items": items, **({"minItems": least} if least else {})}
+
+
+def texts(least: int = 0, items: Schema = TEXT) -> Schema:
+    """Return the schema of a list of at least so many words, all different."""
+    return {**array(items, least), "uniqueItems": True}
 
 
 def row(length: int, items: Schema = NUMBER) -> Schema:

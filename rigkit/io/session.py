@@ -15,20 +15,71 @@ Sessions of several cameras on one mount have [[cameras]] instead of `images`: s
 from __future__ import annotations
 
 import glob
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rigkit.calibration.shape import SHAPES
 from rigkit.cameras.registry import MODELS, check_order
 from rigkit.core.boards import Board
-from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
+from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import load_board
+from rigkit.io.schema_words import ANY_OF, COUNT, NAME, TEXT, Schema, array, choice, file, rows, said, table, texts
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
+from rigkit.io.truth_file import TRUTH_KEYS, between
 
 SESSION_SCHEMA = "rigkit.session/1"
 SESSION_NAME = "session.toml"
-HINT_BOARD = 'board = "board.toml" (or boards = ["a.toml", "b.toml"])'
+
+_IMAGES = said({ANY_OF: [TEXT, texts()]}, "a pattern, or a list of files and patterns", "images/*.jpg")
+_MODEL_KEYS: Mapping[str, Schema] = {
+    "model?": said(choice("auto", *MODELS), "camera model; auto (default): the one that predicts best"),
+    "degree?": said(COUNT, "terms of brown (4, 5, 8), degree of scaramuzza; by default chosen by held-out error", 6),
+}
+ONE_CAMERA_KEYS = ("schema", "images", "board", "boards", "model", "degree", "board_shape")
+"""Other keys of a session are of rigs."""
+_CAMERA_KEYS: Mapping[str, Schema] = {
+    "id": said(NAME, "its name", "left"),
+    "images": _IMAGES,
+    "calibration?": said(TEXT, "file of a lens that stays as it is: only the mount is found", "left.json"),
+    **_MODEL_KEYS,
+}
+_RIGID_KEYS: Mapping[str, Schema] = {
+    "boards": said(texts(2), "boards mounted to each other", ["left", "floor", "right"]),
+    "layout?": said(
+        table(choice(*BOARD_SIDES)), "which is which, of boards that look alike", {"left": "left", "floor": "floor"}
+    ),
+    **TRUTH_KEYS,
+}
+SESSION_FILE = file(
+    SESSION_SCHEMA,
+    "What to calibrate, and how",
+    {
+        "images?": _IMAGES,
+        "board?": said(TEXT, 'file of the board in the images; or boards = ["a.toml", "b.toml"]', "board.toml"),
+        "boards?": said(texts(1), "files of the boards, where there are several", ["a.toml", "b.toml"]),
+        **_MODEL_KEYS,
+        "board_shape?": said(
+            choice("auto", *SHAPES), "flat, warp (print scale and bow), released (every corner), or auto"
+        ),
+        "frames?": said(
+            choice("name", "number", "order"),
+            "of several cameras, which images were taken together: those of one name, one number at the end of the "
+            "name, or one place in the sorted list",
+        ),
+        "rig?": said(
+            TEXT, "file of a rig whose cameras stay as they are, lens and mount: others are added to it", "rig.json"
+        ),
+        "cameras?": rows(_CAMERA_KEYS, "several cameras, instead of images; the first is the rig's frame", least=2),
+        "baselines?": said(
+            array(between("mm", "a camera", "left", "right")),
+            "what a person measured between two lenses: judged, not used",
+        ),
+        "rigid_boards?": rows(_RIGID_KEYS, "boards on one mount"),
+    },
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -77,40 +128,28 @@ def beside_session(session: Path, name: str) -> Path:
 def load_session(path: str | Path) -> Session:
     """Return the session; raises InputError for a missing file or board, or an unknown key."""
     source = Path(path)
-    table = read_toml(source, SESSION_SCHEMA)
-    if table.has("cameras"):
+    table = read_toml(source, SESSION_FILE)
+    if "cameras" in table:
         raise table.error("has several [[cameras]]; where one camera is asked for, give the session of that one")
-    images = images_of(table)
-    boards = boards_of(table)
-    model, degree, shape = options_of(table)
-    table.done()
-    return Session(path=source, images=images, boards=boards, model=model, degree=degree, board_shape=shape)
+    table.allow_only(ONE_CAMERA_KEYS)
+    return Session(path=source, images=images_of(table), boards=boards_of(table), **options_of(table))
 
 
-def options_of(table: TomlTable) -> tuple[str, int | None, str]:
-    """Return model, degree and board shape that a table asks for."""
-    model = "auto"
-    if table.has("model"):
-        model = table.text("model", hint='model = "scaramuzza"', choices=("auto", *MODELS))
-    degree = table.integer("degree", hint="degree = 6", at_least=1) if table.has("degree") else None
-    if degree is not None:
-        try:
-            check_order(model, degree)
-        except InputError as error:
-            raise table.error(f"'degree': {error}") from error
-    shape = "auto"
-    if table.has("board_shape"):
-        shape = table.text("board_shape", hint='board_shape = "auto"', choices=("auto", *SHAPES))
-    return model, degree, shape
+def options_of(table: TomlTable, of_all: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return model, degree and board shape that a table asks for, by the fields of `Session`; what it leaves out is as
+    `of_all` cameras have it."""
+    usual = {"model": "auto", "degree": None, "board_shape": "auto"} if of_all is None else dict(of_all)
+    usual |= {"degree": None} if "model" in table else {}
+    out = usual | {key: table[key] for key in usual if key in table}
+    if out["degree"] is not None:
+        with table.located():
+            check_order(out["model"], out["degree"])
+    return out
 
 
 def images_of(table: TomlTable) -> tuple[Path, ...]:
     """Return the image files that are there, of the patterns that a table lists."""
-    hint = 'images = "images/*.jpg" (or a list of files and patterns)'
-    try:
-        patterns: tuple[str, ...] = (table.text("images", hint=hint),)
-    except InputError:
-        patterns = table.texts("images", hint=hint)
+    patterns = (table["images"],) if isinstance(table["images"], str) else table["images"]
     found: dict[Path, Path] = {}
     absent = []
     for pattern in patterns:
@@ -137,29 +176,26 @@ def files_of_session(path: str | Path) -> tuple[Path, ...]:
     Raises InputError like `load_session`.
     """
     source = Path(path)
-    table = read_toml(source, SESSION_SCHEMA)
-    boards = table.texts("boards", hint=HINT_BOARD) if table.has("boards") else (table.text("board", hint=HINT_BOARD),)
-    out = [source, *map(table.beside, boards)]
-    entries = table.tables("cameras", hint="[[cameras]]") if table.has("cameras") else (table,)
-    out += [table.path_to("rig", hint='rig = "rig.json"')] if table.has("rig") else []
-    for entry in entries:
+    table = read_toml(source, SESSION_FILE)
+    out = [source, *_board_files(table), *([table.beside(table["rig"])] if "rig" in table else [])]
+    for entry in table.get("cameras", (table,)):
         out += images_of(entry)
-        out += [entry.path_to("calibration", hint="calibration")] if entry.has("calibration") else []
-        name = f"-{entry.text('id', hint='id')}" if entry is not table else ""
+        out += [entry.beside(entry["calibration"])] if "calibration" in entry else []
+        name = f"-{entry['id']}" if entry is not table else ""
         out.append(beside_session(source, f"corners{name}.json"))
     return tuple(out)
 
 
+def _board_files(table: TomlTable) -> list[Path]:
+    return [table.beside(name) for name in (table["boards"] if "boards" in table else (table["board"],))]
+
+
 def boards_of(table: TomlTable) -> tuple[Board, ...]:
     """Return the boards that a table lists by file."""
-    if table.has("boards"):
-        if table.has("board"):
-            raise table.error("'board' and 'boards'; keep one of the two")
-        paths = [table.beside(name) for name in table.texts("boards", hint=HINT_BOARD)]
-    else:
-        paths = [table.path_to("board", hint=HINT_BOARD)]
+    if "boards" in table and "board" in table:
+        raise table.error("'board' and 'boards'; keep one of the two")
     with table.located():
-        boards = tuple(load_board(path) for path in paths)
+        boards = tuple(load_board(path) for path in _board_files(table))
     ids = [board.board_id for board in boards]
     if len(set(ids)) < len(ids):
         raise table.error("two boards have the same id; give one of the files another 'id'")

@@ -2,143 +2,149 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
+from rigkit.io.schema_words import (
+    ANY_OF,
+    COUNT,
+    INTEGER,
+    NAME,
+    NUMBER,
+    POSITIVE,
+    TEXT,
+    Schema,
+    array,
+    choice,
+    file,
+    obj,
+    row,
+    rows,
+    said,
+    texts,
+)
 from rigkit.io.toml_reader import TomlTable, read_toml
 from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
-from rigkit.study.table import CELL_KEYS
 from rigkit.synthetic.noise import NoisyImages
 
-STUDY_SCHEMA = "rigkit.study/1"
-KNOWN_POSE_TYPES = tuple(str(p) for p in PoseType if p is not PoseType.AUTO)
-
-DEFAULTS = {f.name: f.default for f in fields(Study) if f.name in ("support", "det_scale")}
+DEFAULTS: Mapping[str, Any] = {f.name: f.default for f in fields(Study) if f.name in ("support", "det_scale")}
 """What a study that says nothing of them works with: the paper's."""
+
+_SIDE: Schema = {"type": "integer", "minimum": 3}
+_NUMBERS = array(NUMBER, 1)
+_CELLS = obj(
+    {
+        "pose_type?": said(TEXT, "of the cells", "general"),
+        "sigma?": said({ANY_OF: [NUMBER, _NUMBERS]}, "one noise level, or several", 3.0),
+        "method?": said(TEXT, "estimator or variant", "3SDIR"),
+        "plane?": said(COUNT, "which board", 1),
+    }
+)
+_ESTIMATION: Mapping[str, Schema] = {
+    "support?": said(TEXT, "where directions come from: see rigkit simulate", "patch"),
+    "det_scale?": said(TEXT, "the scale that DET3UDIR takes", "area"),
+}
+STUDY_FILE = file(
+    "rigkit.study/1",
+    "A synthetic study",
+    {
+        "name": said(NAME, "of the study and its files", "general-motion"),
+        "title?": said(TEXT, "above tables and figures", "General motion"),
+        "trials": said(COUNT, "how many scenes", 100),
+        "seed": said(INTEGER, "of the random numbers", 1),
+        "methods": said(texts(1), f"estimators ({', '.join(AFFINE_METHODS)}) or variants", ["F2UDIR", "3SDIR"]),
+        "pose_types": said(
+            texts(1, choice(*(str(kind) for kind in PoseType if kind is not PoseType.AUTO))),
+            "motions of the camera",
+            ["general"],
+        ),
+        "noise": obj(
+            {
+                "on": said(choice(*NOISE_KINDS), "what is noisy"),
+                **{f"sigma_{unit}?": said(_NUMBERS, f"levels, {unit}", [0.0, 1.0]) for unit in NOISE_KINDS.values()},
+                "images?": said(choice(*map(str, NoisyImages)), "which images"),
+            },
+            "standard deviations of the noise",
+        ),
+        "estimation?": obj(
+            {
+                **_ESTIMATION,
+                "epipolar?": said(TEXT, "whose epipolar geometry is used", "truth"),
+                "min_conditioning?": said(NUMBER, "below it directions determine no affinity", 0.05),
+            },
+            "how affinities are estimated",
+        ),
+        "variants?": rows(
+            {
+                "name": said(TEXT, "of the variant", "3SDIR, patch"),
+                "method": said(TEXT, "estimator", "3SDIR"),
+                **_ESTIMATION,
+            },
+            "estimators with options of their own",
+        ),
+        "scene?": obj(
+            {
+                "board?": said(
+                    obj({"columns": _SIDE, "rows": _SIDE, "square_mm": POSITIVE}),
+                    "the three boards",
+                    {"columns": 6, "rows": 8, "square_mm": 40.0},
+                ),
+                "focal_px?": said(POSITIVE, "of the camera", 1350.0),
+                "baseline_mm?": said(POSITIVE, "of special motions", 300.0),
+                "in_plane_deg?": said(NUMBER, "turn of the boards", 25.0),
+                "centre_px?": said(row(2), "principal point", [800.0, 620.0]),
+                "parallax_deg?": said(row(2), "range of general motions", [40.0, 70.0]),
+            },
+            "what is simulated",
+        ),
+        "claims?": rows(
+            {
+                "text": said(TEXT, "the statement", "3SDIR is better than F2UDIR"),
+                "smaller": said(_CELLS, "cells whose medians are smaller", {"method": "3SDIR"}),
+                "larger?": said(_CELLS, "than those of these cells; or at_most_deg", {"method": "F2UDIR"}),
+                "at_most_deg?": said(POSITIVE, "or than this", 20.0),
+            },
+            "statements to judge",
+        ),
+    },
+)
 
 
 def load_study(path: str | Path) -> Study:
-    """Read a study.
+    """Return the study of a file.
 
-    Raises
-    ------
-    InputError
-        Unknown keys or values, or one of name, trials, seed, pose_types, methods and noise is missing.
+    Raises InputError for unknown keys or values, and where one of name, trials, seed, pose_types, methods and noise is
+    missing.
     """
-    source = Path(path)
-    top = read_toml(source, STUDY_SCHEMA)
-    name = top.identifier("name", hint='name = "general-motion"')
-    options: dict[str, Any] = {
-        "title": top.text("title", hint='title = "..."') if top.has("title") else name,
-        "trials": top.integer("trials", hint="trials = 100", at_least=1),
-        "seed": top.integer("seed", hint="seed = 1"),
-        "methods": top.texts("methods", hint='methods = ["F2UDIR", "3SDIR"]'),
-    }
-    kinds = top.texts("pose_types", hint='pose_types = ["general"]')
-    for kind in kinds:
-        if kind not in KNOWN_POSE_TYPES:
-            raise top.error(f"'pose_types' names '{kind}', which is unknown; known: {', '.join(KNOWN_POSE_TYPES)}")
-    options["pose_types"] = tuple(PoseType(kind) for kind in kinds)
-    options |= _noise(top.table("noise", hint='[noise] with on = "directions" and sigma_deg = [0, 3, 10]'))
-    if top.has("estimation"):
-        options |= _estimation(top.table("estimation", hint="[estimation]"))
-    if top.has("variants"):
-        defaults = {key: options.get(key, DEFAULTS[key]) for key in ("support", "det_scale")}
-        variants = top.tables("variants", hint='[[variants]] with name = "3SDIR, patch"')
-        options["variants"] = tuple(_variant(table, defaults) for table in variants)
-    if top.has("scene"):
-        options |= _scene(top.table("scene", hint="[scene]"))
-    if top.has("claims"):
-        options["claims"] = tuple(_claim(t) for t in top.tables("claims", hint='[[claims]] with text = "..."'))
-    top.done()
+    top = read_toml(path, STUDY_FILE)
+    noise, estimation, scene = top["noise"], dict(top.get("estimation", {})), dict(top.get("scene", {}))
+    usual = {key: estimation.get(key, default) for key, default in DEFAULTS.items()}
+    if "board" in scene:
+        side = scene["board"]["square_mm"]
+        scene["board"] = Board("study", scene["board"]["columns"], scene["board"]["rows"], side, side)
+    if "images" in noise:
+        scene["images"] = NoisyImages(noise["images"])
     with top.located():
-        return Study(name=name, **options)
+        return Study(
+            name=top["name"],
+            title=top.get("title", top["name"]),
+            **{key: top[key] for key in ("trials", "seed", "methods")},
+            pose_types=tuple(map(PoseType, top["pose_types"])),
+            noise=noise["on"],
+            sigmas=noise[f"sigma_{NOISE_KINDS[noise['on']]}"],
+            variants=tuple(Variant(**usual | dict(entry)) for entry in top.get("variants", ())),
+            claims=tuple(map(_claim, top.get("claims", ()))),
+            **estimation,
+            **scene,
+        )
 
 
-def _noise(table: TomlTable) -> dict[str, Any]:
-    kind = table.text("on", hint='on = "directions" (or "corners")', choices=tuple(NOISE_KINDS))
-    key = f"sigma_{NOISE_KINDS[kind]}"
-    out: dict[str, Any] = {"noise": kind, "sigmas": table.numbers(key, hint=f"{key} = [0.0, 1.0]")}
-    if table.has("images"):
-        images = tuple(str(i) for i in NoisyImages)
-        out["images"] = NoisyImages(table.text("images", hint='images = "both"', choices=images))
-    table.done()
-    return out
-
-
-def _estimation(table: TomlTable) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for key in ("support", "det_scale", "epipolar"):
-        if table.has(key):
-            out[key] = table.text(key, hint=f'{key} = "..."')
-    if table.has("min_conditioning"):
-        out["min_conditioning"] = table.number("min_conditioning", hint="min_conditioning = 0.05", positive=False)
-    table.done()
-    return out
-
-
-def _scene(table: TomlTable) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    if table.has("board"):
-        inner = table.table("board", hint="board = { columns = 6, rows = 8, square_mm = 40 }")
-        columns = inner.integer("columns", hint="columns = 6", at_least=3)
-        rows = inner.integer("rows", hint="rows = 8", at_least=3)
-        square = inner.number("square_mm", hint="square_mm = 40")
-        inner.done()
-        out["board"] = Board("study", columns, rows, square, square)
-    for key in ("focal_px", "baseline_mm"):
-        if table.has(key):
-            out[key] = table.number(key, hint=f"{key} = 300.0")
-    if table.has("in_plane_deg"):
-        out["in_plane_deg"] = table.number("in_plane_deg", hint="in_plane_deg = 25.0", positive=False)
-    for key in ("centre_px", "parallax_deg"):
-        if table.has(key):
-            values = table.numbers(key, hint=f"{key} = [40.0, 70.0]")
-            if len(values) != 2:
-                raise table.error(f"'{key}' must be two numbers, got {len(values)}")
-            out[key] = values
-    table.done()
-    return out
-
-
-def _variant(table: TomlTable, defaults: dict[str, str]) -> Variant:
-    name = table.text("name", hint='name = "3SDIR, patch"')
-    method = table.text("method", hint='method = "3SDIR"')
-    chosen = dict(defaults)
-    for key in defaults:
-        if table.has(key):
-            chosen[key] = table.text(key, hint=f'{key} = "..."')
-    table.done()
-    return Variant(name, method, **chosen)
-
-
-def _claim(table: TomlTable) -> Claim:
-    text = table.text("text", hint='text = "3SDIR is better than F2UDIR"')
-    smaller = _cells(table.table("smaller", hint='smaller = { method = "3SDIR" }'))
-    larger, limit = None, None
-    if table.has("at_most_deg"):
-        limit = table.number("at_most_deg", hint="at_most_deg = 20.0")
-    if table.has("larger") or limit is None:
-        larger = _cells(table.table("larger", hint='larger = { method = "F2UDIR" }, or at_most_deg = 20.0'))
-    table.done()
-    return Claim(text, smaller, larger, limit)
-
-
-def _cells(table: TomlTable) -> dict[str, Any]:
-    """Return a selection of cells; the noise may be one level or a list of them."""
-    which: dict[str, Any] = {}
-    for key in CELL_KEYS:
-        if table.has(key):
-            if key == "plane":
-                which[key] = table.integer(key, hint="plane = 1", at_least=1)
-            elif key == "sigma":
-                hint = "sigma = 3.0, or [1.0, 2.0, 3.0]"
-                several = table.is_list(key)
-                which[key] = table.numbers(key, hint=hint) if several else table.number(key, hint=hint, positive=False)
-            else:
-                which[key] = table.text(key, hint=f'{key} = "..."')
-    table.done()
-    return which
+def _claim(entry: TomlTable) -> Claim:
+    limit = entry.get("at_most_deg")
+    larger: dict[str, Any] | None = dict(entry["larger"]) if "larger" in entry or limit is None else None
+    return Claim(entry["text"], dict(entry["smaller"]), larger, limit)

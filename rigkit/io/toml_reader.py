@@ -1,7 +1,7 @@
-"""A strict reader for the TOML files that people write.
+"""A strict reader for the TOML files that people write: the schema of a file is its reader.
 
-Every key is asked for by name; whatever was not asked for is an error, so a misspelt option cannot be silently ignored.
-Every message names the file, the table and the key, and says what to write.
+A key that the schema does not have is an error, so a misspelt option cannot be silently ignored. Every message names
+the file, the table and the key, and says what to write.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import difflib
 import json
 import os
+import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,29 +20,15 @@ from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.io.numbers import fault_of_number
 from rigkit.io.reading import read_text, usable_path
+from rigkit.io.schema_words import ANY_OF, Schema
 
 MAX_TOML_BYTES = 4_000_000
 """People write these files; the reader takes a second for each million."""
 MAX_INTEGER = 10**12
 MAX_SHOWN = 60
 """Characters of a value in a message."""
-
-
-def _shown(value: object) -> str:
-    """Return the value on one line, cut where it is long."""
-    try:
-        text = ascii(value)
-    except (ValueError, RecursionError):
-        return "a number of thousands of digits, or something nested too deep"
-    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
-
-
-def _is_word(value: object) -> bool:
-    return isinstance(value, str) and value.isprintable()
+PLURALS = {"object": "tables", "string": "strings", "number": "numbers"}
+COUNTED = ("no", "one", "two", "three")
 
 
 def named_path(path: Path) -> Path:
@@ -50,15 +37,6 @@ def named_path(path: Path) -> Path:
     Frames, views and reports go by names of images; a store of data (git-annex, DVC) links them to checksums.
     """
     return path.parent.resolve() / path.name
-
-
-def toml_text(text: str) -> str:
-    """Return a basic string of TOML, which has the escapes of JSON; raises InputError for what UTF-8 cannot hold."""
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        raise InputError(f"{text!r}: a file of UTF-8 cannot hold this name; rename the file") from error
-    return json.dumps(text, ensure_ascii=False)
 
 
 def relative_path(path: Path, folder: Path) -> str:
@@ -70,17 +48,56 @@ def relative_path(path: Path, folder: Path) -> str:
         return named_path(path).as_posix()
 
 
-class TomlTable:
-    """One table of a file. Ask for its keys, then call `done()`.
+def toml_text(value: object) -> str:
+    """Return a value as TOML writes it; raises InputError for words that UTF-8 cannot hold."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {toml_text(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_text, value))}]"
+    try:
+        str(value).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{value!r}: a file of UTF-8 cannot hold this name; rename the file") from error
+    # A basic string of TOML has the escapes of JSON.
+    return json.dumps(value, ensure_ascii=False)
 
-    `where` says which table it is, in the words of the file: "[[pairs]] 'fisheye-forward'".
+
+class TomlTable(Mapping[str, Any]):
+    """One table of a file, which fits its schema: tables in it are `TomlTable`, lists tuples, numbers floats.
+
+    `table[key]` is an error that says what to add where the key is missing, `table.get(key)` is not. `where` says which
+    table it is, in the words of the file: "[[pairs]] 'fisheye-forward'".
     """
 
-    def __init__(self, values: dict[str, Any], path: Path, where: str = "") -> None:
-        self._values = values
-        self._known: list[str] = []
-        self.path = path
-        self.where = where
+    def __init__(self, values: Mapping[str, Any], schema: Schema, path: Path, where: str = "") -> None:
+        """Raise InputError for values that the schema does not have."""
+        self._schema, self.path, self.where = schema, path, where
+        self._values: dict[str, Any] = {}
+        known, others = schema.get("properties", {}), schema.get("additionalProperties", True)
+        self._require(schema.get("required", ()), values)
+        if others is False:
+            self.allow_only(known, values)
+        for key, value in values.items():
+            self._values[key] = self._checked(key, value, known.get(key, others))
+        for key, beside in schema.get("dependentRequired", {}).items():
+            self._require(beside if key in values else (), values)
+
+    def __getitem__(self, key: str) -> Any:
+        self._require([key], self._values)
+        return self._values[key]
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the value; `default` where there is none."""
+        return self._values.get(key, default)
 
     def error(self, message: str) -> InputError:
         """Return an error that starts with the file and the table."""
@@ -88,165 +105,156 @@ class TomlTable:
         return InputError(place + message)
 
     @contextmanager
-    def located(self) -> Iterator[None]:
-        """Let complaints of the block start with the file and the table."""
+    def located(self, remedy: str = "") -> Iterator[None]:
+        """Let complaints of the block start with the file and the table, and end with a remedy, unless they name the
+        file already."""
         try:
             yield
         except InputError as error:
-            raise self.error(str(error)) from error
+            raise error if str(self.path) in str(error) else self.error(f"{error}{remedy}") from error
 
-    def has(self, key: str) -> bool:
-        """Say whether the key is there, and make it a known one."""
-        if key not in self._known:
-            self._known.append(key)
-        return key in self._values
-
-    def is_list(self, key: str) -> bool:
-        """Say whether there is a list, for what may be one value or several."""
-        return isinstance(self._values.get(key), list)
-
-    def text(self, key: str, *, hint: str, choices: Sequence[str] = ()) -> str:
-        """Return a required string; `hint` is what the error tells the person to add, written as in the file."""
-        value = self._required(key, hint)
-        if not isinstance(value, str) or not value.strip():
-            raise self.error(f"'{key}' must be a string, got {_shown(value)}; write {hint}")
-        if choices and value not in choices:
-            raise self.error(f"'{key}' is {_shown(value)}, which is unknown; known: {', '.join(choices)}")
-        return value
-
-    def number(self, key: str, *, hint: str, positive: bool = True) -> float:
-        """Return a required finite number (positive unless told)."""
-        value = self._required(key, hint)
-        fault = fault_of_number(value, positive=positive)
-        if fault:
-            raise self.error(f"'{key}' must be {fault}, got {_shown(value)}; write {hint}")
-        return float(value)
-
-    def integer(self, key: str, *, hint: str, at_least: int = 0) -> int:
-        """Return a required whole number."""
-        value = self._required(key, hint)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise self.error(f"'{key}' must be a whole number, got {_shown(value)}; write {hint}")
-        if not at_least <= value <= MAX_INTEGER:
-            limit = f"at least {at_least}" if value < at_least else f"at most {MAX_INTEGER}"
-            raise self.error(f"'{key}' must be {limit}, got {_shown(value)}; write {hint}")
-        return value
-
-    def boolean(self, key: str, *, hint: str) -> bool:
-        """Return a required true or false."""
-        value = self._required(key, hint)
-        if not isinstance(value, bool):
-            raise self.error(f"'{key}' must be true or false, got {_shown(value)}; write {hint}")
-        return value
-
-    def texts(self, key: str, *, hint: str) -> tuple[str, ...]:
-        """Return a required list of strings, all different."""
-        value = self._required(key, hint)
-        if not isinstance(value, list) or not all(isinstance(v, str) and v.strip() for v in value):
-            raise self.error(f"'{key}' must be a list of strings, got {_shown(value)}; write {hint}")
-        twice = sorted({v for v in value if value.count(v) > 1})
-        if twice:
-            raise self.error(f"'{key}' names {', '.join(map(repr, twice))} twice; remove one")
-        return tuple(value)
-
-    def numbers(self, key: str, *, hint: str) -> tuple[float, ...]:
-        """Return a required list of finite numbers."""
-        value = self._required(key, hint)
-        if not isinstance(value, list):
-            raise self.error(f"'{key}' must be a list of numbers, got {_shown(value)}; write {hint}")
-        for number in value:
-            fault = fault_of_number(number, positive=False)
-            if fault:
-                raise self.error(f"'{key}': every entry must be {fault}, got {_shown(number)}; write {hint}")
-        return tuple(float(v) for v in value)
-
-    def path_to(self, key: str, *, hint: str) -> Path:
-        """Return a required path, taken from the folder of the file."""
-        return self.beside(self.text(key, hint=hint))
+    def allow_only(self, known: Collection[str], values: Mapping[str, Any] | None = None) -> None:
+        """Raise InputError if the table has a key that is not among the known ones."""
+        for key in self._values if values is None else values:
+            if key not in known:
+                close = difflib.get_close_matches(key, known, n=1)
+                remedy = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+                raise self.error(f"unknown key {_shown(key)}; {remedy}")
 
     def beside(self, name: str) -> Path:
         """Return the absolute path of `name`, taken from the folder of the file, as both are written."""
-        try:
+        with self.located():
             path = usable_path(self.path.parent / name)
             # Without links: a folder's ".." is where the link leads to.
             written = Path(os.path.abspath(path))
             return written if written.resolve() == path.resolve() else named_path(path)
-        except InputError as error:
-            raise self.error(str(error)) from error
 
-    def identifier(self, key: str, *, hint: str) -> str:
-        """Return a required string that something is called by: see `rigkit.core.identifiers`."""
-        value = self.text(key, hint=hint)
-        try:
-            return check_identifier(value, f"'{key}'")
-        except InputError as error:
-            raise self.error(str(error)) from error
+    def _require(self, keys: Collection[str], values: Mapping[str, Any]) -> None:
+        for key in keys:
+            if key not in values:
+                raise self.error(f"'{key}' is missing; add {_hint(key, self._schema['properties'].get(key, {}))}")
 
-    def table(self, key: str, *, hint: str) -> TomlTable:
-        """Return a required table."""
-        value = self._required(key, hint)
-        if not isinstance(value, dict):
-            raise self.error(f"'{key}' must be a table, got {_shown(value)}; write {hint}")
-        return TomlTable(value, self.path, f"{self.where}, '{key}'" if self.where else f"[{key}]")
+    def _checked(self, key: str, value: Any, schema: Schema) -> Any:
+        """Return a value as the schema has it; raises InputError for one that it does not have."""
+        if ANY_OF in schema:
+            is_list = isinstance(value, list)
+            return self._checked(key, value, next(s for s in _choices(schema) if (s["type"] == "array") == is_list))
+        kind = schema.get("type", "string")
+        fault = _fault(value, kind, schema)
+        if fault is not None:
+            raise self.error(f"'{key}' must {fault}, got {_shown(value)}; write {_hint(key, schema)}")
+        if kind == "object":
+            return TomlTable(value, schema, self.path, f"{self.where}, '{key}'" if self.where else f"[{key}]")
+        if kind == "array":
+            return self._list(key, value, schema)
+        if value not in schema.get("enum", (value,)):
+            raise self.error(f"'{key}' is {_shown(value)}, which is unknown; known: {', '.join(schema['enum'])}")
+        if not re.match(schema.get("pattern", ""), str(value)):
+            raise self.error(f"'{key}' is {_shown(value)}, which is not {schema['description']}")
+        if schema.get("format") == "identifier":
+            with self.located():
+                check_identifier(value, f"'{key}'")
+        return float(value) if kind == "number" else value
 
-    def tables(self, key: str, *, hint: str) -> tuple[TomlTable, ...]:
-        """Return a required, non-empty list of tables; each is called by its id where it has one."""
-        value = self._required(key, hint)
-        if not isinstance(value, list) or not value or not all(isinstance(v, dict) for v in value):
-            raise self.error(f"'{key}' must be a list of tables, got {_shown(value)}; write {hint}")
-        prefix = f"{self.where}, '{key}'" if self.where else f"[[{key}]]"
-        return tuple(
-            TomlTable(v, self.path, prefix + (f" '{v['id'][:40]}'" if _is_word(v.get("id")) else f" number {i + 1}"))
-            for i, v in enumerate(value)
-        )
-
-    def names(self) -> tuple[str, ...]:
-        """Return all keys there are and make them known: for tables whose keys are names that the person chose."""
-        for key in self._values:
-            self.has(key)
-        return tuple(self._values)
-
-    def done(self) -> None:
-        """Raise InputError if the table has a key that nobody asked for."""
-        for key in self._values:
-            if key not in self._known:
-                close = difflib.get_close_matches(key, self._known, n=1)
-                guess = f"did you mean '{close[0]}'? " if close else ""
-                raise self.error(f"unknown key {_shown(key)}; {guess}known: {', '.join(self._known)}")
-
-    def _required(self, key: str, hint: str) -> Any:
-        if not self.has(key):
-            raise self.error(f"'{key}' is missing; add {hint}")
-        return self._values[key]
+    def _list(self, key: str, value: list[Any], schema: Schema) -> tuple[Any, ...]:
+        least, most, (items,) = schema.get("minItems", 0), schema.get("maxItems", len(value)), _choices(schema, "items")
+        if not least <= len(value) <= most:
+            count = f"{'' if most == least else 'at least '}{COUNTED[least]} {PLURALS[items.get('type', 'string')]}"
+            fault = f"must be {count}, got {_shown(value)}" if value else "is empty"
+            raise self.error(f"'{key}' {fault}; write {_hint(key, schema)}")
+        if items.get("type") == "object":
+            prefix = f"{self.where}, '{key}'" if self.where else f"[[{key}]]"
+            names = [one.get("id") for one in value]
+            called = [f"'{name[:40]}'" if _is_word(name) else f"number {k}" for k, name in enumerate(names, start=1)]
+            return tuple(TomlTable(v, items, self.path, f"{prefix} {n}") for v, n in zip(value, called, strict=True))
+        out = tuple(self._checked(key, one, items) for one in value)
+        if twice := sorted({one for one in out if out.count(one) > 1}) if "uniqueItems" in schema else ():
+            raise self.error(f"'{key}' names {', '.join(map(repr, twice))} twice; remove one")
+        return out
 
 
-def read_toml(path: str | Path, schema: str) -> TomlTable:
-    """Return the file's outermost table, its schema checked.
+def _choices(schema: Schema, key: str = ANY_OF) -> list[Schema]:
+    """Return the schemas that a schema is one of, or that of its items, with its own description and examples."""
+    own = {name: value for name, value in schema.items() if name in ("description", "examples")}
+    return [{**own, **one} for one in (schema[key] if key == ANY_OF else [schema[key]])]
 
-    Parameters
-    ----------
-    path : file.
-    schema : name and version, such as "rigkit.dataset/1".
+
+def _fault(value: Any, kind: str, schema: Schema) -> str | None:
+    """Return what a value of a kind must be, in words that follow "must"; None where it is that."""
+    if kind == "string":
+        return None if isinstance(value, str) and value.strip() else "be a string"
+    if kind == "boolean":
+        return None if isinstance(value, bool) else "be true or false"
+    if kind == "object":
+        return None if isinstance(value, dict) else "be a table"
+    if kind == "array":
+        items = schema["items"].get("type", "string")
+        whole = isinstance(value, list) and (bool(value) or items != "object")
+        whole = whole and (items == "number" or not any(_fault(one, items, schema["items"]) for one in value))
+        return None if whole else f"be a list of {PLURALS[items]}"
+    least = schema.get("minimum")
+    if kind == "number":
+        fault = fault_of_number(value, positive="exclusiveMinimum" in schema)
+        if fault is None and least is not None and value < least:
+            return "not be negative"
+        return fault and f"be {fault}"
+    if isinstance(value, bool) or not isinstance(value, int):
+        return "be a whole number"
+    if least is not None and value < least:
+        return f"be at least {least}"
+    return f"be at most {MAX_INTEGER}" if value > MAX_INTEGER else None
+
+
+def _hint(key: str, schema: Schema) -> str:
+    """Return what a person may write, as the file has it, and what it means."""
+    if "enum" in schema:
+        return f'{key} = "{schema["enum"][0]}" ({", ".join(schema["enum"])})'
+    words = schema.get("description", "")
+    shown = {"object": f"[{key}]", "array": f"[[{key}]]"}.get(schema.get("type", ""), "")
+    if "examples" in schema:
+        shown = f"{key} = {toml_text(schema['examples'][0])}"
+    return (f"{shown} ({words})" if words else shown) if shown else words or f"{key} = ..."
+
+
+def _shown(value: object) -> str:
+    """Return the value on one line, cut where it is long."""
+    try:
+        text = ascii(value)
+    except (ValueError, RecursionError):
+        return "a number of thousands of digits, or something nested too deep"
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
+
+
+def _is_word(value: object) -> bool:
+    return isinstance(value, str) and value.isprintable()
+
+
+def read_toml(path: str | Path, schema: Schema) -> TomlTable:
+    """Return the file's outermost table, which fits the `schema` of a whole file.
 
     Raises
     ------
     InputError
-        No such file, not TOML (with the line), no schema, another schema or another version.
+        No such file, not TOML (with the line), no schema, another schema or another version, values of another kind.
     """
     source = Path(path)
     text = read_text(source, max_bytes=MAX_TOML_BYTES)
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: not valid TOML: {_one_line(error)}; correct that line") from error
+        words = " ".join(str(error).split())[:200]
+        raise InputError(f"{source}: not valid TOML: {words}; correct that line") from error
     except (ValueError, RecursionError) as error:
         fault = "nested too deep" if isinstance(error, RecursionError) else "a number of thousands of digits"
         raise InputError(f"{source}: not readable TOML: {fault}; correct the file") from error
-    table = TomlTable(values, source)
-    found = table.text("schema", hint=f'schema = "{schema}" as the first line')
-    if found != schema:
-        name, _, version = schema.partition("/")
-        if found.partition("/")[0] == name:
-            raise table.error(f"schema {_shown(found)} is of another version; write {name}/{version}, or update rigkit")
-        raise table.error(f'schema is {_shown(found)}, but a file with schema = "{schema}" is needed here')
-    return table
+    wanted = schema["properties"]["schema"]["const"]
+    found = values.get("schema")
+    if found is None:
+        raise InputError(f"{source}: 'schema' is missing; add schema = {toml_text(wanted)} as the first line")
+    if found != wanted:
+        name, _, version = wanted.partition("/")
+        if str(found).partition("/")[0] == name:
+            words = f"is of another version; write {name}/{version}, or update rigkit"
+            raise InputError(f"{source}: schema {_shown(found)} {words}")
+        raise InputError(f'{source}: schema is {_shown(found)}, but a file with schema = "{wanted}" is needed here')
+    return TomlTable(values, schema, source)

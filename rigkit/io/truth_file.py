@@ -2,56 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+from rigkit.io.schema_words import POSITIVE, TEXT, Schema, array, obj, said
 from rigkit.io.toml_reader import TomlTable
 
-Measured = TypeVar("Measured", MeasuredAngle, MeasuredDistance)
 
-HINT_BASELINE = 'baseline = { value_mm = 300.0, sigma_mm = 2.0, how = "steel rule" }'
-HINT_ANGLES = 'angles = [ { a = "plane1", b = "plane2", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]'
-HINT_DISTANCES = (
-    'distances = [ { a = "plane1.centre", b = "plane2", value_mm = 300.0, sigma_mm = 1.0, how = "steel rule" } ]'
-)
+def measured(unit: str) -> dict[str, Schema]:
+    """Return the keys of something measured in a unit."""
+    return {
+        f"value_{unit}": said(POSITIVE, f"as measured, {unit}", {"deg": 90.0, "mm": 300.0}[unit]),
+        f"sigma_{unit}": said(POSITIVE, "how far off the measurement may well be: one standard deviation", 0.5),
+        "how": said(TEXT, "by what it was measured: steel rule, set square, calipers", "steel rule"),
+    }
 
 
-def truth_from_table(table: TomlTable, boards: Sequence[Board]) -> PairTruth:
-    """Read `[pairs.truth]`; raises InputError for unknown keys, missing sigmas and boards that are not in the pair."""
-    baseline = None
-    if table.has("baseline"):
-        inner = table.table("baseline", hint=HINT_BASELINE)
-        measured = measured_value(inner, "mm")
-        inner.done()
+def between(unit: str, what: str, a: str, b: str) -> Schema:
+    """Return the schema of something measured between two things, such as `a` and `b`."""
+    return obj({"a": said(TEXT, what, a), "b": said(TEXT, "the other one", b), **measured(unit)})
+
+
+_ANGLE = {"a": "plane1", "b": "plane2", "value_deg": 90.0, "sigma_deg": 0.3, "how": "set square"}
+_DISTANCE = {"a": "plane1.centre", "b": "plane2", "value_mm": 300.0, "sigma_mm": 1.0, "how": "steel rule"}
+TRUTH_KEYS: Mapping[str, Schema] = {
+    "angles?": said(
+        array(between("deg", "a board", "plane1", "plane2")), "angles between boards, across their faces", [_ANGLE]
+    ),
+    "distances?": said(
+        array(between("mm", "a place: plane1, plane1.centre, plane1[0,5]", "plane1.centre", "plane2")),
+        "distances between places",
+        [_DISTANCE],
+    ),
+}
+
+
+def truth_from_table(table: Mapping[str, Any], boards: Sequence[Board]) -> PairTruth:
+    """Return what a table with TRUTH_KEYS, and perhaps a baseline, says; raises InputError for boards that are not in
+    the pair."""
+    baseline, angles, distances = None, [], []
+    if (inner := table.get("baseline")) is not None:
         with inner.located():
-            baseline = MeasuredLength(*measured)
-    angles = _between(table, "angles", HINT_ANGLES, ("deg", ""), boards, make_angle)
-    distances = _between(table, "distances", HINT_DISTANCES, ("mm", ".centre"), boards, make_distance)
-    table.done()
-    return PairTruth(baseline, angles, distances)
-
-
-def _between(
-    table: TomlTable,
-    key: str,
-    hint: str,
-    unit_and_place: tuple[str, str],
-    boards: Sequence[Board],
-    make: Callable[[str, str, float, float, str, Sequence[Board]], Measured],
-) -> tuple[Measured, ...]:
-    """Return what was measured between two things each; none where the key is not there."""
-    unit, place = unit_and_place
-    out = []
-    for inner in table.tables(key, hint=hint) if table.has(key) else ():
-        a, b = (inner.text(end, hint=f'{end} = "{boards[0].board_id}{place}"') for end in "ab")
-        measured = measured_value(inner, unit)
-        inner.done()
+            baseline = MeasuredLength(*measured_value(inner, "mm"))
+    for inner in table.get("angles", ()):
         with inner.located():
-            out.append(make(a, b, *measured, boards))
-    return tuple(out)
+            angles.append(make_angle(inner["a"], inner["b"], *measured_value(inner, "deg"), boards))
+    for inner in table.get("distances", ()):
+        with inner.located():
+            distances.append(make_distance(inner["a"], inner["b"], *measured_value(inner, "mm"), boards))
+    return PairTruth(baseline, tuple(angles), tuple(distances))
 
 
 def make_angle(a: str, b: str, value_deg: float, sigma_deg: float, how: str, boards: Sequence[Board]) -> MeasuredAngle:
@@ -95,7 +97,5 @@ def _board_of(board_id: str, boards: Sequence[Board]) -> Board:
 
 
 def measured_value(table: TomlTable, unit: str) -> tuple[float, float, str]:
-    """Return (value, sigma, how); none has a default."""
-    value = table.number(f"value_{unit}", hint=f"value_{unit} = 90.0" if unit == "deg" else f"value_{unit} = 300.0")
-    sigma = table.number(f"sigma_{unit}", hint=f"sigma_{unit} = 0.5: how far off the measurement may well be")
-    return value, sigma, table.text("how", hint='how = "steel rule": by what it was measured')
+    """Return (value, sigma, how)."""
+    return table[f"value_{unit}"], table[f"sigma_{unit}"], table["how"]

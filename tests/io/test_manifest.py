@@ -114,7 +114,7 @@ WRONG = [
     ('pose_type = "forward"', "", ["[[pairs]] 'first'", "'pose_type' is missing", "general, planar"]),
     ('pose_type = "forward"', 'pose_type = "sideways"', ["'sideways'", "standard, forward, auto"]),
     ("level =", "levl =", ["[[pairs]] 'first'", "unknown key 'levl'", "did you mean 'level'"]),
-    ("sigma_deg = 0.2", "sigma = 0.2", ["'sigma_deg' is missing"]),
+    ("sigma_deg = 0.2", "sigma = 0.2", ["unknown key 'sigma'; did you mean 'sigma_deg'"]),
     ("value_mm = 200.0, sigma_mm = 2.0", "value_mm = 200.0", ["'baseline'", "'sigma_mm' is missing"]),
     ("value_mm = 200.0", "value_mm = -200.0", ["must be positive"]),
     ("value_mm = 200.0", 'value_mm = "200 mm"', ["must be a number"]),
