@@ -34,7 +34,7 @@ from rigkit.affine.registry import AFFINE_METHODS, affines_from_directions
 from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, rotation_angle
-from rigkit.geometry.triangulation import correct_hartley_sturm, correct_lindstrom, triangulate_rays
+from rigkit.geometry.triangulation import correct_lindstrom, triangulate_rays
 from rigkit.kernels.minimal import five_rows, six_rows
 from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
@@ -217,12 +217,6 @@ def triangulation_rows(rng: np.random.Generator, count: int = 100_000, few: int 
 
     yield row(
         "Lindstrom correction", count, lambda: correct_lindstrom(q1, q2, F21), OpenCV_correctMatches=(few, opencv)
-    )
-    yield row(
-        "Hartley-Sturm correction",
-        few,
-        lambda: correct_hartley_sturm(q1[:few], q2[:few], F21),
-        OpenCV_correctMatches=(few, opencv),
     )
     P1, P2 = CAMERA.K @ np.eye(3, 4), CAMERA.K @ POSE.matrix()[:3]
     yield row(

@@ -132,14 +132,10 @@ def geometry_seen(
 
 def normals_in_sigmas(measured: Measured, truth: np.ndarray) -> Iterator[float]:
     """Yield each plane's normal error across either tangent, in its sigma."""
-    count = len(measured.steps)
-    assert measured.pose_covariance is not None
     for board, true in zip(PLANES, truth, strict=True):
         plane, moved = measured.boards[board.board_id].plane, measured.moved[board.board_id].normal
-        ahead, back, again = np.split(moved @ plane.tangents, [count, 2 * count])
-        slopes = (ahead - back) / (2.0 * measured.steps[:, None])
-        common = slopes.T @ measured.pose_covariance @ slopes
-        common += (again[1:] - again[:1]).T @ (again[1:] - again[:1])
+        tilts = (moved[1:] - moved[0]) @ plane.tangents
+        common = tilts.T @ tilts
         yield from (true @ plane.tangents) / np.sqrt(np.diag(plane.scatter[1:, 1:] + common))
 
 

@@ -12,13 +12,9 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.geometry.triangulation import point_covariances, triangulate_rays
+from rigkit.geometry.rotation import unit
+from rigkit.geometry.triangulation import point_uncertainty, triangulate_rays
 from rigkit.reconstruction.scale import scale_and_gradient
-from rigkit.relative_pose.solvers.pose import translation_basis
-
-POSE_STEP_RAD = 1e-5
-"""For central differences: far above rounding, far below where the scale bends."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,35 +47,20 @@ def triangulate_matches(
 ) -> TriangulatedPoints:
     """Intersect the rays of all matches.
 
-    The unit is that of the pose's translation. See `point_covariances` for the pose's share.
+    The unit is that of the pose's translation. `pose_covariance` (6, 6) adds the pose's share: see `point_uncertainty`.
     """
-    m = matches
-    points, valid = _points(matches, cam2_from_cam1)
-    covariance = point_covariances(
-        points,
-        cam2_from_cam1,
-        m.rays1,
-        m.rays2,
-        m.jacobians1,
-        m.jacobians2,
-        m.sigma1_px,
-        m.sigma2_px,
-        pose_covariance,
-    )
+    points, valid, covariance, by_pose = _uncertain_points(matches, cam2_from_cam1)
+    if pose_covariance is not None:
+        covariance = covariance + by_pose @ pose_covariance @ np.swapaxes(by_pose, -1, -2)
     return TriangulatedPoints(points, covariance, valid)
 
 
-def _points(m: Matches, cam2_from_cam1: Rigid3) -> tuple[Points, BoolArray]:
-    points, valid = triangulate_rays(
-        m.rays1,
-        m.rays2,
-        cam2_from_cam1,
-        jacobians1=m.jacobians1,
-        jacobians2=m.jacobians2,
-        sigma1_px=m.sigma1_px,
-        sigma2_px=m.sigma2_px,
-    )
-    return np.where(valid[:, None], points, np.nan), valid
+def _uncertain_points(m: Matches, cam2_from_cam1: Rigid3) -> tuple[Points, BoolArray, FloatArray, FloatArray]:
+    """Return points (N, 3), NaN where they are not valid (N,), and their `point_uncertainty`."""
+    seen, sigmas = (m.rays1, m.rays2), {"sigma1_px": m.sigma1_px, "sigma2_px": m.sigma2_px}
+    points, valid = triangulate_rays(*seen, cam2_from_cam1, jacobians1=m.jacobians1, jacobians2=m.jacobians2, **sigmas)
+    points = np.where(valid[:, None], points, np.nan)
+    return points, valid, *point_uncertainty(points, cam2_from_cam1, *seen, m.jacobians1, m.jacobians2, **sigmas)
 
 
 def metric_pose(
@@ -104,25 +85,24 @@ def metric_pose(
     part that moves the pose and, independent of it, a part that moves the points at fixed pose.
     """
     R, t = cam2_from_cam1.rotation, unit(cam2_from_cam1.translation_mm)
-    points, covariance, _ = triangulate_matches(matches, Rigid3(R, t))
-
-    def points_at(step: FloatArray) -> Points:
-        return _points(matches, Rigid3(exp_so3(step[:3]) @ R, unit(t + step[3:])))[0]
-
+    points, _, covariance, by_pose = _uncertain_points(matches, Rigid3(R, t))
     scale, sigma, d_scale_d_points = scale_and_gradient(points, matches.board_index, matches.grid, boards, covariance)
-    directions = np.zeros((5, 6))
-    directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
-    by_direction = []
-    for d in directions:
-        motion = (points_at(POSE_STEP_RAD * d) - points_at(-POSE_STEP_RAD * d)) / (2.0 * POSE_STEP_RAD)
-        # A point without a triangulation takes no part.
-        by_direction.append(float(np.sum(d_scale_d_points * np.nan_to_num(motion))))
-    gradient = np.array(by_direction) @ directions
-    to_metric = np.zeros((6, 6))
-    to_metric[:3, :3] = np.eye(3)
-    to_metric[3:] = np.outer(t, gradient)
-    to_metric[3:, 3:] += scale * np.eye(3)
-    full = to_metric @ pose_covariance @ to_metric.T
-    full[3:, 3:] += sigma**2 * np.outer(t, t)
+    # A point without a triangulation takes no part.
+    gradient = np.einsum("ni,nip->p", d_scale_d_points, np.nan_to_num(by_pose))
+    full = covariance_in_mm(t, pose_covariance, scale, sigma, gradient)
     baseline_sigma = float(np.sqrt(sigma**2 + gradient @ pose_covariance @ gradient))
     return MetricPose(Rigid3(R, scale * t), full, scale, baseline_sigma)
+
+
+def covariance_in_mm(
+    t: FloatArray, pose_covariance: FloatArray, scale: float, scale_sigma: float, d_scale_d_pose: FloatArray
+) -> FloatArray:
+    """Return the covariance (6, 6) of a pose in mm from that of the pose of unit baseline `t` (3,), and of its scale.
+
+    `scale_sigma` is that of the scale at a fixed pose, `d_scale_d_pose` (6,) how the scale moves with the pose.
+    """
+    to_metric = np.diag([1.0] * 3 + [scale] * 3)
+    to_metric[3:] += np.outer(t, d_scale_d_pose)
+    full = to_metric @ pose_covariance @ to_metric.T
+    full[3:, 3:] += scale_sigma**2 * np.outer(t, t)
+    return np.asarray(full)

@@ -26,7 +26,6 @@ from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKn
 from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
-from rigkit.reconstruction.metric import POSE_STEP_RAD
 from rigkit.reconstruction.moved_cameras import moved_cameras
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
@@ -47,6 +46,8 @@ MIN_GROWN = 100
 MOVED_RAD = np.deg2rad(0.5)
 """Change of the pose by which what was grown with the old one is grown again."""
 MAX_GROWTHS = 3
+POSE_STEP_RAD = 1e-5
+"""For differences of planes: far above rounding, far below where they bend."""
 SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
 OVERLAP = 3.5
