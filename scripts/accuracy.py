@@ -23,13 +23,13 @@ from rigkit.cli.console import progress_on_stderr
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
 from rigkit.io.manifest import load_dataset
-from rigkit.io.paper_tables import load_paper_tables
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
 from rigkit.workflows.datasets import DatasetOptions, PairJob, load_cameras, over_pairs
 from rigkit.workflows.pairs import geometry_of, match_images
+from rigkit.workflows.paper import load_paper_tables
 
 ROOT = Path(__file__).resolve().parents[1]
 

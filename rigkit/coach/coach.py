@@ -17,8 +17,7 @@ from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import RigAdvice, RigGuide
 from rigkit.core.errors import InputError
-from rigkit.io.image_size import announced_size
-from rigkit.io.images import quiet_opencv
+from rigkit.io.images import announced_sizes, quiet_opencv
 
 MAX_PICTURE_PX = 12000
 """Of a picture that a page sends."""
@@ -35,8 +34,8 @@ def decoded(data: bytes) -> Image:
     """Return the picture (H, W, 3) RGB in an upload, as the sensor has it, whatever way up it was held; raises
     InputError where it is none, or too large."""
     # Before a decoder makes room for them.
-    size_px = announced_size(data)
-    if size_px is None or max(size_px) > MAX_PICTURE_PX:
+    sizes = announced_sizes(data)
+    if not sizes or max(max(size_px) for size_px in sizes) > MAX_PICTURE_PX:
         raise InputError(f"coach: that is no picture of at most {MAX_PICTURE_PX} px a side; send a PNG or JPEG")
     try:
         with quiet_opencv():

@@ -8,27 +8,45 @@ alone. Where the images are gone, corners of an earlier detector are better than
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import rigkit
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import parse_json
 from rigkit.io.reading import read_bytes, read_text
-from rigkit.io.sources import source_hash
 
 CORNERS_SCHEMA = "rigkit.corners/2"
 MARK = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
 """How such a file begins, of any version, even if the rest of it is damaged."""
+SOURCE_SUFFIXES = {".py", ".c", ".h"}
+
+
+@functools.cache
+def source_hash() -> str:
+    """Return a hash of rigkit's sources: kept results of other code are computed again.
+
+    They are read once: what runs is what was there then.
+    """
+    root = Path(rigkit.__path__[0])
+    digest = hashlib.sha256()
+    for path in sorted(p for p in root.rglob("*") if p.suffix in SOURCE_SUFFIXES):
+        # Files of a moment, such as an editor's lock that links nowhere, come and go beside the code.
+        with suppress(FileNotFoundError):
+            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -4,8 +4,10 @@ CSV: u1_px, v1_px, u2_px, v2_px; optionally a11, a12, a21, a22; optionally du1_1
 the directions; optionally sigma_px and sigma_A. An empty field is unknown. Columns come in any order, other columns are
 an error. NPZ: arrays pixels1, pixels2 and optionally A21, directions1, directions2 (N, K, 2), sigma_px, sigma_A.
 
-NPZ of matchers (`matcher_arrays`) and COLMAP's database (`interop.colmap_database`) are read too: points, and rough
-affinities where features have frames.
+COLMAP's database (`interop.colmap_database`) and NPZ of matchers are read too: points, and rough affinities where
+features have frames. Arrays of matchers: keypoints0, keypoints1 with matches (K, 2) or matches0 (N,), -1 for none
+(LightGlue, SuperGlue); mkpts0, mkpts1 or kpts0, kpts1 (LoFTR, RoMa); lafs0, lafs1 (N, 2, 3), frames with the point in
+the last column (kornia). A leading batch of one is taken off. Pixel (0, 0) is the centre of the top-left pixel.
 
 AffineExtractor (https://github.com/LeventeHajder/AffineExtractor): ten numbers a line, a11 a21 a12 a22 tx ty x1 y1 x2
 y2, with q2 = A q1 + t. Its refinement moves t and leaves x2, y2 as they were matched, so the point in image 2 is
@@ -27,19 +29,19 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.affine.correspondences import Correspondences
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
 from rigkit.io.files import write_atomic
-from rigkit.io.matcher_arrays import from_matcher
-from rigkit.io.numbers import MAX_NUMBER, is_number
-from rigkit.io.reading import csv_table, read_bytes
+from rigkit.io.reading import MAX_NUMBER, csv_table, is_number, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
 SIGMA_COLUMNS = ("sigma_px", "sigma_A")
 DIRECTION = re.compile(r"^(du1|dv1|du2|dv2)_([1-9]\d*)$")
+MATCHED = (("mkpts0", "mkpts1"), ("kpts0", "kpts1"), ("keypoints0", "keypoints1"), ("lafs0", "lafs1"))
+"""Arrays of matchers."""
 ARRAYS = ("pixels1", "pixels2", "A21", "directions1", "directions2", *SIGMA_COLUMNS)
 
 SIGMA_OF_FRAMES = 0.2
@@ -190,7 +192,7 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
             f"correspondences '{source}': damaged NPZ, or not of numbers ({words}); write it again"
         ) from error
     try:
-        matched = from_matcher(table)
+        matched = _from_matcher(table)
     except InputError as error:
         raise InputError(f"correspondences '{source}': {error}") from error
     if matched is not None:
@@ -207,6 +209,53 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
             raise InputError(f"correspondences '{source}': array '{name}' is missing; add it")
     directions = (table["directions1"], table["directions2"]) if "directions1" in table else None
     return _built(source, table["pixels1"], table["pixels2"], table.get("A21"), directions, table)
+
+
+def _from_matcher(table: dict[str, FloatArray]) -> dict[str, FloatArray] | None:
+    """Return pixels1, pixels2 and perhaps A21 of a matcher's arrays; None where they are no matcher's.
+
+    Raises InputError where they do not fit each other.
+    """
+    names = next((pair for pair in MATCHED if pair[0] in table and pair[1] in table), None)
+    if names is None:
+        return None
+    rank = 3 if names[0] == "lafs0" else 2
+    first, second = (_unbatched(table[name], rank) for name in names)
+    which = _index_pairs(table, names, len(first), len(second))
+    first, second = first[which[:, 0]], second[which[:, 1]]
+    if rank == 2:
+        return {"pixels1": first, "pixels2": second}
+    if first.shape[1:] != (2, 3) or second.shape[1:] != (2, 3):
+        raise InputError(f"{names[0]}: local affine frames must be Nx2x3, got {first.shape}")
+    flat = np.abs(np.linalg.det(first[..., :2])) > 0.0
+    A21 = np.full((len(first), 2, 2), np.nan)
+    A21[flat] = second[flat][..., :2] @ np.linalg.inv(first[flat][..., :2])
+    return {"pixels1": first[..., 2], "pixels2": second[..., 2], "A21": A21}
+
+
+def _unbatched(values: FloatArray, rank: int) -> FloatArray:
+    out = values[0] if values.ndim == rank + 1 and len(values) == 1 else values
+    if out.ndim != rank:
+        raise InputError(f"expected an array of {rank} dimensions, got {values.shape}")
+    return out
+
+
+def _index_pairs(table: dict[str, FloatArray], names: tuple[str, str], count0: int, count1: int) -> IntArray:
+    """Return the indices (K, 2) of what matches, all in order where nothing says."""
+    if "matches" in table:
+        pairs: IntArray = _unbatched(table["matches"], 2).astype(np.int64)
+    elif "matches0" in table:
+        partner = _unbatched(table["matches0"], 1).astype(np.int64)
+        pairs = np.stack([np.arange(len(partner)), partner], axis=1)[partner >= 0]
+    elif count0 == count1:
+        pairs = np.repeat(np.arange(count0)[:, None], 2, axis=1)
+    else:
+        raise InputError(
+            f"{names[0]} has {count0} and {names[1]} {count1} points; array 'matches' must say which match"
+        )
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or (pairs < 0).any() or (pairs >= [count0, count1]).any():
+        raise InputError(f"matches: indices of {count0} and {count1} points are needed, K x 2")
+    return pairs
 
 
 def _rough(A21: FloatArray | None) -> dict[str, FloatArray]:

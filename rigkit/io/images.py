@@ -6,7 +6,9 @@ the file's own structure is walked before it is decoded.
 
 from __future__ import annotations
 
+import io
 import re
+import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,10 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.animation import PNG_START, frame_count
-from rigkit.io.image_size import announced_size
 from rigkit.io.reading import read_bytes
-from rigkit.io.tiff import as_stored, page_count
+from rigkit.io.tiff import TIFF_STARTS, as_stored, page_sizes
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
@@ -36,6 +36,7 @@ JPEG_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 """In entropy-coded data 0xff is followed by 0 (stuffing), a restart mark or 0xff (fill): else it is a marker."""
 BMP_START = b"BM"
+PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
 def read_image(path: str | Path) -> Image:
@@ -59,12 +60,13 @@ def read_image(path: str | Path) -> Image:
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")
-    if (size := announced_size(data)) is not None:
-        require_pixels(size, f"image '{source}'")
-    if (pages := page_count(data)) > 1:
-        raise InputError(f"image '{source}' holds {pages} pages; save each as a file of its own")
-    if (frames := frame_count(data)) > 1:
-        raise InputError(f"image '{source}' is an animation of {frames} frames; save each as a file of its own")
+    sizes = announced_sizes(data)
+    if not sizes:
+        raise InputError(f"image '{source}' is damaged or not an image that is read; convert it to PNG or JPEG")
+    require_pixels(max(sizes, key=lambda size: size[0] * size[1]), f"image '{source}'")
+    if (count := sizes.count(sizes[0])) > 1:
+        what = f"holds {count} pages" if data.startswith(TIFF_STARTS) else f"is an animation of {count} frames"
+        raise InputError(f"image '{source}' {what}; save each as a file of its own")
     try:
         with quiet_opencv():
             raw = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
@@ -108,6 +110,27 @@ def unread_format(data: bytes) -> str | None:
     """Return what a file that begins with `data` is, where that is known and not read as an image."""
     container = UNREAD_CONTAINERS.get(data[4:12])
     return container or next((name for start, name in UNREAD_STARTS.items() if data.startswith(start)), None)
+
+
+def announced_sizes(data: bytes) -> list[tuple[int, int]]:
+    """Return the (width, height) of every image or frame that a file announces, before a decoder makes room for them.
+
+    A file of a kilobyte may announce a thousand megapixels of one colour, and OpenCV returns the first frame of an
+    animation and says nothing. None are returned where Pillow does not know the format, or cannot read its head.
+    """
+    if data.startswith(TIFF_STARTS):
+        return page_sizes(data)
+    from PIL import Image as Pillow
+
+    limit = Pillow.MAX_IMAGE_PIXELS
+    try:
+        Pillow.MAX_IMAGE_PIXELS = None
+        with Pillow.open(io.BytesIO(data)) as picture:
+            return [picture.size] * getattr(picture, "n_frames", 1)
+    except (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, EOFError, struct.error):
+        return []
+    finally:
+        Pillow.MAX_IMAGE_PIXELS = limit
 
 
 def to_grey(image: Image) -> Image:

@@ -1,4 +1,4 @@
-"""Oriented clouds as PLY files that Open3D, CloudCompare and MeshLab read as they are.
+"""Oriented clouds and triangle meshes as PLY files that Open3D, CloudCompare and MeshLab read as they are.
 
 Binary, little endian. Names of the properties are those that these programs know (x y z nx ny nz red green blue); what
 they do not know (board, column, row, sigma_mm, normal_sigma_deg) they show as scalar fields.
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, Normals, Points
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.io.files import write_atomic
@@ -118,6 +118,22 @@ def ply_bytes(
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in notes)]
     header += [f"element vertex {len(cloud)}", *(f"property {kind} {name}" for name, kind, _ in columns), "end_header"]
     return ("\n".join(header) + "\n").encode("utf-8") + table.tobytes()
+
+
+def mesh_bytes(points: Points, normals: Normals, colours: NDArray[np.uint8], triangles: NDArray[np.int32]) -> bytes:
+    """Return the PLY of vertices (V, 3) with normals and colours, single precision, and triangles (T, 3)."""
+    places = [(name, "<f4") for name in (*POINT, *NORMAL_COLUMNS)]
+    vertices = np.empty(len(points), dtype=[*places, *((name, "u1") for name in COLOUR)])
+    for names, columns in ((POINT, points), (NORMAL_COLUMNS, normals), (COLOUR, colours)):
+        for name, column in zip(names, columns.T, strict=True):
+            vertices[name] = column
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, triangles
+    header = ["ply", "format binary_little_endian 1.0", "comment rigkit mesh", f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name, _ in places]
+    header += [f"property uchar {name}" for name in COLOUR]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    return ("\n".join(header) + "\n").encode() + vertices.tobytes() + faces.tobytes()
 
 
 def _one_line(text: str) -> str:

@@ -1,9 +1,13 @@
-"""Reading files: regular ones, of a size that they may have, in words that say what is wrong with any other."""
+"""Reading files: regular ones, of a size that they may have, and the range of numbers in them.
+
+Whatever lies outside of these limits is a slip or damage, and the error says what is wrong with it.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import stat
 from collections.abc import Iterator
@@ -18,6 +22,10 @@ MAX_BINARY_BYTES = 1_000_000_000
 """An image of 160 megapixels in 16 bits, a cloud of ten million points."""
 MAX_NAME_BYTES, MAX_PATH_BYTES = 255, 4095
 """What file systems take of one name, and the system of a whole path."""
+MAX_NUMBER = 1e9
+"""A thousand kilometres in mm."""
+MIN_POSITIVE = 1e-9
+"""A picometre in mm; a measurement with a smaller sigma would outweigh all else."""
 
 
 def usable_path(path: str | Path) -> Path:
@@ -131,3 +139,27 @@ def about(*paths: str | Path) -> Iterator[None]:
 def _named(path: str | Path, what: str) -> str:
     """Return what the file is and its name."""
     return f"{what} '{path}'" if what else f"'{path}'"
+
+
+def fault_of_number(value: object, *, positive: bool = True) -> str | None:
+    """Return what is wrong with a number of a file, in words that follow its name and "must be"; None if nothing is."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return "a number"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "a finite number"
+    if positive and value <= 0:
+        return "positive"
+    if abs(value) > MAX_NUMBER:
+        return f"at most {MAX_NUMBER:g}"
+    if positive and value < MIN_POSITIVE:
+        return f"at least {MIN_POSITIVE:g}"
+    return None
+
+
+def is_number(text: str) -> bool:
+    """Say whether words are a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -12,6 +12,7 @@ NEW_SUBFILE_TYPE, WIDTH, HEIGHT, ORIENTATION = 254, 256, 257, 274
 REDUCED_OR_MASK = 1 | 4
 """Bits of NewSubfileType: a smaller copy of another page, or its transparency."""
 AS_STORED = 1
+TIFF_STARTS = (b"II*\0", b"II+\0", b"MM\0*", b"MM\0+")
 VALUE_BYTES = {1: 1, 3: 2, 4: 4, 16: 8}
 """Sizes of the integer types."""
 
@@ -39,12 +40,6 @@ def as_stored(data: bytes) -> bytes:
     return data
 
 
-def page_count(data: bytes) -> int:
-    """Return how many images as large as the first one a TIFF holds, without previews and masks; 1 for other data."""
-    sizes = page_sizes(data)
-    return sum(size == sizes[0] for size in sizes) or 1
-
-
 def page_sizes(data: bytes) -> list[tuple[int, int]]:
     """Return the (width, height) of every image in a TIFF, without previews and masks; none for other data."""
     order = _byte_order(data)
@@ -59,9 +54,9 @@ def _value(page: dict[int, _Tag], tag: int) -> int:
 
 
 def _byte_order(data: bytes) -> Literal["little", "big"] | None:
-    if data[:4] in (b"II*\0", b"II+\0"):
-        return "little"
-    return "big" if data[:4] in (b"MM\0*", b"MM\0+") else None
+    if not data.startswith(TIFF_STARTS):
+        return None
+    return "little" if data.startswith(b"II") else "big"
 
 
 def _pages(data: bytes, order: Literal["little", "big"]) -> list[dict[int, _Tag]]:

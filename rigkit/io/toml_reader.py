@@ -18,8 +18,7 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
-from rigkit.io.numbers import fault_of_number
-from rigkit.io.reading import read_text, usable_path
+from rigkit.io.reading import fault_of_number, read_text, usable_path
 from rigkit.io.schema_words import ANY_OF, Schema
 
 MAX_TOML_BYTES = 4_000_000

@@ -20,8 +20,7 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.numbers import fault_of_number
-from rigkit.io.reading import csv_table, read_text
+from rigkit.io.reading import csv_table, fault_of_number, read_text
 from rigkit.io.truth_file import make_angle, make_distance
 
 TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.io.numbers import is_number
+from rigkit.io.reading import is_number
 
 MAX_DECIMALS = 6
 """Of a value with its sigma: nanometres."""

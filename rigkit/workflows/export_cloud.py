@@ -5,15 +5,18 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.colmap_model import colmap_model
 from rigkit.interop.las import las_bytes
-from rigkit.io.files import ensure_writable
+from rigkit.io.files import ensure_writable, npz_bytes
 from rigkit.io.manifest import Dataset, load_dataset
-from rigkit.io.npz import cloud_npz
 from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras
@@ -76,7 +79,7 @@ def export_cloud(
             _log.info(words)
     else:
         folder = options.output.parent
-        files[options.output.name] = cloud_npz(r) if options.kind == "npz" else _cloud_bytes(r.cloud, options.kind)
+        files[options.output.name] = _cloud_npz(r) if options.kind == "npz" else _cloud_bytes(r.cloud, options.kind)
     write_results(folder, files, force=options.force, inputs=known.inputs)
     return r
 
@@ -91,6 +94,30 @@ def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
     files: dict[str, str | bytes] = {options.output.name: _cloud_bytes(cloud, options.kind)}
     write_results(options.output.parent, files, force=options.force, inputs=(source,))
     return cloud
+
+
+def _cloud_npz(reconstruction: Reconstruction) -> bytes:
+    """Return an npz file: points, normals, sigmas, corners, affinities and the relative pose, units in the names."""
+    cloud, matches = reconstruction.cloud, reconstruction.matches
+    arrays: dict[str, NDArray[Any]] = {
+        "points_mm": cloud.points_mm,
+        "normals": cloud.normals,
+        "colours": cloud.colours,
+        "sigma_mm": cloud.sigma_mm,
+        "normal_sigma_rad": cloud.normal_sigma_rad,
+        "board_index": cloud.board_index,
+        "grid": cloud.grid,
+        "board_ids": np.array(cloud.board_ids),
+        "pixels1": reconstruction.pixels1,
+        "pixels2": reconstruction.pixels2,
+        "cam2_from_cam1": reconstruction.cam2_from_cam1.matrix(),
+        "E21": reconstruction.E21,
+    }
+    if matches.A21 is not None:
+        arrays["A21"] = matches.A21
+    if reconstruction.pose_covariance is not None:
+        arrays["pose_covariance"] = reconstruction.pose_covariance
+    return npz_bytes(arrays)
 
 
 def _cloud_bytes(cloud: OrientedCloud, kind: str) -> bytes:

@@ -9,8 +9,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.open3d import Mesh, poisson_mesh
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.mesh_file import mesh_bytes
-from rigkit.io.ply import read_ply
+from rigkit.io.ply import mesh_bytes, read_ply
 from rigkit.io.reading import about
 from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.affine.registry import AFFINE_METHODS
-from rigkit.core.errors import RigkitError
+from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
-from rigkit.io.paper_tables import load_paper_tables
+from rigkit.io.reading import csv_table, is_number
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
 from rigkit.report.paper_page import paper_page
 from rigkit.report.tables import table_files
@@ -40,6 +40,8 @@ from rigkit.workflows.provenance import software_facts
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
+PLANES_FILE = "planes.csv"
+BASELINES = "baselines.csv"
 
 _log = logging.getLogger(__name__)
 
@@ -104,6 +106,33 @@ def printed_tables(dataset: Dataset) -> PaperTables | None:
     """Return the paper's tables where they lie beside the data set."""
     folder = dataset.root.parent / PAPER
     return load_paper_tables(folder) if folder.is_dir() else None
+
+
+def load_paper_tables(folder: str | Path) -> PaperTables:
+    """Read `planes.csv` and `baselines.csv` of a folder such as datasets/hajder2021.
+
+    Raises InputError where one is missing, a row has another number of cells than the head, or a cell is no number.
+    """
+    return PaperTables(_read(Path(folder) / PLANES_FILE), _read(Path(folder) / BASELINES))
+
+
+def _read(path: Path) -> dict[str, dict[str, str]]:
+    head, rows = csv_table(path, "the paper's table")
+    out: dict[str, dict[str, str]] = {}
+    for line, row in rows:
+        name, *cells = row.values()
+        for cell in cells:
+            if not is_number(cell):
+                raise InputError(f"{path}: line {line}: {cell!r} is not a number; correct it")
+        out[_without_unit(name)] = dict(zip(map(_without_unit, head[1:]), cells, strict=True))
+    if not out:
+        raise InputError(f"{path}: no rows; restore the file")
+    return out
+
+
+def _without_unit(name: str) -> str:
+    """Return "measured" for "measured [mm]"."""
+    return name.split("[")[0].strip()
 
 
 def _repeat(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:

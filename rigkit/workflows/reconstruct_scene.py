@@ -24,8 +24,8 @@ from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.files import npz_bytes
 from rigkit.io.images import read_image_of
-from rigkit.io.npz import npz_bytes
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.growing.dense import Calibrations, grow_scene

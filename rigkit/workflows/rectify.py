@@ -17,9 +17,8 @@ from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.io.files import ensure_writable, npz_bytes, write_atomic, write_together
 from rigkit.io.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
-from rigkit.io.npz import npz_bytes
 from rigkit.io.reading import about
 from rigkit.io.rig_session import frames_of_images
 from rigkit.io.video import Video, is_video

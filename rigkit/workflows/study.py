@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
+from rigkit.io.corner_cache import source_hash
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
-from rigkit.io.sources import source_hash
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
 from rigkit.report.study_page import study_page

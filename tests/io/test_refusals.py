@@ -9,6 +9,7 @@ import os
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -22,8 +23,7 @@ from rigkit.core.identifiers import MAX_IDENTIFIER, check_identifier
 from rigkit.io.board_file import load_board
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.correspondences import read_correspondences
-from rigkit.io.image_size import announced_size
-from rigkit.io.images import read_image
+from rigkit.io.images import announced_sizes, read_image
 from rigkit.io.manifest import load_dataset
 from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.io.reading import read_bytes, read_text
@@ -289,17 +289,31 @@ def _head_of_png(width: int, height: int) -> bytes:
     )
 
 
+def _claiming(ending: str, *pairs: tuple[bytes, bytes]) -> bytes:
+    """A small image whose head says 30000 x 30000 px; `pairs` are its sides, as the format writes them."""
+    data = bytes(cv2.imencode(f".{ending}", np.zeros((41, 63, 3), np.uint8))[1])
+    for small, large in pairs:
+        assert small in data
+        data = data.replace(small, large)
+    return data
+
+
+def _sides(*sides: int, size: int, order: Literal["little", "big"]) -> tuple[bytes, bytes]:
+    return b"".join(n.to_bytes(size, order) for n in sides), (30_000).to_bytes(size, order) * 2
+
+
 HEADS = {
     "png": _head_of_png(30_000, 30_000),
-    "bmp": b"BM" + (200).to_bytes(4, "little") + bytes(8) + (40).to_bytes(4, "little")
-    + (30_000).to_bytes(4, "little") + (2**32 - 30_000).to_bytes(4, "little") + bytes(200),
+    "bmp": _claiming("bmp", _sides(63, 41, size=4, order="little")),
     "pgm": b"P5\n# a comment\n30000 30000\n255\nabc",
     "pam": b"P7\nWIDTH 30000\nHEIGHT 30000\nDEPTH 1\nMAXVAL 255\nENDHDR\nabc",
     "pfm": b"Pf\n30000 30000\n1.0\nabc",
     "hdr": b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 30000 +X 30000\nabc",
-    "gif": b"GIF89a" + (30_000).to_bytes(2, "little") * 2 + bytes(20),
-    "jp2": b"\0\0\0\x0cjP  \r\n\x87\n" + bytes(20) + b"ihdr" + (30_000).to_bytes(4, "big") * 2,
-}  # fmt: skip
+    "gif": _claiming("gif", _sides(63, 41, size=2, order="little")),
+    "jp2": _claiming("jp2", _sides(63, 41, size=4, order="big"), _sides(41, 63, size=4, order="big")),
+}
+UNREAD = ("hdr", "pam")
+"""Pillow does not know them, and no camera writes them."""
 
 
 @pytest.mark.parametrize("ending", sorted(HEADS))
@@ -307,7 +321,8 @@ def test_an_image_of_too_many_pixels(tmp_path: Path, ending: str, monkeypatch: p
     """It is refused before a decoder makes room for it."""
     (tmp_path / f"a.{ending}").write_bytes(HEADS[ending])
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
-    with pytest.raises(InputError, match=rf"a\.{ending}'.*30000 x 30000 px are more than"):
+    words = "not an image that is read" if ending in UNREAD else "30000 x 30000 px are more than"
+    with pytest.raises(InputError, match=rf"a\.{ending}'.*{words}"):
         read_image(tmp_path / f"a.{ending}")
 
 
@@ -324,7 +339,7 @@ def test_the_size_that_a_file_announces_is_that_of_its_image(ending: str, colour
         done = False
     if not done:
         pytest.skip(f"this OpenCV writes no {ending}")
-    assert announced_size(data.tobytes()) == (63, 41)
+    assert announced_sizes(data.tobytes()) == ([(63, 41)] if ending not in UNREAD else [])
 
 
 def test_one_pixel_less_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rigkit.io.sources import source_hash
+from rigkit.io.corner_cache import source_hash
 from rigkit.kernels import building
 
 

@@ -17,7 +17,6 @@ from helpers.reconstructions import make_reconstruction
 from rigkit.core.errors import InputError
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
-from rigkit.io.paper_tables import load_paper_tables
 from rigkit.report.render import render, shown_table
 from rigkit.report.tables import (
     measured_words,
@@ -29,6 +28,7 @@ from rigkit.report.tables import (
 )
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables, check_table, plane_table
+from rigkit.workflows.paper import load_paper_tables
 
 REPO = Path(__file__).parents[2]
 PAPER = REPO / "datasets" / "hajder2021"
