@@ -148,6 +148,24 @@ class DirectionNoise:
         return DirectionNoise(build @ self.covariance1 @ build.T, build @ self.covariance2 @ build.T)
 
 
+def propagated(by1: FloatArray, by2: FloatArray, use: BoolArray, noise: DirectionNoise) -> FloatArray:
+    """Return the covariance (N, 4, 4) of vec(A21) to first order.
+
+    Parameters
+    ----------
+    by1, by2 : (N, 4, K, 2) d vec(A21) / d directions of either image.
+    use : (N, K); directions not in use have no influence, but their noise may be NaN.
+    """
+    n, k = use.shape
+    unused = np.repeat(~use, 2, axis=1)
+    ignore = unused[:, :, None] | unused[:, None, :]
+    total = np.zeros((n, 4, 4))
+    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
+        flat = by.reshape(n, 4, 2 * k)
+        total += flat @ np.where(ignore, 0.0, covariance) @ np.swapaxes(flat, 1, 2)
+    return total
+
+
 def _block_diagonal(blocks: FloatArray) -> FloatArray:
     c = np.asarray(blocks, dtype=np.float64)
     if c.ndim != 4 or c.shape[2:] != (2, 2):
@@ -180,11 +198,6 @@ class Affinities:
 
     def __len__(self) -> int:
         return len(self.A21)
-
-    @property
-    def sigma(self) -> FloatArray | None:
-        """The same as `sigma_A`."""
-        return self.sigma_A
 
     @property
     def sigma_A(self) -> FloatArray | None:

@@ -16,6 +16,8 @@ from rigkit.core.matches import DirectionPairs
 
 CORNERS_AT_A_TIME = 8192
 """Corners worked on at a time: about fifty rows of this length fit a second-level cache."""
+MIN_CONDITIONING = 0.05
+"""Below this the directions do not determine the affinity: noise is magnified twentyfold and more."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, solve_each, unit_weights
+from rigkit.affine.components import PlanarDirections, finite, first_of, smallest_singular, unit_weights
 from rigkit.core.arrays import Affines, BoolArray, FloatArray
 from rigkit.core.matches import DirectionPairs
 
@@ -61,41 +61,12 @@ def epipolar_block(directions: PlanarDirections, n1: FloatArray, n2: FloatArray)
     return a, smallest_singular(m11, m12, m22)
 
 
-def epipolar_sensitivity(
-    directions: DirectionPairs, use: BoolArray, A21: Affines, epipolar: EpipolarNormals
-) -> tuple[FloatArray, FloatArray]:
-    """Return d vec(A) / d directions of image 1 and of image 2, each (N, 4, K, 2), to first order at consistent data.
-
-    Notes
-    -----
-    With alpha = |A d1| / |d2| the residual d2 x A d1 changes by d2 x (A dd1 - alpha dd2).
-    """
-    n, k = use.shape
-    d1 = np.where(use[..., None], directions.image1, 0.0)
-    d2 = np.where(use[..., None], directions.image2, 0.0)
-    square1, square2 = (d1**2).sum(-1) + ~use, (d2**2).sum(-1) + ~use
-    n2_hat = epipolar.n2 / np.linalg.norm(epipolar.n2, axis=-1, keepdims=True)
-    m = np.stack([-n2_hat[:, 1], n2_hat[:, 0]], axis=-1)
-    c = np.einsum("nki,ni->nk", d2, n2_hat)
-    weight = c / (square1 * square2)
-    normal = np.einsum("nk,nki,nkj->nij", weight * c, d1, d1)
-    # dy = -normal^-1 sum_k weight_k d1_k (d2_k x A dd1_k - alpha_k d2_k x dd2_k)
-    gain = -solve_each(normal, np.einsum("nk,nkj->njk", weight, d1))  # (N, 2, K)
-    across2 = np.stack([-d2[..., 1], d2[..., 0]], axis=-1)
-    stretch = np.linalg.norm(np.einsum("nij,nkj->nki", A21, d1), axis=-1) / np.sqrt(square2)
-    by1 = np.einsum("ni,njk,nkr,nrl->nijkl", m, gain, across2, A21, optimize=True)
-    by2 = -np.einsum("ni,njk,nk,nkl->nijkl", m, gain, stretch, across2, optimize=True)
-    return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)
-
-
-def soft_epipolar(
-    directions: DirectionPairs, use: BoolArray, epipolar: EpipolarNormals, weight: float = 1.0
-) -> Affines:
+def soft_epipolar(directions: DirectionPairs, use: BoolArray, epipolar: EpipolarNormals) -> Affines:
     """Return A (N, 2, 2) from the directions in use with the epipolar equations as two more rows, as in the paper.
 
     Notes
     -----
-    Minimises sum_k (perp(u2)^T A u1)^2 + weight^2 |A^T n2 + n1|^2 / |n2|^2. Dividing by |n2| removes the arbitrary
+    Minimises sum_k (perp(u2)^T A u1)^2 + |A^T n2 + n1|^2 / |n2|^2. Dividing by |n2| removes the arbitrary
     scale of F that the paper's rows carry. For comparison: with hard rows the normals are as good or better.
     """
     keep = use[..., None]
@@ -106,9 +77,9 @@ def soft_epipolar(
         n2_hat, v = epipolar.n2 / length, epipolar.n1 / length
     across2 = np.stack([-u2[..., 1], u2[..., 0]], axis=-1)
     rows = np.where(keep[..., None], across2[..., :, None] * u1[..., None, :], 0.0).reshape(*use.shape, 4)
-    line = weight * np.einsum("ni,jl->njil", n2_hat, np.eye(2)).reshape(-1, 2, 4)
+    line = np.einsum("ni,jl->njil", n2_hat, np.eye(2)).reshape(-1, 2, 4)
     system = np.concatenate([rows, line], axis=1)
-    right = -weight * np.einsum("njr,nj->nr", line, v)
+    right = -np.einsum("njr,nj->nr", line, v)
     normal = np.einsum("nki,nkj->nij", system, system)
     solvable = finite(normal) & (np.linalg.matrix_rank(np.nan_to_num(normal)) == 4)
     out = np.full((len(use), 2, 2), np.nan)

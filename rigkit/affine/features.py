@@ -27,6 +27,11 @@ SAME_POINT_PX = 8.0
 """Features of different simulated views this near are one point: no rivals in the ratio test."""
 RIVALS = 8
 MIN_CORRELATION = 0.9
+"""Of two aligned patches."""
+MAX_RATIO = 0.85
+"""A match must be nearer than this times its best rival elsewhere in the image (D. Lowe, IJCV 2004)."""
+CELL_PX = 4.0
+"""A cell of this side has one match."""
 FEATURES_OF_VIEWS = (600, 6000)
 """In a tilted view; and at most in a plain one."""
 AREA_OF_FEATURE = 150.0
@@ -50,9 +55,6 @@ def match_affine_features(
     *,
     tilts: Sequence[float] | None = None,
     features_per_view: int | None = None,
-    ratio: float = 0.85,
-    half_width_px: int = 16,
-    min_correlation: float = MIN_CORRELATION,
     unique: bool = False,
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
@@ -62,9 +64,6 @@ def match_affine_features(
     image1, image2 : (H, W) or (H, W, 3) RGB, uint8 or uint16.
     tilts : simulated tilts, 1 (none) and above. None: none, and where that finds too little, those of TILTS too.
     features_per_view : strongest SIFT features kept in each simulated view; None: by the area of the image.
-    ratio : a match must be nearer than this times its best rival elsewhere in the image.
-    half_width_px : of the patches aligned; surfaces are taken as flat within.
-    min_correlation : of two aligned patches.
     unique : features of the same image that look alike are rivals, too. What is repeated (tiles, keys, bricks) is
         easily matched a period off, and such a match may lie near its epipolar line all the same.
 
@@ -80,8 +79,8 @@ def match_affine_features(
     found: _AlignedMatches | None = None
     for views in (_views(tilts),) if tilts is not None else (_views((1.0,)), _views(TILTS)):
         first, second = (_features(grey, views, features_per_view) for grey in greys)
-        matched = _match(first, second, ratio, unique)
-        found = _aligned(first, second, matched, pyramid1, pyramid2, half_width_px, min_correlation)
+        matched = _match(first, second, unique)
+        found = _aligned(first, second, matched, pyramid1, pyramid2)
         if len(found.pairs) >= ENOUGH_PLAIN:
             break
     assert found is not None
@@ -106,17 +105,15 @@ def _aligned(
     matched: tuple[IntArray, IntArray, FloatArray],
     pyramid1: Pyramid,
     pyramid2: Pyramid,
-    half_width_px: int,
-    min_correlation: float,
 ) -> _AlignedMatches:
     """Return the matches of two images' features whose patches align."""
     i, j, rank = matched
     once = _unrepeated(first.pixels[i], second.pixels[j], rank)
     i, j = i[once], j[once]
     A21 = second.frames[j] @ np.linalg.inv(first.frames[i]) if i.size else np.zeros((0, 2, 2))
-    refined = refine_patches(pyramid1, pyramid2, first.pixels[i], second.pixels[j], A21, half_width_px=half_width_px)
+    refined = refine_patches(pyramid1, pyramid2, first.pixels[i], second.pixels[j], A21)
     with np.errstate(invalid="ignore"):
-        good = refined.valid & (refined.correlation >= min_correlation)
+        good = refined.valid & (refined.correlation >= MIN_CORRELATION)
     good[good] = _unrepeated(first.pixels[i][good], refined.pixels2[good], refined.sigma_A[good])
     pairs = Correspondences(
         first.pixels[i][good],
@@ -226,7 +223,7 @@ def _simulated(
     return view, cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=0), view_from_image
 
 
-def _match(first: _Features, second: _Features, ratio: float, unique: bool) -> tuple[IntArray, IntArray, FloatArray]:
+def _match(first: _Features, second: _Features, unique: bool) -> tuple[IntArray, IntArray, FloatArray]:
     """Return index pairs of features that choose each other and have no rival elsewhere, with their distances."""
     forward, distance, rival = _nearest(first, second)
     backward, _, _ = _nearest(second, first)
@@ -239,7 +236,7 @@ def _match(first: _Features, second: _Features, ratio: float, unique: bool) -> t
             # The nearest is the feature itself: the rival is elsewhere in its own image.
             own = _nearest(features, features)[2]
             rival = np.minimum(rival, own[which]) if own.size else rival
-    i = np.flatnonzero(mutual & (distance < ratio * rival))
+    i = np.flatnonzero(mutual & (distance < MAX_RATIO * rival))
     return i, forward[i], distance[i]
 
 
@@ -269,12 +266,12 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
     return best, nearest, rival
 
 
-def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray, cell_px: float = 4.0) -> BoolArray:
+def _unrepeated(pixels1: Pixels, pixels2: Pixels, rank: FloatArray) -> BoolArray:
     """Return which to keep so that every cell of either image has one point, the one of lowest rank."""
     keep = np.zeros(len(pixels1), dtype=bool)
     order = np.argsort(rank, kind="stable")
     for pixels in (pixels1, pixels2):
-        cell = np.floor(pixels[order] / cell_px).astype(np.int64)
+        cell = np.floor(pixels[order] / CELL_PX).astype(np.int64)
         _, position = np.unique(cell, axis=0, return_index=True)
         order = order[np.sort(position)]
     keep[order] = True

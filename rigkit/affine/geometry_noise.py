@@ -13,6 +13,7 @@ import numpy as np
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
 from rigkit.core.arrays import Affines, FloatArray, RayJacobians, Rays
+from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
@@ -25,17 +26,10 @@ BASELINE_STEP = 1e-6
 
 
 def geometry_covariance(
-    rays1: Rays,
-    ray_jacobians1: RayJacobians,
-    rays2: Rays,
-    ray_jacobians2: RayJacobians,
+    matches: Matches,
     cam2_from_cam1: Rigid3,
     A21: Affines | Callable[[EpipolarNormals], Affines],
-    *,
-    sigma1_px: FloatArray | float,
-    sigma2_px: FloatArray | float,
     pose_covariance: FloatArray | None = None,
-    covariance: FloatArray | None = None,
 ) -> FloatArray:
     """Return the covariance (N, 3, 3) of the unit normals, rad^2, from corner and pose errors at fixed directions.
 
@@ -43,16 +37,13 @@ def geometry_covariance(
 
     Parameters
     ----------
-    rays1, rays2 : (N, 3); ray_jacobians1, ray_jacobians2 : (N, 3, 2)
+    matches : the corners, with their sigmas.
     cam2_from_cam1 : relative pose; points are triangulated with it.
     A21 : (N, 2, 2), or for F2UDIR and F3UDIR the function that gives them for an epipolar geometry, because those
         affinities move with it.
-    sigma1_px, sigma2_px : (N,) or scalars, corner standard deviation per axis.
     pose_covariance : (6, 6) of (left rotation perturbation rad, translation), or None: the pose is exact.
-    covariance : (N, 4, 4) of vec(A21) where the normals are weighted by it.
     """
-    f1, f2, b1, b2 = (np.asarray(v, dtype=np.float64) for v in (rays1, rays2, ray_jacobians1, ray_jacobians2))
-    n = len(f1)
+    f1, f2, b1, b2 = matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2
 
     def normals(corner1: FloatArray, corner2: FloatArray, pose: Rigid3) -> FloatArray:
         g1, c1 = _moved(f1, b1, corner1)
@@ -63,17 +54,17 @@ def geometry_covariance(
             affines = affines(EpipolarNormals.from_rays(g1, c1, g2, c2, E21))
         points, _ = triangulate_midpoint(g1, g2, pose)
         J1, J2 = pair_projection_jacobians(points, g1, c1, g2, c2, pose)
-        return normals_from_affines(J1, J2, affines, covariance=covariance)[0]
+        return normals_from_affines(J1, J2, affines)[0]
 
     still = np.zeros(2)
-    total = np.zeros((n, 3, 3))
+    total = np.zeros((len(f1), 3, 3))
     for axis in np.eye(2):
         step = STEP_PX * axis
         for sigma, plus, minus in (
-            (sigma1_px, normals(step, still, cam2_from_cam1), normals(-step, still, cam2_from_cam1)),
-            (sigma2_px, normals(still, step, cam2_from_cam1), normals(still, -step, cam2_from_cam1)),
+            (matches.sigma1_px, normals(step, still, cam2_from_cam1), normals(-step, still, cam2_from_cam1)),
+            (matches.sigma2_px, normals(still, step, cam2_from_cam1), normals(still, -step, cam2_from_cam1)),
         ):
-            change = (plus - minus) / (2.0 * STEP_PX) * np.broadcast_to(sigma, (n,))[:, None]
+            change = (plus - minus) / (2.0 * STEP_PX) * sigma[:, None]
             total += change[:, :, None] * change[:, None, :]
     if pose_covariance is not None:
         steps = np.repeat([STEP_RAD, BASELINE_STEP * np.linalg.norm(cam2_from_cam1.translation_mm)], 3)

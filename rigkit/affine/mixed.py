@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
-from rigkit.affine.components import finite
-from rigkit.affine.registry import MIN_CONDITIONING
+from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals, propagated
+from rigkit.affine.components import MIN_CONDITIONING, finite
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
+
+SINGULAR = 1e-6
+"""Below this the normal equations have no digits left."""
 
 
 def affines_from_mixed_directions(
@@ -70,7 +72,9 @@ def affines_from_mixed_directions(
         scale = (weight / length1[..., None])[..., None]
         by1 = scale * np.einsum("nkri,nij->nkrj", left, A21)
         by2 = -scale * np.where(counts, 1.0, mapped / length2)[..., None, None] * left
-        covariance = _propagate(free @ gain, by1, by2, use, noise)
+        spread = (free @ gain).reshape(n, 4, k, 2)
+        by1, by2 = (np.einsum("nakr,nkrj->nakj", spread, by) for by in (by1, by2))
+        covariance = propagated(by1, by2, use, noise)
         covariance[~valid] = np.nan
     return Affinities(A21, valid, conditioning, covariance)
 
@@ -109,20 +113,3 @@ def _least_squares(system: FloatArray, right: FloatArray) -> tuple[FloatArray, F
     gain = np.full((n, unknowns, system.shape[1]), np.nan)
     gain[good] = np.linalg.solve(normal[good], np.swapaxes(system[good], -1, -2))
     return np.einsum("nur,nr->nu", gain, right), gain, conditioning
-
-
-def _propagate(gain: FloatArray, by1: FloatArray, by2: FloatArray, use: BoolArray, noise: DirectionNoise) -> FloatArray:
-    """Return the covariance (N, 4, 4) of vec(A) from d residual / d direction, (N, K, 2 rows, 2) in either image."""
-    n, k = use.shape
-    spread = gain.reshape(n, 4, k, 2)
-    unused = np.repeat(~use, 2, axis=1)
-    ignore = unused[:, :, None] | unused[:, None, :]
-    total = np.zeros((n, 4, 4))
-    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
-        flat = np.einsum("nakr,nkrj->nakj", spread, by).reshape(n, 4, 2 * k)
-        total += flat @ np.where(ignore, 0.0, covariance) @ np.swapaxes(flat, 1, 2)
-    return total
-
-
-SINGULAR = 1e-6
-"""Below this the normal equations have no digits left."""

@@ -15,6 +15,8 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Pixels
 from rigkit.kernels.patches import MOST_LEVELS, PatchRules, Pyramid, aligned, starts_of
 
 PATCH_STEPS = 20
+HALF_WIDTH_OF_FEATURE = 16
+"""Px, of a patch in the image that shows it larger; the surface is taken as flat within."""
 SETTLED_PX = 1e-3
 """Move of a patch's border at which it is done."""
 WINDOW_OF_PATCH = 0.6
@@ -111,8 +113,6 @@ def refine_patches(
     pixels1: Pixels,
     pixels2: Pixels,
     A21: Affines,
-    *,
-    half_width_px: int = 16,
 ) -> RefinedPatches:
     """Return the affinities and points of image 2 that align the surroundings of `pixels1` best.
 
@@ -121,9 +121,8 @@ def refine_patches(
     pyramid1, pyramid2 : of the two images (`patch_pyramid`).
     pixels1, pixels2 : (N, 2); pixels2 good to a few px.
     A21 : (N, 2, 2) good to a few tenths.
-    half_width_px : of the patch in the image that shows it larger; the surface is taken as flat within.
     """
-    rules = patch_rules(half_width_px, most_move=0.5 * half_width_px, excess_noise=EXCESS_NOISE)
+    rules = patch_rules(HALF_WIDTH_OF_FEATURE, most_move=0.5 * HALF_WIDTH_OF_FEATURE, excess_noise=EXCESS_NOISE)
     found = aligned(pyramid1, pyramid2, rules, starts_of(pixels1, pixels2, A21))
     # Detail that only the sharper image 1 shows stays in the differences, alike over a pixel of image 2.
     with np.errstate(invalid="ignore"):
@@ -132,7 +131,7 @@ def refine_patches(
     return RefinedPatches(
         A21=found.A21,
         pixels2=found.pixels2,
-        sigma_A=np.hypot(np.sqrt(variances[:, 2:].mean(axis=1)), FLOOR_PX / half_width_px),
+        sigma_A=np.hypot(np.sqrt(variances[:, 2:].mean(axis=1)), FLOOR_PX / HALF_WIDTH_OF_FEATURE),
         sigma_px=np.hypot(np.sqrt(variances[:, :2].mean(axis=1)), FLOOR_PX),
         correlation=found.correlation,
         valid=np.isfinite(found.correlation),

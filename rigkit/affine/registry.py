@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals
-from rigkit.affine.components import PlanarDirections, blocks, finite, first_of
-from rigkit.affine.epipolar import epipolar_block, epipolar_sensitivity, soft_epipolar, usable_directions
+from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals, propagated
+from rigkit.affine.components import MIN_CONDITIONING, PlanarDirections, blocks, finite, first_of
+from rigkit.affine.epipolar import epipolar_block, soft_epipolar, usable_directions
+from rigkit.affine.mixed import affines_from_mixed_directions
 from rigkit.affine.scaled import scaled_block, scaled_sensitivity
 from rigkit.affine.unscaled import SCALES, determinant_block, determinant_sensitivity
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
@@ -14,9 +15,6 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
 AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
-
-MIN_CONDITIONING = 0.05
-"""Below this the directions do not determine the affinity: noise is magnified twentyfold and more."""
 
 _COUNT: dict[str, int | None] = {"F2UDIR": 2, "F3UDIR": None, "DET3UDIR": None, "2SDIR": 2, "3SDIR": None}
 _AT_LEAST = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
@@ -126,31 +124,29 @@ def _covariance(
     noise: DirectionNoise,
 ) -> FloatArray:
     """Propagate the direction noise to vec(A), (N, 4, 4), to first order; NaN where invalid."""
-    n, k = directions.valid.shape
-    out = np.full((n, 4, 4), np.nan)
+    out = np.full((len(valid), 4, 4), np.nan)
+    of_valid = DirectionNoise(noise.covariance1[valid], noise.covariance2[valid])
     some = DirectionPairs(
         image1=directions.image1[valid],
         image2=directions.image2[valid],
-        valid=directions.valid[valid],
+        valid=use[valid],
         scaled=directions.scaled,
         kinds=directions.kinds,
     )
     if epipolar is not None and needs_epipolar(method):
-        normals = EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])
-        by1, by2 = epipolar_sensitivity(some, use[valid], A21[valid], normals)
-    elif method == "DET3UDIR":
+        normals, no_lengths = EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid]), np.zeros(1, dtype=bool)
+        found = affines_from_mixed_directions(
+            some, no_lengths, epipolar=normals, noise=of_valid, min_conditioning=0.0
+        ).covariance
+        assert found is not None
+        out[valid] = found
+        return out
+    if method == "DET3UDIR":
         given = determinant_given
         by1, by2 = determinant_sensitivity(some, use[valid], A21[valid], scale, determinant_given=given)
     else:
         by1, by2 = scaled_sensitivity(some, use[valid], A21[valid])
-    # Directions not in use have no influence, but their noise may be NaN.
-    unused = np.repeat(~use[valid], 2, axis=1)
-    ignore = unused[:, :, None] | unused[:, None, :]
-    total = np.zeros((int(valid.sum()), 4, 4))
-    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
-        flat = by.reshape(-1, 4, 2 * k)
-        total += flat @ np.where(ignore, 0.0, covariance[valid]) @ np.swapaxes(flat, 1, 2)
-    out[valid] = total
+    out[valid] = propagated(by1, by2, use[valid], of_valid)
     return out
 
 

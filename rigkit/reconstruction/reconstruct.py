@@ -324,17 +324,7 @@ def oriented_cloud(
     points, covariance, seen = triangulated
     m = matches
     J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, cam2_from_cam1)
-    geometry = geometry_covariance(
-        m.rays1,
-        m.jacobians1,
-        m.rays2,
-        m.jacobians2,
-        cam2_from_cam1,
-        affines if affines is not None else affinities.A21,
-        sigma1_px=m.sigma1_px,
-        sigma2_px=m.sigma2_px,
-        pose_covariance=pose_covariance,
-    )
+    geometry = geometry_covariance(m, cam2_from_cam1, affines or affinities.A21, pose_covariance)
     normals = estimate_normals(J1, J2, affinities.A21, covariance=affinities.covariance, geometry=geometry)
     kept = seen & normals.valid & np.isfinite(covariance).all(axis=(1, 2))
     if not kept.any():

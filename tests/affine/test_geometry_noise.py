@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see, turned
+from helpers.affine_scenes import FISHEYE, REGULAR, Corners, angles_deg, see
 
-from rigkit.affine.affinities import DirectionNoise, EpipolarNormals
+from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.geometry_noise import geometry_covariance
 from rigkit.affine.normal import estimate_normals, normals_from_affines
 from rigkit.affine.registry import affines_from_directions
@@ -56,16 +58,9 @@ def test_corner_errors(camera: Camera, pose: Rigid3, limit: float, method: str, 
     def follow(e: EpipolarNormals) -> np.ndarray:
         return affines_from_directions(c.directions(), method, epipolar=e, min_conditioning=0.0).A21
 
-    share = geometry_covariance(
-        m.rays1,
-        m.jacobians1,
-        m.rays2,
-        m.jacobians2,
-        pose,
-        follow if method == "F3UDIR" else A21,
-        sigma1_px=SIGMA_PX,
-        sigma2_px=np.full(len(c), SIGMA_PX),
-    )
+    sigma = np.full(len(c), SIGMA_PX)
+    seen = replace(m, sigma1_px=sigma, sigma2_px=sigma)
+    share = geometry_covariance(seen, pose, follow if method == "F3UDIR" else A21)
     square = np.zeros(len(c))
     for _ in range(TRIALS):
         noisy = [q + SIGMA_PX * rng.normal(size=q.shape) for q in (c.pixels1, c.pixels2)]
@@ -83,17 +78,8 @@ def test_pose_errors(rng: np.random.Generator) -> None:
     assert c is not None
     _, m, A21 = normals_of(c, REGULAR, SIDE, "2SDIR", c.pixels1, c.pixels2)
     half = np.diag([2e-4, 3e-4, 1e-4, 0.3, 0.2, 0.4]) @ (np.eye(6) + 0.3 * np.tri(6, k=-1))
-    share = geometry_covariance(
-        m.rays1,
-        m.jacobians1,
-        m.rays2,
-        m.jacobians2,
-        SIDE,
-        A21,
-        sigma1_px=0.0,
-        sigma2_px=0.0,
-        pose_covariance=half @ half.T,
-    )
+    still = replace(m, sigma1_px=np.zeros(len(c)), sigma2_px=np.zeros(len(c)))
+    share = geometry_covariance(still, SIDE, A21, half @ half.T)
     square = np.zeros(len(c))
     for _ in range(600):
         change = half @ rng.normal(size=6)
@@ -108,30 +94,7 @@ def test_is_added_to_the_estimate() -> None:
     c = see(REGULAR, REGULAR, SIDE, [BOARD])
     assert c is not None
     share = np.broadcast_to(np.diag([1e-4, 2e-4, 1e-4]), (len(c), 3, 3))
-    sigma_A = np.full(len(c), 0.001)
-    without = estimate_normals(c.J1, c.J2, c.A21, sigma_A=sigma_A)
-    with_it = estimate_normals(c.J1, c.J2, c.A21, sigma_A=sigma_A, geometry=share)
-    np.testing.assert_allclose(with_it.covariance - without.covariance, share, atol=1e-15)
+    of_A21 = np.tile(1e-6 * np.eye(4), (len(c), 1, 1))
+    without = estimate_normals(c.J1, c.J2, c.A21, covariance=of_A21)
+    with_it = estimate_normals(c.J1, c.J2, c.A21, covariance=of_A21, geometry=share)
     np.testing.assert_allclose(with_it.sigma_rad**2 - without.sigma_rad**2, 4e-4, rtol=1e-9)
-
-
-def test_weights_do_not_blow_up_errors_of_the_corners(rng: np.random.Generator) -> None:
-    """F3UDIR's covariance is singular across the epipolar line; noisy corners leave a difference there all the same."""
-    c = see(REGULAR, REGULAR, SIDE, [BOARD])
-    assert c is not None
-    noisy = [q + SIGMA_PX * rng.normal(size=q.shape) for q in (c.pixels1, c.pixels2)]
-    m = Matches.from_cameras(REGULAR, REGULAR, *noisy)
-    e = EpipolarNormals.from_rays(
-        m.rays1, m.jacobians1, m.rays2, m.jacobians2, skew(SIDE.translation_mm) @ SIDE.rotation
-    )
-    directions = turned(c.directions(), 0.3, rng)
-    noise = DirectionNoise.angular(directions, np.radians(0.3), np.radians(0.3))
-    found = affines_from_directions(directions, "F3UDIR", epipolar=e, noise=noise)
-    points, _ = triangulate_rays(m.rays1, m.rays2, SIDE, jacobians1=m.jacobians1, jacobians2=m.jacobians2)
-    J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, SIDE)
-    plain, weighted = (
-        estimate_normals(J1, J2, found.A21, covariance=found.covariance, weighted=w).normals for w in (False, True)
-    )
-    ok = found.valid
-    error = angles_deg(plain, c.normals)[ok]
-    assert np.median(angles_deg(plain, weighted)[ok]) < 0.2 * np.median(error)

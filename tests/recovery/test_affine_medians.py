@@ -108,11 +108,11 @@ SIGMA_PX = 0.1
 
 
 @pytest.fixture(scope="module")
-def errors() -> dict[tuple[str, bool], tuple[np.ndarray, np.ndarray]]:
+def errors() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(14)
     scene = general_pairs(rng, 25, (15.0, 40.0))
     grid = np.rint(GRID / SQUARE_MM).astype(int)
-    out: dict[tuple[str, bool], list[tuple[np.ndarray, np.ndarray]]] = {}
+    out: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for board in range(len(scene) // len(grid)):
         c = scene.select(np.arange(len(grid)) + board * len(grid))
         fields = []
@@ -126,10 +126,9 @@ def errors() -> dict[tuple[str, bool], tuple[np.ndarray, np.ndarray]]:
         noise = DirectionNoise.of_board(fields[0].covariance, fields[1].covariance)
         for method in AFFINE_METHODS:
             found = affines_from_directions(directions, method, epipolar=c.epipolar, noise=noise)
-            for weighted in (False, True):
-                e = estimate_normals(c.J1, c.J2, found.A21, covariance=found.covariance, weighted=weighted)
-                row = (angles_deg(e.normals, c.normals)[e.valid], np.degrees(e.sigma_rad)[e.valid])
-                out.setdefault((method, weighted), []).append(row)
+            e = estimate_normals(c.J1, c.J2, found.A21, covariance=found.covariance)
+            row = (angles_deg(e.normals, c.normals)[e.valid], np.degrees(e.sigma_rad)[e.valid])
+            out.setdefault(method, []).append(row)
     return {key: tuple(np.concatenate(v) for v in zip(*rows, strict=True)) for key, rows in out.items()}  # type: ignore[misc]
 
 
@@ -140,19 +139,14 @@ class TestCornerNoise:
         ("method", "limit_deg"), [("2SDIR", 0.40), ("3SDIR", 0.40), ("DET3UDIR", 0.40), ("F3UDIR", 0.50)]
     )
     def test_medians(self, method: str, limit_deg: float, errors: dict) -> None:
-        assert np.median(errors[method, False][0]) < limit_deg
+        assert np.median(errors[method][0]) < limit_deg
 
     @pytest.mark.parametrize("method", AFFINE_METHODS)
     def test_predicted_errors(self, method: str, errors: dict) -> None:
-        error, sigma = errors[method, False]
-        assert np.sqrt(np.mean((error / sigma) ** 2)) == pytest.approx(1.0, abs=0.15)
-
-    def test_weights_help(self, errors: dict) -> None:
-        assert np.median(errors["2SDIR", True][0]) < 0.95 * np.median(errors["2SDIR", False][0])
-        error, sigma = errors["2SDIR", True]
+        error, sigma = errors[method]
         assert np.sqrt(np.mean((error / sigma) ** 2)) == pytest.approx(1.0, abs=0.15)
 
     def test_diagonal_that_is_a_sum_adds_nothing(self, errors: dict) -> None:
         """With exact lengths 2SDIR, 3SDIR and DET3UDIR coincide."""
-        np.testing.assert_allclose(errors["3SDIR", False][0], errors["2SDIR", False][0], atol=1e-6)
-        np.testing.assert_allclose(errors["DET3UDIR", False][0], errors["2SDIR", False][0], atol=1e-6)
+        np.testing.assert_allclose(errors["3SDIR"][0], errors["2SDIR"][0], atol=1e-6)
+        np.testing.assert_allclose(errors["DET3UDIR"][0], errors["2SDIR"][0], atol=1e-6)
