@@ -38,6 +38,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.coplanar_planes import coplanar_planes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import lattice_planes
@@ -48,7 +49,6 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import Measured, measure
 
 SIZE_PX = (960, 720)
@@ -142,9 +142,8 @@ def normals_in_sigmas(measured: Measured, truth: np.ndarray) -> Iterator[float]:
 def in_sigmas(scene: StereoScene, geometry: PairGeometry, found: Calibration) -> Iterator[tuple[str, float]]:
     """Yield (what, error in stated sigmas) of a pair."""
     reconstruction = reconstruct_from(geometry)
-    level = reconstruction.level_sigma_rad
     known = uncertain_camera(found)
-    shifts = calibration_shifts(reconstruction, known, level_sigma_rad=level)
+    shifts = calibration_shifts(reconstruction, known)
     measured = measure(reconstruction, shifts)
     fitted: dict[str, BoardPlanes] = {
         "coplanar": coplanar_planes(geometry, known, one_camera=True),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -167,6 +167,19 @@ class Matches:
             sigma_A=sigma_A,
         )
 
+    def through(self, camera1: CentralCamera, camera2: CentralCamera) -> Matches:
+        """Return the same pixels as other cameras see them, without affinities."""
+        return Matches.from_cameras(
+            camera1,
+            camera2,
+            self.pixels1,
+            self.pixels2,
+            sigma1_px=self.sigma1_px,
+            sigma2_px=self.sigma2_px,
+            board_index=self.board_index,
+            grid=self.grid,
+        )
+
     def with_affinities(self, A21: Affines, sigma_A: FloatArray | None = None) -> Matches:
         """Return the same matches with affinities."""
         return replace(self, A21=A21, sigma_A=sigma_A)
@@ -179,22 +192,6 @@ class Matches:
         if not mask and (index.dtype.kind not in "iu" or index.ndim != 1 or not ((index >= -n) & (index < n)).all()):
             raise InputError(f"matches: a mask or indices of {n} are needed, got {index.dtype} of {index.shape}")
 
-        def pick(array: FloatArray | None) -> FloatArray | None:
-            return None if array is None else array[index]
-
-        return Matches(
-            pixels1=self.pixels1[index],
-            pixels2=self.pixels2[index],
-            rays1=self.rays1[index],
-            rays2=self.rays2[index],
-            jacobians1=self.jacobians1[index],
-            jacobians2=self.jacobians2[index],
-            sigma1_px=self.sigma1_px[index],
-            sigma2_px=self.sigma2_px[index],
-            board_index=self.board_index[index],
-            grid=self.grid[index],
-            K1=self.K1,
-            K2=self.K2,
-            A21=pick(self.A21),
-            sigma_A=pick(self.sigma_A),
-        )
+        every = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("K1", "K2")}
+        picked: dict[str, Any] = {name: None if array is None else array[index] for name, array in every.items()}
+        return replace(self, **picked)

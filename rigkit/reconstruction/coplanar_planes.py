@@ -26,7 +26,7 @@ from rigkit.reconstruction.board_planes import (
     near_the_rest,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
-from rigkit.reconstruction.moved_cameras import moved_cameras
+from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
 from rigkit.reconstruction.noise_level import variance_factor
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
 
@@ -109,8 +109,7 @@ def coplanar_planes(
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
     cameras = [(pair.camera1, pair.camera2), *moved]
-    both = [(c, pixels) for two in cameras for c, pixels in zip(two, _pixels(pair.captured), strict=True)]
-    seen = np.logical_and.reduce([camera.unproject(pixels)[1] for camera, pixels in both])
+    seen = seen_by_all(cameras, pair.captured.pixels1, pair.captured.pixels2)
     matches, boards, total = _on_boards(pair.captured.select(seen), pair.boards)
     if not boards:
         raise DegenerateError(
@@ -124,10 +123,6 @@ def coplanar_planes(
     fit = _Fit.of(problem, state, boards, pair.pair_id)
     again = [fit.moved(problem.through(*two), boards) for two in moved]
     return _result(fit, again, boards, total)
-
-
-def _pixels(matches: Matches) -> tuple[FloatArray, FloatArray]:
-    return matches.pixels1, matches.pixels2
 
 
 def _on_boards(matches: Matches, boards: tuple[Board, ...]) -> tuple[Matches, list[Board], int]:

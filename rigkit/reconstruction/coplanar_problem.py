@@ -79,17 +79,7 @@ class CoplanarProblem:
 
     def through(self, camera1: Camera, camera2: Camera) -> CoplanarProblem:
         """Return the same corners by other cameras."""
-        m = self.matches
-        seen = Matches.from_cameras(
-            camera1,
-            camera2,
-            m.pixels1,
-            m.pixels2,
-            sigma1_px=m.sigma1_px,
-            sigma2_px=m.sigma2_px,
-            board_index=m.board_index,
-            grid=m.grid,
-        )
+        seen = self.matches.through(camera1, camera2)
         seen = seen if self.frames is None else self.frames.matches(seen)
         return replace(self, matches=seen, bases2=np.asarray(np.linalg.pinv(seen.jacobians2)))
 

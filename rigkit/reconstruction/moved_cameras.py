@@ -5,11 +5,13 @@ The axes are independent: the squares of what they change in a quantity add up t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import Pixels, RayJacobians, Rays
+from rigkit.core.arrays import BoolArray, Pixels
 
 
 def moved_cameras(
@@ -25,9 +27,6 @@ def moved_cameras(
     return first if one or known2 is None else first + [(camera1, moved) for moved in known2.moved()]
 
 
-def moved_sights(camera: Camera, was: Camera, pixels: Pixels, by_coordinate: RayJacobians) -> tuple[Rays, RayJacobians]:
-    """Return rays (N, 3) of pixels as a moved camera has them, and their derivatives by the coordinates of affinities,
-    which were `by_coordinate` (N, 3, 2) in the camera as it was: coordinates (rectified, or the captured pixels) move
-    with the pixels as they did."""
-    captured_by_coordinate = np.linalg.pinv(was.ray_jacobian(pixels)) @ by_coordinate
-    return camera.unproject(pixels)[0], camera.ray_jacobian(pixels) @ captured_by_coordinate
+def seen_by_all(cameras: Sequence[tuple[Camera, Camera]], pixels1: Pixels, pixels2: Pixels) -> BoolArray:
+    """Return which pixels (N, 2) of both images have a ray in all of the cameras."""
+    return np.asarray(np.all([a.unproject(pixels1)[1] & b.unproject(pixels2)[1] for a, b in cameras], axis=0))

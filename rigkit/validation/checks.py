@@ -20,12 +20,12 @@ from rigkit.core.errors import InputError
 from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
 from rigkit.validation.check import Check, compare
 from rigkit.validation.declarations import DECLARED, contradicted_boards, declaration_checks
 from rigkit.validation.fitted_planes import AngleResult, FittedPlanes, normal_errors_against
-from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.measure import Measured, measure
 from rigkit.validation.planes import NormalErrors
 

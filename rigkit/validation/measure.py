@@ -18,9 +18,9 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.truth import MeasuredDistance
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.triangulation import point_uncertainty
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved, places_on
-from rigkit.validation.intrinsics import CalibrationShifts
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
 Boards = dict[str, BoardResult]

@@ -17,11 +17,11 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image_of, to_grey
 from rigkit.io.manifest import Pair
 from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts, calibration_shifts
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
-from rigkit.validation.intrinsics import CalibrationShifts, calibration_shifts
 from rigkit.workflows.datasets import LoadedCamera
 
 Detections: TypeAlias = tuple[BoardDetection, ...]
@@ -101,7 +101,7 @@ def shifts_of(reconstruction: Reconstruction, camera1: LoadedCamera, camera2: Lo
     if known1 is None or known2 is None:
         return None
     second = None if camera1 is camera2 else known2
-    return calibration_shifts(reconstruction, known1, second, level_sigma_rad=reconstruction.level_sigma_rad)
+    return calibration_shifts(reconstruction, known1, second)
 
 
 def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera) -> BoardPlanes:

@@ -11,9 +11,9 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
+from rigkit.reconstruction.calibration_shifts import with_calibrations
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import cloud_png, corners_png, epipolar_png
-from rigkit.validation.intrinsics import with_calibrations
 from rigkit.workflows.datasets import (
     DatasetOptions,
     PairFailure,

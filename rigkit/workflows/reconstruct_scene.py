@@ -28,9 +28,9 @@ from rigkit.io.files import npz_bytes
 from rigkit.io.images import read_image_of
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
+from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
-from rigkit.reconstruction.scene_calibrations import with_scene_calibrations
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import cloud_png, epipolar_png
@@ -170,7 +170,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     if images and options.grow:
         scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known, of=of)
     if of is not None and not maps:
-        sparse = with_scene_calibrations(scene.reconstruction, *of, pose_is_known=known)
+        shifts = calibration_shifts(scene.reconstruction, *of, pose_is_known=known)
+        sparse = with_calibrations(scene.reconstruction, shifts)
         scene = replace(scene, reconstruction=sparse)
     r = scene.reconstruction
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))

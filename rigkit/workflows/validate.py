@@ -19,6 +19,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts, with_calibrations
 from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
@@ -31,7 +32,6 @@ from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
-from rigkit.validation.intrinsics import CalibrationShifts, with_calibrations
 from rigkit.validation.tables import best_report
 from rigkit.workflows.datasets import (
     DatasetOptions,

@@ -18,8 +18,8 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
+from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.scene import reconstruct_scene
-from rigkit.reconstruction.scene_calibrations import with_scene_calibrations
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.relative_pose.refinement.refine import refine_pose
 
@@ -200,7 +200,8 @@ def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_kno
         camera = REGULAR.with_parameters(rng.multivariate_normal(REGULAR.parameters, covariance))
         scene = reconstruct_scene(found, camera, camera, baseline_mm=300.0, known_pose=known)
         alone = scene.reconstruction
-        whole = with_scene_calibrations(alone, UncertainCamera(camera, covariance), None, pose_is_known=pose_is_known)
+        shifts = calibration_shifts(alone, UncertainCamera(camera, covariance), pose_is_known=pose_is_known)
+        whole = with_calibrations(alone, shifts)
         assert whole.cloud.calibration_in_sigmas and not alone.cloud.calibration_in_sigmas
         _, a, b = np.intersect1d(exact.kept, scene.kept, return_indices=True)
         off = (whole.cloud.points_mm[b] - exact.reconstruction.cloud.points_mm[a]) ** 2

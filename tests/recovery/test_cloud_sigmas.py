@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.posetype import PoseType
+from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene
-from rigkit.validation.intrinsics import calibration_shifts, with_calibrations
 
 DRAWS, SCENES = 12, 3
 POINTS = (0.85, 1.85)
@@ -59,7 +59,7 @@ def test_sigmas_of_free_clouds_include_the_calibration(rng: np.random.Generator,
         matched = match_pair("made", calibrated, calibrated, one, two, BOARDS)
         given = reconstruct_pair(matched, pose_type=scene.pose_type, affine_method=method)
         known = UncertainCamera(calibrated, covariance)
-        whole = with_calibrations(given, calibration_shifts(given, known, level_sigma_rad=given.level_sigma_rad))
+        whole = with_calibrations(given, calibration_shifts(given, known))
         assert whole.cloud.calibration_in_sigmas and np.isfinite(whole.cloud.sigma_mm).all()
         off = errors(whole, scene)
         off_mm.append(off[0])

@@ -26,11 +26,11 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
+from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.intrinsics import calibration_shifts
 
 DRAWS = 400
 SIGMA_PX = 0.03
@@ -68,7 +68,7 @@ def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate
     shifts = None
     if covariance is not None:
         known = UncertainCamera(camera, covariance)
-        shifts = calibration_shifts(reconstruction, known, level_sigma_rad=reconstruction.level_sigma_rad)
+        shifts = calibration_shifts(reconstruction, known)
     return validate(reconstruction, truth, shifts=shifts)
 
 

@@ -20,9 +20,9 @@ from rigkit.geometry.relative_pose import relative_pose, relative_pose_covarianc
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.colmap import colmap_pair, solve_pair
+from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.crosscheck import ADJUSTED, PNP, crosscheck, sigma_of_difference
-from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import measure
 from rigkit.validation.pnp import planar_pnp
 

@@ -11,9 +11,9 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.principal_axes import principal_axes
+from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.checks import validate
-from rigkit.validation.intrinsics import calibration_shifts
 from rigkit.validation.measure import measure
 
 DRAWS = 20

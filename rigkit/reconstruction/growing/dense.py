@@ -26,7 +26,7 @@ from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKn
 from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
-from rigkit.reconstruction.moved_cameras import moved_cameras
+from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
@@ -284,11 +284,9 @@ def _moved_poses(even: _EvenPose, r: Reconstruction, calibrations: Calibrations)
     t, to_length = pose.translation_mm, np.repeat([1.0, r.baseline_mm], 3)
     moves = []
     for cameras in moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None):
-        seen = np.flatnonzero(cameras[0].unproject(m.pixels1)[1] & cameras[1].unproject(m.pixels2)[1])
+        seen = np.flatnonzero(seen_by_all([cameras], m.pixels1, m.pixels2))
         here = m.select(seen)
-        there = Matches.from_cameras(
-            *cameras, here.pixels1, here.pixels2, sigma1_px=here.sigma1_px, sigma2_px=here.sigma2_px
-        )
+        there = here.through(*cameras)
         before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
         change = to_length * (even.pose.by_distance[:, seen] @ (after - before))
         moves.append(_Moved(cameras, change))

@@ -1,9 +1,9 @@
 """What the uncertainty of the calibrations does to a reconstruction.
 
 A calibration is one error for a whole pair: it tilts planes and stretches baselines without leaving any scatter behind.
-So each principal axis of what they leave open is tried: the cameras moved by one standard deviation along it, the
-pose, the scale and the points estimated again from the same corners. The axes are independent, so the squares of what
-they change in a quantity add up to its variance.
+So the cameras are moved by one standard deviation along each principal axis of their covariance, and the pose, the
+scale and the points are estimated again from the same corners or correspondences. The axes are independent: the squares
+of what they change in a quantity add up to its variance.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import moved_cameras
+from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -70,95 +70,94 @@ def calibration_shifts(
     known1: UncertainCamera,
     known2: UncertainCamera | None = None,
     *,
-    level_sigma_rad: float | None = None,
+    pose_is_known: bool = False,
 ) -> CalibrationShifts:
     """Return the reconstruction with its cameras moved by one standard deviation along every principal axis.
 
     Parameters
     ----------
-    reconstruction : of one pair.
+    reconstruction : of one pair, with boards or of any scene.
     known1 : camera 1 as it is known.
     known2 : camera 2, or None where both images are of one camera: then both move together.
-    level_sigma_rad : as in the reconstruction.
+    pose_is_known : the pose was measured and stays as it is.
     """
-    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    cameras = [(camera1, camera2), *moved_cameras(camera1, camera2, known1, known2, one=known2 is None)]
+    r = reconstruction
+    cameras = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, known1, known2, one=known2 is None)]
     # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
-    seen = np.logical_and.reduce(
-        [
-            camera.unproject(pixels)[1]
-            for both in cameras
-            for camera, pixels in zip(both, (reconstruction.pixels1, reconstruction.pixels2), strict=True)
-        ]
-    )
-    again = [_again(reconstruction, *both, level_sigma_rad, seen) for both in cameras]
+    seen = seen_by_all(cameras, r.pixels1, r.pixels2)
+    again = [_again(r, *both, seen, pose_is_known) for both in cameras]
     base, *moved = (estimated for estimated, _ in again)
     return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
 
 
 def _again(
-    reconstruction: Reconstruction, camera1: Camera, camera2: Camera, level_sigma_rad: float | None, seen: BoolArray
+    r: Reconstruction, camera1: Camera, camera2: Camera, seen: BoolArray, pose_is_known: bool
 ) -> tuple[Reconstruction, BoolArray]:
     """Estimate pose, scale and points again from the corners `seen`, and say which points (N,) could be.
 
-    The other points, and all normals, stay.
+    The other points, and all normals, stay. Without boards the baseline keeps its length.
     """
-    known = reconstruction.matches.select(seen)
+    known = r.matches.select(seen)
     matches = Matches.from_cameras(
         camera1,
         camera2,
-        reconstruction.pixels1[seen],
-        reconstruction.pixels2[seen],
+        r.pixels1[seen],
+        r.pixels2[seen],
         sigma1_px=known.sigma1_px,
         sigma2_px=known.sigma2_px,
         board_index=known.board_index,
         grid=known.grid,
     )
-    pose = reconstruction.cam2_from_cam1
-    start = Rigid3(pose.rotation, pose.translation_mm / np.linalg.norm(pose.translation_mm))
-    frames = None if reconstruction.geometry is None else reconstruction.geometry.decision.level_frames
-    refined = refine_pose(matches, start, reconstruction.pose_type, level_sigma_rad, level_frames=frames)
-    points, covariance, valid = triangulate_matches(matches, refined.cam2_from_cam1)
-    scale, _ = metric_scale(points, matches.board_index, matches.grid, reconstruction.boards, covariance)
-    cloud = reconstruction.cloud
+    pose = Rigid3(r.cam2_from_cam1.rotation, r.cam2_from_cam1.translation_mm / r.baseline_mm)
+    if not pose_is_known:
+        frames = None if r.geometry is None else r.geometry.decision.level_frames
+        pose = refine_pose(matches, pose, r.pose_type, r.level_sigma_rad, level_frames=frames).cam2_from_cam1
+    points, covariance, valid = triangulate_matches(matches, pose)
+    scale = r.baseline_mm
+    if r.boards:
+        scale, _ = metric_scale(points, matches.board_index, matches.grid, r.boards, covariance)
     found = np.zeros(len(seen), dtype=bool)
     found[np.flatnonzero(seen)[valid]] = True
-    again = np.array(cloud.points_mm)
+    again = np.array(r.cloud.points_mm)
     again[found] = scale * points[valid]
     estimated = replace(
-        reconstruction,
+        r,
         camera1=camera1,
         camera2=camera2,
-        cam2_from_cam1=Rigid3(refined.cam2_from_cam1.rotation, scale * refined.cam2_from_cam1.translation_mm),
+        cam2_from_cam1=Rigid3(pose.rotation, scale * pose.translation_mm),
         pose_covariance=None,
-        cloud=replace(cloud, points_mm=again),
+        cloud=replace(r.cloud, points_mm=again),
         baseline_mm=scale,
     )
     return estimated, found
 
 
-def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts) -> Reconstruction:
+def with_calibrations(r: Reconstruction, shifts: CalibrationShifts) -> Reconstruction:
     """Return the reconstruction with the share of the calibrations in the sigmas of its cloud's points and normals.
 
     Along each axis of `shifts` a point moves, and its normal turns: by the moved point, pose and cameras, from the same
     affinity in the image, or where affinities follow from the epipolar geometry from the same directions. Sigmas of
     points that not all of the moved cameras see are NaN: nobody knows them.
 
-    Raises InputError for a reconstruction that is of no boards: its corners' noise is not known any more.
+    Raises InputError for points on fitted planes, which have that share.
     """
-    geometry, kept = reconstruction.geometry, reconstruction.kept
-    if geometry is None or kept is None:
-        raise InputError(f"pair '{reconstruction.pair_id}': the calibrations' share is for free points of boards")
-    cloud, known = reconstruction.cloud, shifts.known
+    if r.boards and r.kept is None:
+        raise InputError(f"pair '{r.pair_id}': the calibrations' share is for free points of boards")
+    cloud, known = r.cloud, shifts.known
     moves = shifts.points()[:, known]
-    covariance = geometry.points.covariance[kept][known] + np.einsum("kni,knj->nij", moves, moves)
-    m = reconstruction.matches.select(known)
+    if r.geometry is not None and r.kept is not None:
+        covariance = r.geometry.points.covariance[r.kept][known] + np.einsum("kni,knj->nij", moves, moves)
+        spread = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    else:
+        # The largest axis of a sum is no longer than this.
+        spread = np.sqrt(cloud.sigma_mm[known] ** 2 + np.sum(moves**2, axis=(0, 2)))
+    m = r.matches.select(known)
     # The coordinates of the affinities (rectified, or the captured pixels) move with the pixels as they did.
     by_coordinates = [
         np.linalg.pinv(camera.ray_jacobian(pixels[known])) @ by_coordinate
         for camera, pixels, by_coordinate in (
-            (reconstruction.camera1, reconstruction.pixels1, m.jacobians1),
-            (reconstruction.camera2, reconstruction.pixels2, m.jacobians2),
+            (r.camera1, r.pixels1, m.jacobians1),
+            (r.camera2, r.pixels2, m.jacobians2),
         )
     ]
     normals = []
@@ -166,18 +165,18 @@ def with_calibrations(reconstruction: Reconstruction, shifts: CalibrationShifts)
         one, two = (
             (rays[known], by_pixel[known] @ by) for (rays, by_pixel), by in zip(sights, by_coordinates, strict=True)
         )
-        normals.append(_normals(reconstruction, shift, known, one, two))
+        normals.append(_normals(r, shift, known, one, two))
     base, *turned = normals
     tilt = sum((np.sum((normals - base) ** 2, axis=1) for normals in turned), np.zeros(int(known.sum())))
     sigma_mm, normal_sigma = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
-    sigma_mm[known] = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    sigma_mm[known] = spread
     normal_sigma[known] = np.sqrt(cloud.normal_sigma_rad[known] ** 2 + tilt)
     whole = replace(cloud, sigma_mm=sigma_mm, normal_sigma_rad=normal_sigma, calibration_in_sigmas=True)
-    return replace(reconstruction, cloud=whole)
+    return replace(r, cloud=whole)
 
 
 def _normals(
-    reconstruction: Reconstruction,
+    r: Reconstruction,
     moved: Reconstruction,
     known: BoolArray,
     one: tuple[Rays, RayJacobians],
@@ -187,17 +186,14 @@ def _normals(
     with the derivatives by the coordinates of the affinities."""
     (rays1, by1), (rays2, by2) = one, two
     J1, J2 = pair_projection_jacobians(moved.cloud.points_mm[known], rays1, by1, rays2, by2, moved.cam2_from_cam1)
-    A21 = None if reconstruction.matches.A21 is None else reconstruction.matches.A21[known]
-    if needs_epipolar(reconstruction.affine_method):
-        assert reconstruction.geometry is not None and reconstruction.kept is not None
-        E21 = essential_from_pose(moved.cam2_from_cam1)
-        seen = EpipolarNormals.from_rays(rays1, by1, rays2, by2, E21)
-        chosen = np.flatnonzero(reconstruction.kept)[known]
-        n1, n2 = np.full((2, len(reconstruction.kept), 2), np.nan)
+    assert r.matches.A21 is not None
+    A21 = r.matches.A21[known]
+    if r.geometry is not None and r.kept is not None and needs_epipolar(r.affine_method):
+        seen = EpipolarNormals.from_rays(rays1, by1, rays2, by2, essential_from_pose(moved.cam2_from_cam1))
+        chosen = np.flatnonzero(r.kept)[known]
+        n1, n2 = np.full((2, len(r.kept), 2), np.nan)
         n1[chosen], n2[chosen] = seen.n1, seen.n2
-        directions = reconstruction.geometry.pair.directions
-        A21 = affines_from_directions(directions, reconstruction.affine_method, epipolar=EpipolarNormals(n1, n2)).A21[
-            chosen
-        ]
-    assert A21 is not None
+        directions = r.geometry.pair.directions
+        found = affines_from_directions(directions, r.affine_method, epipolar=EpipolarNormals(n1, n2))
+        A21 = found.A21[chosen]
     return normals_from_affines(J1, J2, A21)[0]
