@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,14 +15,20 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, skew
-
-if TYPE_CHECKING:
-    pass
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
+from rigkit.reconstruction.noise_level import variance_factor
 
 MIN_CORNERS_OF_BOARD = 8
 """A board with fewer corners in a view has no pose there worth the name."""
 GROSS = 8.0
 """A corner this many standard deviations off is no corner of the board: something stands in front of it."""
+OUTLIER_ROUNDS = 3
+DAMPING_OF_PLANES = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
+STOP_OF_PLANES = Stop(steps=60, promise=1e-14, gain=1e-14)
+
+State = TypeVar("State")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,16 +109,41 @@ class BoardPlanes(ABC):
         return slice(start, start + 3)
 
 
+def likeliest(
+    state: State,
+    linearise: Callable[[State], DenseProblem],
+    moved: Callable[[State, FloatArray], State],
+    free: BoolArray,
+) -> State:
+    """Return the state of maximum likelihood near `state`; only the parameters `free` (P,) change."""
+
+    def stepped(at: State, step: DenseStep) -> State:
+        change = np.zeros(len(free))
+        change[free] = step.change
+        return moved(at, change)
+
+    return minimise(state, linearise, stepped, DAMPING_OF_PLANES, STOP_OF_PLANES).state
+
+
 def near_the_rest(lengths: FloatArray) -> BoolArray:
     """Return which corners (N,), whose residuals have these lengths, are no gross outliers by the median of all."""
-    # The median length of two normal residuals is 1.1774 of their sigma.
-    return np.asarray(lengths <= GROSS * max(float(np.median(lengths)) / 1.1774, 1e-9))
+    return np.asarray(lengths <= GROSS * max(float(np.median(lengths)) / MEDIAN_OF_RAYLEIGH, 1e-9))
 
 
-def inverse_information(gram: FloatArray, pair_id: str) -> FloatArray:
-    """Return the inverse of an information matrix; raises DegenerateError where it has none."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+def variance_and_covariance(
+    problem: DenseProblem, corners: int, unknowns: int, pair_id: str
+) -> tuple[float, FloatArray]:
+    """Return observed over stated variance of the corners, and the covariance (F, F) of the parameters at a minimum.
+
+    The first 2 `corners` residuals are the corners', less `unknowns` that are fitted to them; the others are priors,
+    whose variance stays what a person said. Raises DegenerateError where the corners do not determine the parameters.
+    """
+    data = problem.residual[: 2 * corners]
+    factor = variance_factor(float(data @ data), 2 * corners - unknowns)
+    variance = np.where(np.arange(len(problem.residual)) < len(data), factor, 1.0)
+    information = (problem.jacobian.T / variance) @ problem.jacobian
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if not values[0] > 1e-14:
         raise DegenerateError(f"pair '{pair_id}': the corners leave the boards' poses open; more of them must be seen")
-    return np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))
+    return factor, np.asarray((vectors / values) @ vectors.T / np.outer(scale, scale))

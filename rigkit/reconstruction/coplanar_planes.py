@@ -8,34 +8,30 @@ planes are estimated together. What the squares measure gives the length, as it 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3
 from rigkit.reconstruction.board_planes import (
     MIN_CORNERS_OF_BOARD,
+    OUTLIER_ROUNDS,
     BoardPlanes,
-    inverse_information,
     near_the_rest,
+    variance_and_covariance,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
 from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
-from rigkit.reconstruction.noise_level import variance_factor
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
 
 if TYPE_CHECKING:
     from rigkit.reconstruction.geometry import PairGeometry
-
-OUTLIER_ROUNDS = 3
-STEP = 1e-6
-"""For central differences, of each parameter's unit: far above rounding, far below where anything bends."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,7 +100,7 @@ def coplanar_planes(
 
     Notes
     -----
-    The calibrations' share is found by fitting again with the cameras moved along each principal axis.
+    The calibrations' share is linear, as that of `lattice_planes`.
     """
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
@@ -120,9 +116,7 @@ def coplanar_planes(
     planes = [geometry.pair.identity.cam1_from_board[board.board_id] for board in boards]
     state = problem.start(geometry.refined.cam2_from_cam1, planes, geometry.metric.baseline_mm)
     problem, state = _without_outliers(problem, state)
-    fit = _Fit.of(problem, state, boards, pair.pair_id)
-    again = [fit.moved(problem.through(*two), boards) for two in moved]
-    return _result(fit, again, boards, total)
+    return _result(problem, state, boards, total, moved, pair.pair_id)
 
 
 def _on_boards(matches: Matches, boards: tuple[Board, ...]) -> tuple[Matches, list[Board], int]:
@@ -146,137 +140,92 @@ def _without_outliers(problem: CoplanarProblem, state: CoplanarState) -> tuple[C
     return problem, problem.minimum(state)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Fit:
-    """A minimum, how certain it is, and its scale.
+class _Scale(NamedTuple):
+    """Mm to the unit of a state, its derivatives by the points (N, 3) and by the free parameters (F,), and its standard
+    deviation for this state.
 
     Every board's squares give a scale, from points that weigh as well as they are known. How certain it is depends on
     how well the board's plane is known, and the planes are known together: the scale is that of generalised least
     squares.
-
-    Attributes
-    ----------
-    problem, state, metric : the minimum, and it in mm.
-    covariance : (F, F) of the free parameters.
-    factor : observed over stated variance of the corners.
-    motions : (F, N, 3) derivatives of the points by the free parameters.
-    noise, weighing : (N, 3, 3) covariances of the points for this state, and in all.
-    scale_weights : (K,) of the boards' scales.
-    scale_by_state, scale_sigma : derivative of the scale (F,), and its standard deviation for this state, in mm.
     """
 
-    problem: CoplanarProblem
-    state: CoplanarState
-    metric: _Metric
-    covariance: FloatArray
-    factor: float
-    motions: FloatArray
-    noise: FloatArray
-    weighing: FloatArray
-    scale_weights: FloatArray
-    scale_by_state: FloatArray
-    scale_sigma: float
+    value: float
+    by_points: FloatArray
+    by_state: FloatArray
+    sigma: float
 
     @classmethod
-    def of(cls, problem: CoplanarProblem, state: CoplanarState, boards: list[Board], pair_id: str) -> _Fit:
-        here = problem.linearise(state)
-        count = 2 * len(problem.matches)
-        factor = variance_factor(float(here.residual[:count] @ here.residual[:count]), count - here.jacobian.shape[1])
-        # A level's prior is no noise of the corners: its variance stays what a person said.
-        variance = np.where(np.arange(len(here.residual)) < count, factor, 1.0)
-        covariance = inverse_information((here.jacobian.T / variance) @ here.jacobian, pair_id)
-        points, noise = problem.points(state)
-        noise = factor * noise
-        motions = problem.motions(state, STEP)
+    def of(
+        cls,
+        matches: Matches,
+        boards: list[Board],
+        points: Points,
+        noise: FloatArray,
+        motions: FloatArray,
+        covariance: FloatArray,
+    ) -> _Scale:
+        """Return the scale from points (N, 3), their covariances for this state (N, 3, 3), their derivatives (F, N, 3)
+        by the free parameters, and the covariance (F, F) of these."""
         weighing = noise + np.einsum("fni,fg,gnj->nij", motions, covariance, motions)
-        scales, by_points = _board_scales(problem, points, weighing, boards)
-        told = np.isfinite(scales)
-        own = np.einsum("kni,nij,knj->k", by_points, noise, by_points) + (scales * square_sigmas(boards)) ** 2
-        by_state = np.einsum("kni,fni->kf", by_points[told], motions)
-        solved = np.linalg.solve(np.diag(own[told]) + by_state @ covariance @ by_state.T, np.ones(int(told.sum())))
-        weights = np.zeros(len(boards))
-        weights[told] = solved / solved.sum()
-        return cls(
-            problem=problem,
-            state=state,
-            metric=_Metric.of(problem, state, float(weights[told] @ scales[told])),
-            covariance=covariance,
-            factor=factor,
-            motions=motions,
-            noise=noise,
-            weighing=weighing,
-            scale_weights=weights,
-            scale_by_state=weights[told] @ by_state,
-            scale_sigma=float(np.sqrt(weights[told] ** 2 @ own[told])),
-        )
-
-    def moved(self, problem: CoplanarProblem, boards: list[Board]) -> _Metric:
-        """Return the minimum for the same corners through other cameras, everything weighed as it is here."""
-        state = problem.minimum(self.state)
-        scales, _ = _board_scales(problem, problem.points(state)[0], self.weighing, boards)
-        return _Metric.of(problem, state, float(self.scale_weights @ np.nan_to_num(scales)))
+        found = board_scales_and_gradients(points, matches.board_index, matches.grid, boards, weighing)
+        known = np.isfinite(found[0])
+        scales, by_points = found[0][known], found[2][known]
+        own = np.einsum("kni,nij,knj->k", by_points, noise, by_points) + (scales * square_sigmas(boards)[known]) ** 2
+        by_state = np.einsum("kni,fni->kf", by_points, motions)
+        weights = np.linalg.solve(np.diag(own) + by_state @ covariance @ by_state.T, np.ones(len(scales)))
+        weights /= weights.sum()
+        gradient = np.einsum("k,kni->ni", weights, by_points)
+        return cls(float(weights @ scales), gradient, weights @ by_state, float(np.sqrt(weights**2 @ own)))
 
 
-def _board_scales(
-    problem: CoplanarProblem, points: Points, weighing: FloatArray, boards: list[Board]
-) -> tuple[FloatArray, FloatArray]:
-    """Return mm to the unit of the points (N, 3) by every board (K,), NaN where it tells none, and the gradients."""
-    index, grid = problem.matches.board_index, problem.matches.grid
-    scales, _, by_points = board_scales_and_gradients(points, index, grid, boards, weighing)
-    return scales, by_points
-
-
-@dataclass(frozen=True, eq=False)
-class _Metric:
-    """A state in mm: mm to its unit, cam2_from_cam1, planes and points in camera 1."""
-
-    scale: float
-    pose: Rigid3
-    normals: FloatArray
-    offsets_mm: FloatArray
-    points_mm: Points
-
-    @classmethod
-    def of(cls, problem: CoplanarProblem, state: CoplanarState, scale: float) -> _Metric:
-        pose, normals, offsets = problem.in_camera(state)
-        points_mm = scale * problem.turned_back(problem.points(state)[0])
-        return cls(scale, Rigid3(pose.rotation, scale * pose.translation_mm), normals, scale * offsets, points_mm)
-
-    def difference(self, other: _Metric) -> FloatArray:
-        """Return the parameters (6 + 6 K,) of `other` less those here."""
-        turn = log_so3(other.pose.rotation @ self.pose.rotation.T)
-        out = [turn, other.pose.translation_mm - self.pose.translation_mm]
-        for n, m, o, p in zip(self.normals, other.normals, self.offsets_mm, other.offsets_mm, strict=True):
-            out += [np.cross(n, m), (p - o) * n]
-        return np.concatenate(out)
-
-
-def _result(fit: _Fit, again: list[_Metric], boards: list[Board], total: int) -> CoplanarPlanes:
-    """Return the planes of a fit, and the same with the calibrations moved, as a result in mm."""
-    problem, found = fit.problem, fit.metric
-    lengths, by_scale = problem.lengths(fit.state, found.scale)
-    by_state = problem.parameter_changes(fit.state) * lengths[:, None] + np.outer(by_scale, fit.scale_by_state)
-    points = found.points_mm
-    by_point = found.scale * problem.turned_back(fit.motions)
-    by_point += fit.scale_by_state[:, None, None] * points / found.scale
-    moved = np.array([one.points_mm - points for one in again]).reshape(-1, *points.shape)
-    own = found.scale**2 * problem.turned_back(np.swapaxes(problem.turned_back(fit.noise), 1, 2))
-    own += (fit.scale_sigma / found.scale) ** 2 * points[:, :, None] * points[:, None, :]
-    shared = np.einsum("fni,fg,gnj->nij", by_point, fit.covariance, by_point)
-    residuals = problem.corners(fit.state)[0]
+def _result(
+    problem: CoplanarProblem,
+    state: CoplanarState,
+    boards: list[Board],
+    total: int,
+    moved: list[tuple[Camera, Camera]],
+    pair_id: str,
+) -> CoplanarPlanes:
+    """Return the planes at a minimum in mm, with the covariance that the residuals and the moved cameras show."""
+    here, count = problem.linearise(state), len(problem.matches)
+    factor, of_free = variance_and_covariance(here, count, here.jacobian.shape[1], pair_id)
+    points, noise = problem.points(state)
+    noise, motions = factor * noise, problem.motions(state)
+    scale = _Scale.of(problem.matches, boards, points, noise, motions, of_free)
+    lengths, by_scale = problem.lengths(state, scale.value)
+    by_state = problem.parameter_changes(state) * lengths[:, None] + np.outer(by_scale, scale.by_state)
+    points_mm = scale.value * problem.turned_back(points)
+    by_point = scale.value * problem.turned_back(motions) + np.multiply.outer(scale.by_state, points_mm / scale.value)
+    moves, point_moves = [np.zeros((0, len(by_scale)))], [np.zeros((0, *points.shape))]
+    residuals = here.residual[: 2 * count]
+    for cameras in moved:
+        there = problem.through(*cameras)
+        change = there.corners(state)[0].ravel() - residuals
+        step = -of_free @ here.jacobian[: 2 * count].T @ change / factor
+        # What moves at a fixed state: the points, and with them the scale.
+        shift = there.points(state)[0] - points
+        lengthening = float(np.sum(scale.by_points * shift))
+        moves.append((by_state @ step + lengthening * by_scale)[None])
+        shift = scale.value * problem.turned_back(shift) + lengthening * points_mm / scale.value
+        point_moves.append((shift + np.einsum("f,fni->ni", step, by_point))[None])
+    of_points = np.concatenate(point_moves)
+    own = scale.value**2 * problem.turned_back(np.swapaxes(problem.turned_back(noise), 1, 2))
+    own += (scale.sigma / scale.value) ** 2 * points_mm[:, :, None] * points_mm[:, None, :]
+    shared = np.einsum("fni,fg,gnj->nij", by_point, of_free, by_point)
+    pose, normals, offsets = problem.in_camera(state)
     return CoplanarPlanes(
         board_ids=tuple(board.board_id for board in boards),
-        cam2_from_cam1=found.pose,
-        covariance=by_state @ fit.covariance @ by_state.T + fit.scale_sigma**2 * np.outer(by_scale, by_scale),
-        calibration_moves=np.array([found.difference(one) for one in again]).reshape(-1, len(by_scale)),
-        variance_factor=fit.factor,
+        cam2_from_cam1=Rigid3(pose.rotation, scale.value * pose.translation_mm),
+        covariance=by_state @ of_free @ by_state.T + scale.sigma**2 * np.outer(by_scale, by_scale),
+        calibration_moves=np.concatenate(moves),
+        variance_factor=factor,
         rms_sigmas=float(np.sqrt(np.mean(residuals**2))),
-        count=len(problem.matches),
-        gross=total - len(problem.matches),
-        normals=found.normals,
-        offsets_mm=found.offsets_mm,
+        count=count,
+        gross=total - count,
+        normals=normals,
+        offsets_mm=scale.value * offsets,
         board_index=problem.matches.board_index,
         grid=problem.matches.grid,
-        points_mm=points,
-        points_covariance=own + shared + np.einsum("ani,anj->nij", moved, moved),
+        points_mm=points_mm,
+        points_covariance=own + shared + np.einsum("ani,anj->nij", of_points, of_points),
     )

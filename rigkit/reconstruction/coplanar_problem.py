@@ -8,23 +8,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew, unit
-from rigkit.optim.damping import Damping, Stop
-from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
+from rigkit.optim.levenberg_marquardt import DenseProblem
+from rigkit.reconstruction.board_planes import likeliest
 from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.refine import project_to_type
 from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
-DAMPING_OF_PLANES = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
-STOP_OF_PLANES = Stop(steps=60, promise=1e-14, gain=1e-14)
+STEP = 1e-6
+"""For central differences, of each parameter's unit: far above rounding, far below where anything bends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,12 @@ class CoplanarProblem:
         planes = normals / offsets[:, None]
         return CoplanarState(rotation, t, planes if self.frames is None else planes @ self.frames.level1_from_cam1.T)
 
-    def free(self, state: CoplanarState) -> IntArray:
-        """Return which of the parameters may move."""
+    def free(self, state: CoplanarState) -> BoolArray:
+        """Return which (5 + 3 K,) of the parameters may move."""
         kind = PoseType.GENERAL if self.level_sigma_rad is not None else self.kind
-        return np.concatenate([free_directions(kind), 5 + np.arange(state.planes.size)])
+        free = np.ones(5 + state.planes.size, dtype=bool)
+        free[:5] = np.isin(np.arange(5), free_directions(kind))
+        return free
 
     def corners(self, state: CoplanarState) -> tuple[FloatArray, FloatArray]:
         """Return whitened residuals (N, 2) and their derivatives (N, 2, 5 + 3 K), the whitening held."""
@@ -138,14 +140,7 @@ class CoplanarProblem:
 
     def minimum(self, state: CoplanarState) -> CoplanarState:
         """Return the state of maximum likelihood near `state`."""
-        free = self.free(state)
-
-        def moved(at: CoplanarState, step: DenseStep) -> CoplanarState:
-            change = np.zeros(5 + at.planes.size)
-            change[free] = step.change
-            return at.moved(change)
-
-        return minimise(state, self.linearise, moved, DAMPING_OF_PLANES, STOP_OF_PLANES).state
+        return likeliest(state, self.linearise, CoplanarState.moved, self.free(state))
 
     def points(self, state: CoplanarState) -> tuple[Points, FloatArray]:
         """Return the likeliest points (N, 3) on the planes, and their covariances (N, 3, 3) for this state.
@@ -164,12 +159,12 @@ class CoplanarProblem:
         by_pixel = by_ray @ m.jacobians1
         return depth * rays, by_pixel @ spread @ np.swapaxes(by_pixel, 1, 2)
 
-    def motions(self, state: CoplanarState, step: float) -> FloatArray:
+    def motions(self, state: CoplanarState) -> FloatArray:
         """Return the derivatives (F, N, 3) of the points by what is free, by central differences."""
         out = []
         for one in np.eye(5 + state.planes.size)[self.free(state)]:
-            ahead, back = (self.points(state.moved(sign * step * one))[0] for sign in (1.0, -1.0))
-            out.append((ahead - back) / (2.0 * step))
+            ahead, back = (self.points(state.moved(sign * STEP * one))[0] for sign in (1.0, -1.0))
+            out.append((ahead - back) / (2.0 * STEP))
         return np.array(out)
 
     def in_camera(self, state: CoplanarState) -> tuple[Rigid3, FloatArray, FloatArray]:

@@ -21,21 +21,16 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
-from rigkit.reconstruction.board_planes import (
-    MIN_CORNERS_OF_BOARD,
-    BoardPlanes,
-    inverse_information,
-)
+from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, BoardPlanes, variance_and_covariance
 from rigkit.reconstruction.lattice_problem import (
     LatticeView,
     PlacedLattices,
-    all_residuals,
     fit_without_outliers,
     free_parameters,
+    linearised,
     residuals_of,
 )
 from rigkit.reconstruction.moved_cameras import moved_cameras
-from rigkit.reconstruction.noise_level import variance_factor
 
 if TYPE_CHECKING:
     from rigkit.reconstruction.geometry import PairGeometry
@@ -132,18 +127,13 @@ def _result(
     total: int,
 ) -> LatticePlanes:
     """Return the planes at a minimum, with the covariance that the residuals and the moved cameras show."""
-    r, J = all_residuals(views, state, sigma)
-    free = free_parameters(sigma)
-    count, priors = sum(len(v.rays) for v in views), int((sigma > 0.0).sum())
-    data = r[: len(r) - priors]
-    factor = variance_factor(float(data @ data), 2 * count - 6 * (len(boards) + 1))
-    # The sizes' prior is no noise of the corners: its variance stays what a person said.
-    scaled = J[:, free] / np.sqrt(np.where(np.arange(len(J)) < len(data), factor, 1.0))[:, None]
-    information = inverse_information(scaled.T @ scaled, pair_id)
-    covariance = np.zeros((J.shape[1], J.shape[1]))
-    covariance[np.ix_(free, free)] = information
-    moves = np.zeros((len(moved), J.shape[1]))
-    moves[:, free] = -_residual_changes(views, state, moved) @ J[: len(data), free] @ information / factor
+    problem, free = linearised(views, state, sigma), free_parameters(sigma)
+    count = sum(len(v.rays) for v in views)
+    factor, of_free = variance_and_covariance(problem, count, 6 * (len(boards) + 1), pair_id)
+    data, jacobian = problem.residual[: 2 * count], problem.jacobian[: 2 * count]
+    covariance, moves = np.zeros((len(free), len(free))), np.zeros((len(moved), len(free)))
+    covariance[np.ix_(free, free)] = of_free
+    moves[:, free] = -_residual_changes(views, state, moved) @ jacobian @ of_free / factor
     return LatticePlanes(
         board_ids=tuple(b.board_id for b in boards),
         cam2_from_cam1=state.pose,

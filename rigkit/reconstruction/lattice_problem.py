@@ -11,12 +11,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
 from rigkit.geometry.board_pose import point_residuals
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
-from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, near_the_rest
-
-OUTLIER_ROUNDS = 3
-MAX_LATTICE_STEPS = 40
-LATTICE_STEP_TOLERANCE = 1e-10
-"""Largest step in standard deviations of a parameter at which the minimisation ends: nothing of it shows."""
+from rigkit.optim.levenberg_marquardt import DenseProblem
+from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, OUTLIER_ROUNDS, likeliest, near_the_rest
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,39 +98,24 @@ def residuals_of(view: LatticeView, state: PlacedLattices) -> tuple[FloatArray, 
     return residual, jacobian
 
 
-def all_residuals(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return all residuals in sigmas, those of the sizes' prior last, and their derivatives."""
+def linearised(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray) -> DenseProblem:
+    """Return all residuals in sigmas, those of the sizes' prior last, and their derivatives by what is unknown."""
     parts = [residuals_of(view, state) for view in views]
     stated = sigma > 0.0
     prior = np.zeros((int(stated.sum()), 7 * len(sigma) + 6))
     prior[:, 6 * (len(sigma) + 1) :] = np.diag(1.0 / np.where(stated, sigma, 1.0))[stated]
-    r = np.concatenate([*(r.ravel() for r, _ in parts), state.log_sizes[stated] / sigma[stated]])
-    return r, np.concatenate([*(J.reshape(-1, J.shape[-1]) for _, J in parts), prior])
+    residual = np.concatenate([*(r.ravel() for r, _ in parts), state.log_sizes[stated] / sigma[stated]])
+    jacobian = np.concatenate([*(J.reshape(-1, J.shape[-1]) for _, J in parts), prior])
+    return DenseProblem(residual, jacobian[:, free_parameters(sigma)])
 
 
-def _minimum(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray) -> PlacedLattices:
-    """Return the nearest minimum of the sum of squares (Levenberg-Marquardt)."""
-    free, damping = free_parameters(sigma), 1e-6
-    r, J = all_residuals(views, state, sigma)
-    for _ in range(MAX_LATTICE_STEPS):
-        gram = J[:, free].T @ J[:, free]
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-30))
-        step = np.zeros(J.shape[1])
-        unit_step = np.linalg.solve(
-            gram / np.outer(scale, scale) + damping * np.eye(len(gram)), -(J[:, free].T @ r) / scale
-        )
-        step[free] = unit_step / scale
-        trial = state.moved(step)
-        r_trial, J_trial = all_residuals(views, trial, sigma)
-        if r_trial @ r_trial <= r @ r:
-            state, r, J, damping = trial, r_trial, J_trial, max(0.1 * damping, 1e-12)
-            if np.abs(unit_step).max() < LATTICE_STEP_TOLERANCE * np.sqrt(len(r)):
-                break
-        else:
-            damping = max(10.0 * damping, 1e-9)
-            if damping > 1e6:
-                break
-    return state
+def minimum(views: list[LatticeView], state: PlacedLattices, sigma: FloatArray) -> PlacedLattices:
+    """Return the state of maximum likelihood near `state`."""
+
+    def linearise(at: PlacedLattices) -> DenseProblem:
+        return linearised(views, at, sigma)
+
+    return likeliest(state, linearise, PlacedLattices.moved, free_parameters(sigma))
 
 
 def fit_without_outliers(
@@ -142,12 +123,12 @@ def fit_without_outliers(
 ) -> tuple[list[LatticeView], PlacedLattices]:
     """Return the views without gross outliers, and the minimum for what is left."""
     for _ in range(OUTLIER_ROUNDS):
-        state = _minimum(views, state, sigma)
+        state = minimum(views, state, sigma)
         near = _near(views, state)
         if all(which.all() for which in near):
-            break
+            return views, state
         views = [view.select(which) for view, which in zip(views, near, strict=True)]
-    return views, state
+    return views, minimum(views, state, sigma)
 
 
 def _near(views: list[LatticeView], state: PlacedLattices) -> list[BoolArray]:
