@@ -100,3 +100,14 @@ def test_figures_of_summaries_stand_on_the_pages_that_say_how_they_were_measured
             assert figures(LINK.sub("", row)) <= known, f"{figures(row) - known} of: {row}"
             checked += 1
     assert checked > 30
+
+
+def test_files_that_contributing_names_exist() -> None:
+    text = (REPOSITORY / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/]+\.(?:py|pyi|txt|md|yml|c))(?: [^`]*)?`", text))
+    known = {
+        path.as_posix() for room in ("rigkit", "tests", "scripts", "docs") for path in (REPOSITORY / room).rglob("*.*")
+    }
+    assert len(named) > 30
+    lost = {name for name in named if not any(path.endswith("/" + name) for path in known)}
+    assert not lost
