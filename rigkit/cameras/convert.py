@@ -9,11 +9,11 @@ import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.fit import nearest_camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
-from rigkit.optim.damping import Damping, Stop
-from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
+from rigkit.optim.damping import Stop
 
 CONVERT_GRID = (64, 48)
 """Pixels of the source at which the two cameras are held against each other."""
@@ -25,14 +25,12 @@ FOLLOWS_PX = 1.0
 WIDE_RAD = np.radians(60.0)
 """Narrower limits are tried for perspective models of lenses that reach beyond this; others are to hold everywhere."""
 MAX_CONVERT_STEPS = 60
-HALVINGS = 8
 CONVERT_SETTLED = 1e-10
 """The fit stops where a step gains less than this share of the cost,"""
 OUTSIDE_WEIGHT = 0.02
 """An error outside the outline of what was seen counts by this much: there the lens is but extrapolated."""
 ROUNDING_PX = 1e-10
 """or where pixels are met this well."""
-CONVERT_DAMPING = Damping(start=1e-6, ceiling=1e6)
 INSIDE = 0.995
 """Rays within this share of the start's field of view take part: at its edge the derivatives have no end."""
 
@@ -138,7 +136,6 @@ def fit_camera(
     centre_px: FloatArray,
     *,
     order: int | None = None,
-    fixed: Sequence[str] = (),
 ) -> Camera:
     """Return the camera of `model` that projects `rays` (N, 3) nearest to `pixels` (N, 2), by least squares.
 
@@ -147,7 +144,7 @@ def fit_camera(
     """
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     start = _start(model, size_px, theta, pixels, centre_px, order)
-    return refit_camera(start, rays, pixels, fixed=fixed)
+    return refit_camera(start, rays, pixels)
 
 
 def refit_camera(
@@ -162,7 +159,8 @@ def refit_camera(
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     used = theta < INSIDE * start.max_angle_rad
     used[used] &= start.project(rays[used])[1]
-    return _descend(start, rays[used], pixels[used], weight[used], _free(start, fixed))
+    stop = Stop(steps=MAX_CONVERT_STEPS, gain=CONVERT_SETTLED, cost=ROUNDING_PX**2 * 2 * int(used.sum()))
+    return nearest_camera(start, rays[used], pixels[used], _free(start, fixed), stop, weight[used])[0]
 
 
 def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:
@@ -203,51 +201,3 @@ def _start(
         return model.from_radial_curve(size_px, curve, order=order)
     except InputError as error:
         raise _NoStart(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Conversion(LinearisedProblem):
-    """A camera against rays and pixels, weighted (N,), moved along the columns of `free` (P, F)."""
-
-    camera: Camera
-    rays: Rays
-    pixels: Pixels
-    weight: FloatArray
-    free: FloatArray
-    sum_of_squares: float
-
-    @property
-    def cost(self) -> float:
-        """Sum of squared errors, infinite where a point is not seen."""
-        return self.sum_of_squares
-
-    def step(self, damping: float) -> DenseStep | None:
-        projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.rays)
-        jacobian = self.weight[:, None, None] * (d_pixels_d_parameters @ self.free)
-        residuals = self.weight[:, None] * (projected - self.pixels)
-        return damped_step(jacobian.reshape(-1, self.free.shape[1]), residuals.reshape(-1), damping)
-
-
-def _descend(camera: Camera, rays: Rays, pixels: Pixels, weight: FloatArray, free: FloatArray) -> Camera:
-    """Return the camera after a damped descent of the projection error over the free directions."""
-
-    def linearise(state: Camera) -> _Conversion:
-        return _Conversion(state, rays, pixels, weight, free, _cost(state, rays, pixels, weight))
-
-    def moved(state: Camera, step: DenseStep) -> Camera | None:
-        change = free @ step.change
-        for _ in range(HALVINGS):  # a step out of the model's domain is halved until it is inside
-            try:
-                return state.with_parameters(state.parameters + change)
-            except InputError:
-                change = 0.5 * change
-        return None
-
-    stop = Stop(steps=MAX_CONVERT_STEPS, gain=CONVERT_SETTLED, cost=ROUNDING_PX**2 * pixels.size)
-    return minimise(camera, linearise, moved, CONVERT_DAMPING, stop).state
-
-
-def _cost(camera: Camera, rays: Rays, pixels: Pixels, weight: FloatArray) -> float:
-    """Sum of squared weighted projection errors, infinite where a ray is not seen."""
-    projected, valid = camera.project(rays)
-    return float(np.sum((weight[:, None] * (projected - pixels)) ** 2)) if valid.all() else float("inf")

@@ -14,15 +14,12 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.cameras.fit import nearest_camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-from rigkit.optim.damping import Damping, Stop
-from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
+from rigkit.optim.damping import Stop
 
-FIT_STEPS = 40
-FIT_SETTLED = 1e-6
-"""The descent stops where a step gains less than this share of the cost."""
-FIT_DAMPING = Damping(start=1e-6, ceiling=5e3)
+STOP_OF_SHAPE = Stop(steps=40, gain=1e-6)
 
 
 class ScaleDerivatives(NamedTuple):
@@ -132,75 +129,30 @@ def fit_shape(
     curve: RadialCurve,
     starts: Sequence[Sequence[float]],
 ) -> _Focal:
-    """Return the camera of `model` nearest to the curve: one focal length and its shape, damped Gauss-Newton.
+    """Return the camera of `model` nearest to the curve: one focal length and its shape, by least squares.
 
     Each of `starts` is a shape; the best end is returned. Raises InputError where no start sees the whole curve.
     """
-    theta = curve.theta_rad
+    theta, centre = curve.theta_rad, curve.centre_px
     points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
-    best: tuple[float, _Focal] | None = None
+    pixels = centre + np.stack([curve.radius_px, np.zeros_like(theta)], axis=-1)
+    best: tuple[_Focal, float] | None = None
     for start in starts:
-        found = _descend(model(size_px, np.array([1.0, 1.0, *curve.centre_px, *start])), points, curve.radius_px)
-        if found is not None and (best is None or found[0] < best[0]):
+        camera = model(size_px, np.array([1.0, 1.0, *centre, *start]))
+        reached, valid = camera.project(points)
+        if not valid.all():
+            continue
+        radius = reached[:, 0] - centre[0]
+        focal = float(radius @ curve.radius_px / (radius @ radius))
+        # One focal length along both axes, and the shape; the centre stays.
+        free = np.eye(camera.parameters.size)[:, [0, *range(4, camera.parameters.size)]]
+        free[1, 0] = 1.0
+        camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
+        found = nearest_camera(camera, points, pixels, free, STOP_OF_SHAPE)
+        if best is None or found[1] < best[1]:
             best = found
     if best is None:
         raise InputError(
             f"radial curve: no {model.model} camera sees all of it, out to {np.degrees(theta[-1]):.1f} deg"
         )
-    return best[1]
-
-
-def _descend(camera: _Focal, points: FloatArray, radius: FloatArray) -> tuple[float, _Focal] | None:
-    """Return cost and camera after the descent from a camera of focal length 1, or None where it sees too little."""
-    centre = camera.parameters[2]
-    pixels, valid = camera.project(points)
-    if not valid.all():
-        return None
-    reached = pixels[:, 0] - centre
-    focal = float(reached @ radius / (reached @ reached))
-    camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])
-
-    def linearise(state: _Focal) -> _CurveFit:
-        return _CurveFit(state, points, radius, _curve_cost(state, points, radius))
-
-    def moved(state: _Focal, step: DenseStep) -> _Focal | None:
-        trial = state.parameters.copy()
-        trial[0] += step.change[0]
-        trial[1] = trial[0]
-        trial[4:] += step.change[1:]
-        try:
-            return state.with_parameters(trial)
-        except InputError:
-            return None
-
-    end = minimise(camera, linearise, moved, FIT_DAMPING, Stop(steps=FIT_STEPS, gain=FIT_SETTLED))
-    return end.problem.cost, end.state
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _CurveFit(LinearisedProblem):
-    """A camera against the radii (N,) at which points (N, 3) of the plane y = 0 are seen."""
-
-    camera: RadialCamera
-    points: FloatArray
-    radius: FloatArray
-    sum_of_squares: float
-
-    @property
-    def cost(self) -> float:
-        """Sum of squared errors, infinite where a point is not seen."""
-        return self.sum_of_squares
-
-    def step(self, damping: float) -> DenseStep | None:
-        pixels, _, _, jacobian = self.camera.project_with_jacobians(self.points)
-        # The points lie in the plane y = 0: u depends on fx alone, which then stands for both focal lengths.
-        by_shape = np.delete(jacobian[:, 0], (1, 2, 3), axis=1)
-        return damped_step(by_shape, pixels[:, 0] - (self.camera.parameters[2] + self.radius), damping)
-
-
-def _curve_cost(camera: RadialCamera, points: FloatArray, radius: FloatArray) -> float:
-    """Sum of squared radius errors, infinite where a point is not seen."""
-    pixels, valid = camera.project(points)
-    if not valid.all():
-        return float("inf")
-    return float(np.sum((pixels[:, 0] - camera.parameters[2] - radius) ** 2))
+    return best[0]

@@ -1,0 +1,71 @@
+"""The camera whose projection is nearest to given pixels: damped least squares over some of its parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, Pixels, Points
+from rigkit.core.errors import InputError
+from rigkit.optim.damping import Damping, Stop
+from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, damped_step, minimise
+
+FIT_DAMPING = Damping(start=1e-6, ceiling=1e6)
+HALVINGS = 8
+"""A step out of the model's domain is halved until it is inside, so many times at the most."""
+
+C = TypeVar("C", bound=Camera)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Projection(LinearisedProblem, Generic[C]):
+    """A camera against pixels (N, 2) of points (N, 3), weighted (N,), moved along the columns of `free` (P, F)."""
+
+    camera: C
+    points: Points
+    pixels: Pixels
+    weight: FloatArray
+    free: FloatArray
+    sum_of_squares: float
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared errors, infinite where a point is not seen."""
+        return self.sum_of_squares
+
+    def step(self, damping: float) -> DenseStep | None:
+        projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.points)
+        jacobian = self.weight[:, None, None] * (d_pixels_d_parameters @ self.free)
+        residuals = self.weight[:, None] * (projected - self.pixels)
+        return damped_step(jacobian.reshape(-1, self.free.shape[1]), residuals.reshape(-1), damping)
+
+
+def nearest_camera(
+    start: C, points: Points, pixels: Pixels, free: FloatArray, stop: Stop, weight: FloatArray | None = None
+) -> tuple[C, float]:
+    """Return the camera near `start` that projects points (N, 3) nearest to pixels (N, 2), and the sum of squares.
+
+    `free` (P, F) are the directions in which its parameters change, `weight` (N,) is that of each error. The sum is
+    infinite where the start does not see all points.
+    """
+    weight = np.ones(len(points)) if weight is None else weight
+
+    def linearise(camera: C) -> _Projection[C]:
+        projected, valid = camera.project(points)
+        cost = float(np.sum((weight[:, None] * (projected - pixels)) ** 2)) if valid.all() else float("inf")
+        return _Projection(camera, points, pixels, weight, free, cost)
+
+    def moved(camera: C, step: DenseStep) -> C | None:
+        change = free @ step.change
+        for _ in range(HALVINGS):
+            try:
+                return camera.with_parameters(camera.parameters + change)
+            except InputError:
+                change = 0.5 * change
+        return None
+
+    end = minimise(start, linearise, moved, FIT_DAMPING, stop)
+    return end.state, end.problem.cost
