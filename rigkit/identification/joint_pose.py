@@ -62,9 +62,17 @@ class JointPose:
     chi2: FloatArray
 
 
-@dataclass(slots=True)
-class _StackedObservations:
-    """All corners of one image: rays, whitened bases, board points, board index."""
+@dataclass(frozen=True, eq=False, slots=True)
+class BoardCorners:
+    """All corners of one image.
+
+    Attributes
+    ----------
+    rays : (N, 3) unit.
+    bases : (N, 2, 3) rows perpendicular to the rays that make residuals in sigmas.
+    points, board : (N, 3) mm on their boards, and (N,) which board.
+    sigma_px : (N,)
+    """
 
     rays: Rays
     bases: FloatArray
@@ -73,7 +81,8 @@ class _StackedObservations:
     sigma_px: FloatArray
 
     @classmethod
-    def stack(cls, observations: Sequence[BoardObservation], points: Sequence[Points]) -> _StackedObservations:
+    def stack(cls, observations: Sequence[BoardObservation], points: Sequence[Points]) -> BoardCorners:
+        """Return the corners of boards as an image shows them, board after board."""
         sigma = np.concatenate([s.sigma_px for s in observations])
         bases = np.concatenate([s.bases for s in observations]) / sigma[:, None, None]
         board = np.repeat(np.arange(len(observations)), [len(p) for p in points])
@@ -99,14 +108,14 @@ def refine_joint(
     points1, points2 : their corners in the frame of their board, mm; the two images need not see the same ones.
     tolerance : stop when a step gains less than this part of the cost.
     """
-    images = _StackedObservations.stack(observations1, points1), _StackedObservations.stack(observations2, points2)
+    images = BoardCorners.stack(observations1, points1), BoardCorners.stack(observations2, points2)
 
     def linearise(poses: tuple[FloatArray, FloatArray]) -> DenseProblem:
-        return DenseProblem(*_evaluate(images, *poses))
+        return DenseProblem(*joint_residuals(images, *poses))
 
     def moved(poses: tuple[FloatArray, FloatArray], step: DenseStep) -> tuple[FloatArray, FloatArray]:
         change = step.change.reshape(-1, 6)
-        return _moved(poses[0], change[0]), _moved(poses[1], change[1:])
+        return moved_poses(poses[0], change[0]), moved_poses(poses[1], change[1:])
 
     start = cam2_from_cam1.copy(), cam1_from_board.copy()
     end = minimise(start, linearise, moved, JOINT_DAMPING, Stop(steps=MAX_JOINT_STEPS, gain=tolerance))
@@ -121,7 +130,7 @@ def refine_joint(
     return JointPose(motion, boards, squared, chi2)
 
 
-def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
+def moved_poses(pose: FloatArray, step: FloatArray) -> FloatArray:
     """Return poses (..., 4, 4) changed by (w, v): R' = exp([w]x) R, t' = t + v."""
     out = pose.copy()
     out[..., :3, :3] = exp_so3(step[..., :3]) @ pose[..., :3, :3]
@@ -129,17 +138,25 @@ def _moved(pose: FloatArray, step: FloatArray) -> FloatArray:
     return out
 
 
-def _evaluate(
-    images: tuple[_StackedObservations, _StackedObservations], motion: FloatArray, boards: FloatArray
+def joint_residuals(
+    images: tuple[BoardCorners, BoardCorners],
+    motion: FloatArray,
+    boards: FloatArray,
+    log_sizes: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return whitened residuals of image 1, then 2, (2N,), and their derivatives by the motion, then the boards."""
-    residuals, jacobians = [], []
+    """Return whitened residuals of image 1, then 2, (2N,), and their derivatives by the motion, then the boards.
+
+    With `log_sizes` (K,) of the boards, their true sizes over the declared ones, come the derivatives by these.
+    """
+    count, residuals, jacobians = len(boards), [], []
     for k, image in enumerate(images):
         pose = boards[image.board]
         turned = (pose[:, :3, :3] @ image.points[..., None])[..., 0]
+        if log_sizes is not None:
+            turned *= np.exp(log_sizes[image.board])[:, None]
         x = turned + pose[:, :3, 3]
         n = len(x)
-        jacobian = np.zeros((n, 2, 1 + len(boards), 6))
+        jacobian = np.zeros((n, 2, 1 + count, 6))
         if k == 0:
             residual, by_x = point_residuals(image.rays, image.bases, x)
         else:
@@ -148,6 +165,11 @@ def _evaluate(
             jacobian[:, :, 0] = np.concatenate([-by_y @ skew(swung), by_y], axis=-1)
             by_x = by_y @ motion[:3, :3]
         jacobian[np.arange(n), :, 1 + image.board] = np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+        columns = [jacobian.reshape(2 * n, -1)]
+        if log_sizes is not None:
+            by_size = np.zeros((n, 2, count))
+            by_size[np.arange(n), :, image.board] = (by_x @ turned[..., None])[..., 0]
+            columns.append(by_size.reshape(2 * n, -1))
         residuals.append(residual.reshape(-1))
-        jacobians.append(jacobian.reshape(2 * n, -1))
+        jacobians.append(np.concatenate(columns, axis=1))
     return np.concatenate(residuals), np.concatenate(jacobians)

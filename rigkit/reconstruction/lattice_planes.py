@@ -16,20 +16,13 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 from rigkit.reconstruction.board_planes import MIN_CORNERS_OF_BOARD, BoardPlanes, variance_and_covariance
-from rigkit.reconstruction.lattice_problem import (
-    LatticeView,
-    PlacedLattices,
-    fit_without_outliers,
-    free_parameters,
-    linearised,
-    residuals_of,
-)
+from rigkit.reconstruction.lattice_problem import LatticeProblem, seen_corners
 from rigkit.reconstruction.moved_cameras import moved_cameras
 
 if TYPE_CHECKING:
@@ -102,81 +95,62 @@ def lattice_planes(
     """
     pair = geometry.pair
     moved = moved_cameras(pair.camera1, pair.camera2, known1, known2, one=one_camera)
-    views, boards = _views(geometry, moved)
+    problem, boards = _problem(geometry, moved)
+    placed = np.array([pair.identity.cam1_from_board[b.board_id].matrix() for b in boards])
+    state = pair.identity.cam2_from_cam1.matrix(), placed, np.zeros(len(boards))
+    total = problem.count
+    problem, state = problem.without_outliers(state)
+    here, free = problem.linearise(state), problem.free
+    factor, of_free = variance_and_covariance(here, problem.count, 6 * (len(boards) + 1), pair.pair_id)
+    data = here.residual[: 2 * problem.count]
+    covariance, moves = np.zeros((len(free), len(free))), np.zeros((len(moved), len(free)))
+    covariance[np.ix_(free, free)] = of_free
+    for k, cameras in enumerate(moved):
+        change = problem.through(cameras).residuals(state) - data
+        moves[k, free] = -of_free @ here.jacobian[: len(data)].T @ change / factor
+    poses = [Rigid3.from_matrix(matrix) for matrix in (state[0], *state[1])]
+    return LatticePlanes(
+        board_ids=tuple(b.board_id for b in boards),
+        cam2_from_cam1=poses[0],
+        cam1_from_board={b.board_id: pose for b, pose in zip(boards, poses[1:], strict=True)},
+        covariance=covariance,
+        calibration_moves=moves,
+        variance_factor=factor,
+        rms_sigmas=float(np.sqrt(np.mean(data**2))),
+        count=problem.count,
+        gross=total - problem.count,
+    )
+
+
+def _problem(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[LatticeProblem, list[Board]]:
+    """Return the corners of every board that has enough of them in both views, and these boards; raises DegenerateError
+    without any.
+
+    Corners at the rim of the field that one of the moved cameras does not see take no part.
+    """
+    pair = geometry.pair
+    found = [{d.board_id: d for d in one} for one in (pair.identity.detections1, pair.identity.detections2)]
+    cameras = [(pair.camera1, pair.camera2), *moved]
+    boards: list[Board] = []
+    parts: list[list[tuple[Pixels, FloatArray, Points, IntArray]]] = [[], []]
+    for board in pair.boards:
+        both = []
+        for second in (0, 1):
+            corners = found[second][board.board_id]
+            seen = np.logical_and.reduce([two[second].unproject(corners.pixels)[1] for two in cameras])
+            # What the matched corners show of their noise holds as well for those that one view alone has.
+            sigma_px, number = geometry.scatter * corners.sigma_px[seen], np.full(int(seen.sum()), len(boards))
+            both.append((corners.pixels[seen], sigma_px, board.points(corners.grid[seen]), number))
+        if min(len(number) for *_, number in both) >= MIN_CORNERS_OF_BOARD:
+            boards.append(board)
+            for part, view in zip(parts, both, strict=True):
+                part.append(view)
     if not boards:
         raise DegenerateError(
             f"pair '{pair.pair_id}': no board has {MIN_CORNERS_OF_BOARD} corners in each view for its own plane; "
             "take images that show whole boards"
         )
-    sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
-    identity = pair.identity
-    placed = tuple(identity.cam1_from_board[b.board_id] for b in boards)
-    state = PlacedLattices(identity.cam2_from_cam1, placed, np.zeros(len(boards)))
-    total = sum(len(v.rays) for v in views)
-    views, state = fit_without_outliers(views, state, sigma)
-    return _result(pair.pair_id, boards, views, state, sigma, moved, total)
-
-
-def _result(
-    pair_id: str,
-    boards: list[Board],
-    views: list[LatticeView],
-    state: PlacedLattices,
-    sigma: FloatArray,
-    moved: list[tuple[Camera, Camera]],
-    total: int,
-) -> LatticePlanes:
-    """Return the planes at a minimum, with the covariance that the residuals and the moved cameras show."""
-    problem, free = linearised(views, state, sigma), free_parameters(sigma)
-    count = sum(len(v.rays) for v in views)
-    factor, of_free = variance_and_covariance(problem, count, 6 * (len(boards) + 1), pair_id)
-    data, jacobian = problem.residual[: 2 * count], problem.jacobian[: 2 * count]
-    covariance, moves = np.zeros((len(free), len(free))), np.zeros((len(moved), len(free)))
-    covariance[np.ix_(free, free)] = of_free
-    moves[:, free] = -_residual_changes(views, state, moved) @ jacobian @ of_free / factor
-    return LatticePlanes(
-        board_ids=tuple(b.board_id for b in boards),
-        cam2_from_cam1=state.pose,
-        cam1_from_board={b.board_id: pose for b, pose in zip(boards, state.boards, strict=True)},
-        covariance=covariance,
-        calibration_moves=moves,
-        variance_factor=factor,
-        rms_sigmas=float(np.sqrt(np.mean(data**2))),
-        count=count,
-        gross=total - count,
-    )
-
-
-def _views(geometry: PairGeometry, moved: list[tuple[Camera, Camera]]) -> tuple[list[LatticeView], list[Board]]:
-    """Return the corners of every board that has enough of them in both views, and these boards.
-
-    Corners at the rim of the field that one of the moved cameras does not see take no part.
-    """
-    pair = geometry.pair
-    views: list[LatticeView] = []
-    boards: list[Board] = []
-    found = [{d.board_id: d for d in one} for one in (pair.identity.detections1, pair.identity.detections2)]
-    for board in pair.boards:
-        both = []
-        for second in (False, True):
-            corners, cameras = (
-                found[second][board.board_id],
-                [m[second] for m in ((pair.camera1, pair.camera2), *moved)],
-            )
-            seen = np.logical_and.reduce([camera.unproject(corners.pixels)[1] for camera in cameras])
-            # What the matched corners show of their noise holds as well for those that one view alone has.
-            sigma_px, points = geometry.scatter * corners.sigma_px[seen], board.points(corners.grid[seen])
-            both.append(LatticeView.of(cameras[0], len(boards), second, corners.pixels[seen], sigma_px, points))
-        if all(len(view.rays) >= MIN_CORNERS_OF_BOARD for view in both):
-            views += both
-            boards.append(board)
-    return views, boards
-
-
-def _residual_changes(
-    views: list[LatticeView], state: PlacedLattices, moved: list[tuple[Camera, Camera]]
-) -> FloatArray:
-    """Return the change (A, R) of the residuals for each of the moved cameras."""
-    base = np.concatenate([residuals_of(view, state)[0].ravel() for view in views])
-    rows = [[residuals_of(view.by(cameras[view.second]), state)[0].ravel() for view in views] for cameras in moved]
-    return np.array([np.concatenate(row) - base for row in rows]).reshape(len(moved), len(base))
+    size_sigma = np.array([(b.square_sigma_mm or 0.0) / np.sqrt(b.square_x_mm * b.square_y_mm) for b in boards])
+    views = [[np.concatenate(column) for column in zip(*part, strict=True)] for part in parts]
+    one, two = (seen_corners(camera, *view) for camera, view in zip(cameras[0], views, strict=True))
+    return LatticeProblem((views[0][0], views[1][0]), (one, two), size_sigma), boards
