@@ -32,7 +32,7 @@ MADE = PAGES / "made"
 ARROW = """<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">
 <path d="M0 0L8 4L0 8z"/></marker></defs>"""
 FRAMES = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 740 240" font-family="sans-serif" font-size="14">
-<rect width="740" height="240" fill="#fff"/>
+<style>text { paint-order: stroke; stroke: #fff; stroke-width: 4px }</style><rect width="740" height="240" fill="#fff"/>
 ARROW
 <g stroke="#333" fill="none"><path d="M110 120L40 70V170zM110 120L40 70M110 120L40 170"/></g>
 <g stroke="#000" stroke-width="2" marker-end="url(#tip)"><path d="M110 120H230"/><path d="M110 120V215"/>
@@ -48,7 +48,8 @@ ARROW
 
 
 PIXELS = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 740 200" font-family="sans-serif" font-size="14">
-<rect width="740" height="200" fill="#fff"/><g stroke="#888" fill="none">GRID</g>
+<style>text { paint-order: stroke; stroke: #fff; stroke-width: 4px }</style><rect width="740" height="200" fill="#fff"/>
+<g stroke="#888" fill="none">GRID</g>
 <circle cx="80" cy="70" r="4"/><text x="92" y="66">(0, 0): the centre of the first pixel</text>
 <circle cx="50" cy="40" r="4" fill="#b3261e"/>
 <text x="62" y="30" fill="#b3261e">(-0.5, -0.5): the corner of the image</text>
