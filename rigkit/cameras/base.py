@@ -105,8 +105,12 @@ class Camera(ABC):
                 f"camera size {self.size_px}: width and height must be positive whole numbers, at most {MAX_SIDE_PX}"
             )
         object.__setattr__(self, "size_px", (int(size[0]), int(size[1])))
-        _require_numbers(self.parameters, f"{self.model} parameters")
-        array = as_array(self.parameters, (None,), f"{self.model} parameters")
+        self._keep(self.parameters)
+
+    def _keep(self, parameters: ArrayLike) -> None:
+        """Check the parameters and keep them, with what the formulas need of them."""
+        _require_numbers(parameters, f"{self.model} parameters")
+        array = as_array(parameters, (None,), f"{self.model} parameters")
         object.__setattr__(self, "parameters", array)
         names = self.parameter_names()
         if len(names) != array.size:
@@ -275,8 +279,11 @@ class Camera(ABC):
 
         Raises InputError where they are outside of what the model is defined for; a solver takes that as a failed step.
         """
-        _require_numbers(parameters, f"{self.model} parameters")
-        return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64))
+        # The size is checked already, and a solver asks for many.
+        out = object.__new__(type(self))
+        object.__setattr__(out, "size_px", self.size_px)
+        out._keep(parameters)
+        return out
 
     def on_image(self, pixels: Pixels) -> BoolArray:
         """Say which pixels (..., 2) lie on the sensor, whose outermost pixels reach half a pixel further out."""

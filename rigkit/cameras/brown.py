@@ -14,7 +14,7 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-from rigkit.kernels.brown import brown_derivatives
+from rigkit.kernels.cameras import brown_pixels
 
 FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
@@ -135,22 +135,8 @@ class Brown(Camera):
         slope[::2] += factor
         return slope
 
-    def _plane(
-        self, x: FloatArray, y: FloatArray, z: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return 1/z, (x/z, y/z) (2, N), its (x^2, x y, y^2), t, valid."""
-        inverse = 1.0 / z
-        plane = np.stack([x, y])
-        plane *= inverse
-        squares = _squares(plane)
-        t = squares[0] + squares[2]
-        return inverse, plane, squares, t, (z > 0.0) & (t <= self._max_r**2)
-
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        _, plane, squares, t, valid = self._plane(x, y, z)
-        (mx, my), _ = self._distort(plane, squares, self._radial(t)[0])
-        fx, fy, cx, cy = self.parameters[:4].tolist()
-        return fx * mx + cx, fy * my + cy, valid
+        return brown_pixels((x, y, z), self.parameters, self._max_r)
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         fx, fy, cx, cy = self.parameters[:4].tolist()
@@ -202,7 +188,7 @@ class Brown(Camera):
         d_pixels_d_point: FloatArray,
         d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        return brown_derivatives((x, y, z), self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
+        return brown_pixels((x, y, z), self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
 
 
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:

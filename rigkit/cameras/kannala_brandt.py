@@ -13,12 +13,12 @@ import numpy as np
 
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
-from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
+from rigkit.cameras.radial import CompiledCamera
 from rigkit.core.arrays import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
-class KannalaBrandt(FocalCamera):
+class KannalaBrandt(CompiledCamera):
     """|m| = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), u = fx m_x + cx, v = fy m_y + cy.
 
     Parameters are fx, fy, cx, cy in px, k1..k4. The field of view ends where the curve stops rising, at most at
@@ -63,32 +63,8 @@ class KannalaBrandt(FocalCamera):
         """|m| / theta."""
         return horner(np.concatenate([[1.0], self.parameters[4:]]), theta2)
 
-    def _angle(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Return theta, theta / r and valid."""
-        r = np.sqrt(r2)
-        theta = np.arctan2(r, z)
-        ratio = np.where(r > 0.0, theta / r, 1.0 / z)
-        valid = (theta <= self._max_angle) & (r2 + z * z < np.inf) & ((r > 0.0) | (z > 0.0))
-        return theta, ratio, valid
-
-    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
-        theta, ratio, valid = self._angle(r2, z)
-        return ratio * self._factor(theta * theta), valid
-
-    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
-        theta, ratio, valid = self._angle(r2, z)
-        theta2 = theta * theta
-        scale = ratio * self._factor(theta2)
-        # d theta / d r = z / |X|^2, d theta / d z = -r / |X|^2.
-        by_angle = horner(self._slope_coefficients(), theta2) / (r2 + z * z)
-        by_r = np.where(r2 > 0.0, (by_angle * z - scale) / r2, 0.0)
-        by_shape: list[FloatArray] = []
-        if shape:
-            power = ratio
-            for _ in range(4):
-                power = power * theta2
-                by_shape.append(power)
-        return ScaleDerivatives(scale, valid, by_r, -by_angle, tuple(by_shape))
+    def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
+        return self.parameters[4:], (self._max_angle, 0.0)
 
     def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         radius = np.sqrt(radius2)

@@ -6,10 +6,8 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.kernels.monotone import inverses
+from rigkit.kernels.monotone import inverses, smallest_root
 
-REAL_ROOT = 1e-7
-"""A computed root whose imaginary part is below this share of its size is real: rounding splits a double root."""
 CELLS_PER_KNOT = 4
 """The table is looked up in equal cells of the target, found by a division instead of a search."""
 
@@ -37,19 +35,12 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
     Raises InputError where a polynomial overflows: what a solver tries may be far from any lens.
     """
     # Scaled to x in (0, 1] so that coefficients of high powers of pixels are not lost beside the others.
-    degree = coefficients.shape[-1] - 1
-    scaled = coefficients * limit ** np.arange(degree + 1.0)
+    scaled = np.atleast_2d(coefficients) * limit ** np.arange(float(coefficients.shape[-1]))
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        last_row = scaled[..., 1:] / -scaled[..., :1]
-    if not np.isfinite(last_row).all():
+        scaled /= scaled[:, :1].copy()
+    if not np.isfinite(scaled).all():
         raise InputError("lens polynomial: its coefficients are too large for any lens; calibrate again")
-    # Eigenvalues of this companion matrix are 1 / x: a leading coefficient of zero is no special case.
-    companion = np.zeros((*coefficients.shape[:-1], degree, degree))
-    companion.reshape(-1, degree * degree)[:, degree :: degree + 1] = 1.0
-    companion[..., 0, :] = last_row
-    inverse = np.linalg.eigvals(companion)
-    real = inverse.real[np.abs(inverse.imag) <= REAL_ROOT * np.abs(inverse)]
-    return float(limit / real.max(initial=1.0))
+    return limit * smallest_root(scaled)
 
 
 def invert_increasing(

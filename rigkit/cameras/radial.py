@@ -17,6 +17,7 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.fit import nearest_camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
+from rigkit.kernels.cameras import radial_pixels
 from rigkit.optim.damping import Stop
 
 STOP_OF_SHAPE = Stop(steps=40, gain=1e-6)
@@ -37,35 +38,13 @@ class RadialCamera(Camera):
     """What radially symmetric models have in common; see the module."""
 
     @abstractmethod
-    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Return s and valid from r^2 and z."""
-
-    @abstractmethod
-    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
-        """Return s with its derivatives; those by the shape parameters only where asked for."""
-
-    @abstractmethod
     def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return sin(theta) / radius, cos(theta) and valid, from the squared radius |s (x, y)|^2."""
 
-    @abstractmethod
     def _linear(self) -> tuple[float, float, float, float, float]:
-        """Return l00, l01, l11 of L (l10 = 0) and the centre."""
-
-    @abstractmethod
-    def _fill_parameters(
-        self, out: FloatArray, m: tuple[FloatArray, FloatArray], by_shape: tuple[tuple[FloatArray, FloatArray], ...]
-    ) -> None:
-        """Write d pixel / d parameters (2, P, N) from m = s (x, y) and L (x, y) ds / d shape."""
-
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        scale, valid = self._scale(x * x + y * y, z)
-        l00, l01, l11, cx, cy = self._linear()
-        mx, my = scale * x, scale * y
-        u = l00 * mx + cx
-        if l01:
-            u += l01 * my
-        return u, l11 * my + cy, valid
+        """Return l00, l01, l11 of L (l10 = 0) and the centre: of a model that begins with fx, fy, cx, cy."""
+        fx, fy, cx, cy = self.parameters[:4].tolist()
+        return fx, 0.0, fy, cx, cy
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         l00, l01, l11, cx, cy = self._linear()
@@ -73,6 +52,49 @@ class RadialCamera(Camera):
         mx = (u - cx - l01 * my) / l00
         sine, cosine, valid = self._profile(mx * mx + my * my)
         return mx * sine, my * sine, cosine, valid
+
+
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class CompiledCamera(RadialCamera):
+    """Radial models whose formulas are a kernel in radial.c, of the model's name."""
+
+    @abstractmethod
+    def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
+        """Return the polynomial and the limits that `radial_pixels` asks for."""
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        polynomial, limits = self._shape()
+        return radial_pixels(self.model, (x, y, z), polynomial, self._linear(), limits)
+
+    def _derivatives(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        memory = d_pixels_d_point, d_pixels_d_parameters
+        polynomial, limits = self._shape()
+        return radial_pixels(self.model, (x, y, z), polynomial, self._linear(), limits, *memory)
+
+
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class FocalCamera(RadialCamera):
+    """Radial models whose parameters are fx, fy, cx, cy in px and then the shape."""
+
+    @abstractmethod
+    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return s and valid from r^2 and z."""
+
+    @abstractmethod
+    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
+        """Return s with its derivatives; those by the shape parameters only where asked for."""
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        scale, valid = self._scale(x * x + y * y, z)
+        fx, fy, cx, cy = self.parameters[:4].tolist()
+        return fx * (scale * x) + cx, fy * (scale * y) + cy, valid
 
     def _derivatives(
         self,
@@ -83,41 +105,22 @@ class RadialCamera(Camera):
         d_pixels_d_parameters: FloatArray | None,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         d = self._scale_derivatives(x * x + y * y, z, d_pixels_d_parameters is not None)
-        l00, l01, l11, cx, cy = self._linear()
+        fx, fy, cx, cy = self.parameters[:4].tolist()
         mx, my = d.scale * x, d.scale * y
         # L (x, y): with it d pixel / d point = s L [I 0] + L (x, y) (by_r x, by_r y, by_z).
-        lx, ly = l00 * x + l01 * y, l11 * y
-        rx, ry = d.by_r * x, d.by_r * y
-        np.multiply(lx, rx, out=d_pixels_d_point[0, 0])
-        d_pixels_d_point[0, 0] += l00 * d.scale
-        np.multiply(lx, ry, out=d_pixels_d_point[0, 1])
-        if l01:
-            d_pixels_d_point[0, 1] += l01 * d.scale
-        np.multiply(lx, d.by_z, out=d_pixels_d_point[0, 2])
-        np.multiply(ly, rx, out=d_pixels_d_point[1, 0])
-        np.multiply(ly, ry, out=d_pixels_d_point[1, 1])
-        d_pixels_d_point[1, 1] += l11 * d.scale
-        np.multiply(ly, d.by_z, out=d_pixels_d_point[1, 2])
+        lx, ly = fx * x, fy * y
+        for own, out in zip((lx, ly), d_pixels_d_point, strict=True):
+            np.multiply(own, d.by_r * x, out=out[0])
+            np.multiply(own, d.by_r * y, out=out[1])
+            np.multiply(own, d.by_z, out=out[2])
+        d_pixels_d_point[0, 0] += fx * d.scale
+        d_pixels_d_point[1, 1] += fy * d.scale
         if d_pixels_d_parameters is not None:
-            self._fill_parameters(d_pixels_d_parameters, (mx, my), tuple((lx * b, ly * b) for b in d.by_shape))
-        return l00 * mx + l01 * my + cx, l11 * my + cy, d.valid
-
-
-@dataclass(frozen=True, eq=False, slots=True, repr=False)
-class FocalCamera(RadialCamera):
-    """Radial models whose parameters are fx, fy, cx, cy in px and then the shape."""
-
-    def _linear(self) -> tuple[float, float, float, float, float]:
-        fx, fy, cx, cy = self.parameters[:4].tolist()
-        return fx, 0.0, fy, cx, cy
-
-    def _fill_parameters(
-        self, out: FloatArray, m: tuple[FloatArray, FloatArray], by_shape: tuple[tuple[FloatArray, FloatArray], ...]
-    ) -> None:
-        out[0, 0], out[1, 1] = m
-        out[0, 2] = out[1, 3] = 1.0
-        for k, (du, dv) in enumerate(by_shape, start=4):
-            out[0, k], out[1, k] = du, dv
+            d_pixels_d_parameters[0, 0], d_pixels_d_parameters[1, 1] = mx, my
+            d_pixels_d_parameters[0, 2] = d_pixels_d_parameters[1, 3] = 1.0
+            for k, by in enumerate(d.by_shape, start=4):
+                d_pixels_d_parameters[0, k], d_pixels_d_parameters[1, k] = lx * by, ly * by
+        return fx * mx + cx, fy * my + cy, d.valid
 
 
 _Focal = TypeVar("_Focal", bound=FocalCamera)

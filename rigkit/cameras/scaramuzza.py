@@ -13,8 +13,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from rigkit.cameras.base import RadialCurve, image_center
-from rigkit.cameras.monotone import KNOTS, first_root, horner, invert_increasing
-from rigkit.cameras.radial import RadialCamera, ScaleDerivatives
+from rigkit.cameras.monotone import first_root, horner
+from rigkit.cameras.radial import CompiledCamera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 
@@ -26,7 +26,7 @@ BEYOND_CORNERS = 1.5
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
-class Scaramuzza(RadialCamera):
+class Scaramuzza(CompiledCamera):
     """The ray of (u', v') is along (u', v', f(rho)), rho = |(u', v')|, f(rho) = a0 + a2 rho^2 + ... + aN rho^N.
 
     (u, v) = [[c, d], [0, 1]] (u', v') + (cx, cy). Parameters are a0, a2, ..., aN, cx, cy, c, d; the degree N, 3 to 10,
@@ -43,7 +43,6 @@ class Scaramuzza(RadialCamera):
 
     _max_rho: float = field(init=False, repr=False)
     _polynomial: FloatArray = field(init=False, repr=False)
-    _slope: FloatArray = field(init=False, repr=False)
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
@@ -94,61 +93,14 @@ class Scaramuzza(RadialCamera):
         # d angle / d rho has the sign of f - rho f'; where that ends, the image folds back.
         limit = BEYOND_CORNERS * float(np.linalg.norm(offset))
         object.__setattr__(self, "_polynomial", polynomial)
-        object.__setattr__(self, "_slope", (k * polynomial)[1:])
         object.__setattr__(self, "_max_rho", first_root(polynomial * (1.0 - k), limit))
 
     def _linear(self) -> tuple[float, float, float, float, float]:
         cx, cy, c, d = self.parameters[-4:].tolist()
         return c, d, 1.0, cx, cy
 
-    def _fill_parameters(
-        self, out: FloatArray, m: tuple[FloatArray, FloatArray], by_shape: tuple[tuple[FloatArray, FloatArray], ...]
-    ) -> None:
-        n = self.degree
-        for k, (du, dv) in enumerate(by_shape):
-            out[0, k], out[1, k] = du, dv
-        out[0, n] = out[1, n + 1] = 1.0
-        out[0, n + 2], out[0, n + 3] = m
-
-    def _solve(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return unit r and z (r = 0, z = 1 where invalid), rho, valid."""
-        length = np.sqrt(r2 + z * z)
-        r = np.sqrt(r2)
-        knots = np.linspace(0.0, self._max_rho, KNOTS)
-        angles = np.arctan2(knots, horner(self._polynomial, knots))
-        theta = np.arctan2(r, z)
-        valid = (theta <= angles[-1]) & (length > 0.0) & (length < np.inf)
-        theta = np.where(valid, theta, 0.0)
-        sine, cosine = np.where(valid, r / length, 0.0), np.where(valid, z / length, 1.0)
-
-        # z rho - r f = |(rho, f)| sin(angle(rho) - theta) changes sign once, from minus to plus, on the range.
-        parts = cosine, -sine, np.zeros_like(theta)
-        return sine, cosine, invert_increasing(self._polynomial, parts, theta, knots, angles), valid
-
-    def _scale(self, r2: FloatArray, z: FloatArray) -> tuple[FloatArray, BoolArray]:
-        r, _, rho, valid = self._solve(r2, z)
-        return np.where(r > 0.0, rho / np.sqrt(r2), self.parameters[0] / z), valid
-
-    def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
-        r, cosine, rho, valid = self._solve(r2, z)
-        length = np.sqrt(r2 + z * z)
-        f = horner(self._polynomial, rho)
-        # d rho / d r = -f / D, d rho / d z = rho / D, d rho / d a_k = -r rho^k / D at unit length.
-        inverse = 1.0 / (r * horner(self._slope, rho) - cosine)
-        scale = np.where(r > 0.0, rho / r, self.parameters[0])
-        by_r = np.where(r > 0.0, (-f * inverse - scale) / (r * r), 0.0)
-        by_z = scale * inverse
-        by_shape: list[FloatArray] = []
-        if shape:
-            power = -inverse / length
-            by_shape.append(power)
-            power = power * rho
-            for _ in range(2, self.degree + 1):
-                power = power * rho
-                by_shape.append(power)
-        # s is homogeneous of degree -1, by_z of degree -2 and by_r, which is divided by r once more, of degree -3.
-        length2 = length * length
-        return ScaleDerivatives(scale / length, valid, by_r / (length2 * length), by_z / length2, tuple(by_shape))
+    def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
+        return self._polynomial, (0.0, self._max_rho)
 
     def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         rho = np.sqrt(radius2)

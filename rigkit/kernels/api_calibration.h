@@ -89,19 +89,41 @@ EXPORT void cover_pixels(
 
 /* brown.c */
 
-/* Points in the camera frame and a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero where it has less of them. Of
- * derivatives by parameters so many `rows` are written, none or those that the camera has; zeros are not. */
+/* Points in the camera frame and a camera: fx, fy, cx, cy, k1, k2, p1, p2, k3 ... k6, zero where it has less of them.
+ * Derivatives are written by so many `axes` of the point and so many `rows` of parameters, none or all; zeros are not. */
 typedef struct {
     ARRAY(const double, x, count);
     ARRAY(const double, y, count);
     ARRAY(const double, z, count);
     ARRAY(const double, parameters, 12);
-    int64_t count, rows, rational;
+    int64_t count, axes, rows, rational;
     double max_r;
 } brown_points_t;
 
 EXPORT void differentiate_brown(
-    const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, 3, points.count),
+    const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
+    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+
+/* radial.c */
+
+/* Points in the camera frame and a camera that looks the same all around: pixel = L s (x, y) + centre with L = ((l00, l01),
+ * (0, l11)), and the numbers of its shape: k1 ... k4, or f(rho) of the power zero first. Derivatives as above. */
+typedef struct {
+    ARRAY(const double, x, count);
+    ARRAY(const double, y, count);
+    ARRAY(const double, z, count);
+    ARRAY(const double, polynomial, terms);
+    int64_t count, terms, axes, rows;
+    double l00, l01, l11, cx, cy, max_angle, max_radius;
+} radial_points_t;
+
+EXPORT void differentiate_kannala_brandt(
+    const radial_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
+    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+EXPORT void differentiate_scaramuzza(
+    const radial_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
     ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
     ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
 
@@ -121,5 +143,7 @@ typedef struct {
 } increasing_t;
 
 EXPORT void invert_increasing(const increasing_t *functions, ARRAY(double, out, functions.count));
+EXPORT double smallest_root(
+    ARRAY(const double, polynomials, count, terms), int64_t count, int64_t terms, ARRAY(double, memory, terms));
 
 #endif

@@ -33,12 +33,10 @@ INLINE void differentiate(
         const double by_yy = 2.0 * p2 * x + 6.0 * p1 * y + slope * yy + factor;
         const double ux = fx * inverse * by_xx, uy = fx * inverse * by_xy;
         const double vx = fy * inverse * by_xy, vy = fy * inverse * by_yy;
-        by_point[n] = ux;
-        by_point[N + n] = uy;
-        by_point[2 * N + n] = -(ux * x + uy * y);
-        by_point[3 * N + n] = vx;
-        by_point[4 * N + n] = vy;
-        by_point[5 * N + n] = -(vx * x + vy * y);
+        if (at->axes) {
+            by_point[n] = ux, by_point[N + n] = uy, by_point[2 * N + n] = -(ux * x + uy * y);
+            by_point[3 * N + n] = vx, by_point[4 * N + n] = vy, by_point[5 * N + n] = -(vx * x + vy * y);
+        }
         u[n] = fx * mx + cx;
         v[n] = fy * my + cy;
         valid[n] = (at->z[n] > 0.0) & (t <= farthest);

@@ -1,91 +1,81 @@
-/* Inverting what a lens polynomial makes of a radius or an angle, point by point (cameras.monotone). */
-#include "kernels.h"
+/* Inverting what a lens polynomial makes of a radius or an angle, point by point, and where it ends (cameras.monotone). */
+#include "monotone.h"
 
-enum {
-    /* Points at a time: their polynomials stay in the first cache. */
-    POINTS = 64,
-    /* Newton steps from the table for all points; nearly all are done after two. The rest is bracketed: bisection alone
-     * reaches double precision in so many. */
-    QUICK_STEPS = 3,
-    MAX_BISECTIONS = 60
-};
+/* A polynomial that comes so near to zero, as a part of x, touches it: rounding parts a double root. */
+#define TOUCHING 1e-8
 
-/* Newton doubles the digits at each step: after one this small, as a share of the range, all are right. */
-#define LAST_STEP_REL 1e-9
-#define RELATIVE_STEP 1e-14
+enum { BISECTIONS = 32 };
 
-/* Write g(x) = linear x + factor P(x) - offset, which increases, and its slope. */
-INLINE void evaluate(
-    const increasing_t *g, int64_t first, int64_t count, const double *x, double *residual, double *slope)
+INLINE double value_at(const double *p, int64_t terms, double x)
 {
-    const double *linear = g->linear + first, *factor = g->factor + first, *offset = g->offset + first;
-    for (int64_t i = 0; i < count; i++)
-        residual[i] = slope[i] = 0.0;
-    for (int64_t k = g->terms - 1; k >= 0; k--) {
-        const double a = g->polynomial[k];
-#pragma omp simd
-        for (int64_t i = 0; i < count; i++) {
-            slope[i] = slope[i] * x[i] + residual[i];
-            residual[i] = residual[i] * x[i] + a;
-        }
-    }
-#pragma omp simd
-    for (int64_t i = 0; i < count; i++) {
-        slope[i] = linear[i] + factor[i] * slope[i];
-        residual[i] = linear[i] * x[i] + factor[i] * residual[i] - offset[i];
-    }
+    double value = 0.0;
+    for (int64_t k = terms - 1; k >= 0; k--)
+        value = value * x + p[k];
+    return value;
 }
 
-/* Return the root number `n` between `low` and `high`, from x: Newton kept inside the bracket. */
-static double bracketed(const increasing_t *g, int64_t n, double x, double low, double high)
+/* Set `b` to Bernstein's coefficients of p between `low` and `low` + `width`; return whether all are positive. */
+INLINE int positive(const double *p, int64_t terms, double low, double width, double *b)
 {
-    const double least = RELATIVE_STEP * (high - low);
-    /* NaN (a slope of zero) must not be the start. */
-    double at = isfinite(x) ? x : 0.5 * (low + high);
-    for (int64_t step = 0; step < MAX_BISECTIONS; step++) {
-        double residual, slope;
-        evaluate(g, n, 1, &at, &residual, &slope);
-        if (residual > 0.0)
-            high = at;
-        else
-            low = at;
-        double next = at - residual / slope;
-        if (!(next >= low && next <= high))
-            next = 0.5 * (low + high);
-        const double moved = fabs(next - at);
-        at = next;
-        if (!(moved > least))
-            break;
+    const int64_t n = terms - 1;
+    memcpy(b, p, (size_t)terms * sizeof(double));
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t k = n - 1; k >= i; k--)
+            b[k] += low * b[k + 1];
+    double scale = 1.0;
+    for (int64_t k = 1; k <= n; k++) {
+        /* width^k over the binomial coefficient n over k. */
+        scale *= width * (double)k / (double)(n - k + 1);
+        b[k] *= scale;
     }
-    return at;
+    for (int64_t i = 1; i <= n; i++)
+        for (int64_t k = n; k >= i; k--)
+            b[k] += b[k - 1];
+    for (int64_t k = 0; k <= n; k++)
+        if (!(b[k] > 0.0))
+            return 0;
+    return 1;
+}
+
+/* Return the smallest root in (0, 1] of p, which is positive at zero, or 1 where there is none. */
+static double root_of(const double *p, int64_t terms, double *memory)
+{
+    double low = 0.0, width = 1.0;
+    while (low < 1.0) {
+        if (positive(p, terms, low, width, memory)) {
+            low += width;
+            width = 2.0 * width < 1.0 - low ? 2.0 * width : 1.0 - low;
+        } else if (width > TOUCHING * (low + width)) {
+            width *= 0.5;
+        } else {
+            double high = low + width;
+            if (value_at(p, terms, high) > 0.0)
+                return low;
+            for (int64_t step = 0; step < BISECTIONS; step++) {
+                const double middle = 0.5 * (low + high);
+                if (value_at(p, terms, middle) > 0.0)
+                    low = middle;
+                else
+                    high = middle;
+            }
+            return high;
+        }
+    }
+    return 1.0;
+}
+
+EXPORT FOR_EACH_PROCESSOR double smallest_root(const double *polynomials, int64_t count, int64_t terms, double *memory)
+{
+    double least = 1.0;
+    for (int64_t i = 0; i < count; i++) {
+        const double root = root_of(polynomials + i * terms, terms, memory);
+        least = root < least ? root : least;
+    }
+    return least;
 }
 
 EXPORT FOR_EACH_PROCESSOR void invert_increasing(const increasing_t *g, double *out)
 {
-    const double range = g->high - g->low, per_cell = (double)g->cells / (g->last - g->first);
-    for (int64_t first = 0; first < g->count; first += POINTS) {
-        const int64_t count = g->count - first < POINTS ? g->count - first : POINTS;
-        double residual[POINTS], slope[POINTS], *x = out + first;
-        uint8_t done[POINTS];
-        for (int64_t i = 0; i < count; i++) {
-            const double place = (g->target[first + i] - g->first) * per_cell;
-            int64_t cell = place > 0.0 ? (int64_t)place : 0;
-            cell = cell < g->cells - 1 ? cell : g->cells - 1;
-            x[i] = g->table[cell] + (place - (double)cell) * (g->table[cell + 1] - g->table[cell]);
-        }
-        int64_t left = count;
-        for (int64_t step = 0; step < QUICK_STEPS && (left || step < 2); step++) {
-            evaluate(g, first, count, x, residual, slope);
-            left = 0;
-            for (int64_t i = 0; i < count; i++) {
-                const double move = residual[i] / slope[i], to = x[i] - move;
-                done[i] = fabs(move) <= LAST_STEP_REL * range;
-                left += !done[i];
-                x[i] = to < g->low ? g->low : to > g->high ? g->high : to;
-            }
-        }
-        for (int64_t i = 0; i < count; i++)
-            if (!done[i])
-                x[i] = bracketed(g, first + i, x[i], g->low, g->high);
-    }
+    for (int64_t first = 0; first < g->count; first += POINTS)
+        invert(g, first, g->count - first < POINTS ? g->count - first : POINTS, out + first);
 }

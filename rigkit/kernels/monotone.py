@@ -1,4 +1,4 @@
-"""The call of the kernel in monotone.c: inverting increasing functions that a polynomial makes."""
+"""Calls of the kernels in monotone.c: inverting increasing functions that a polynomial makes, and its first root."""
 
 from __future__ import annotations
 
@@ -50,3 +50,10 @@ def inverses(
     )
     kernels().invert_increasing(functions, out)
     return out
+
+
+def smallest_root(polynomials: FloatArray) -> float:
+    """Return the smallest root in (0, 1] of polynomials (M, K) that are positive at zero, of the power zero first, or 1
+    where there is none."""
+    polynomials = np.ascontiguousarray(polynomials, np.float64)
+    return float(kernels().smallest_root(polynomials, *polynomials.shape, np.empty(polynomials.shape[1])))

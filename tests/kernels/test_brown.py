@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference import brown as reference
 
-from rigkit.kernels.brown import brown_derivatives
+from rigkit.kernels.cameras import brown_pixels
 
 PARAMETERS = np.array([1364.0, 1290.0, 801.0, 617.0, -0.19, 0.11, 1e-3, -2e-3, 0.01, 0.02, -0.03, 0.004])
 ROUNDING = 1e-12
@@ -26,7 +26,7 @@ def test_pixels_and_derivatives_are_as_defined(count: int, within: bool, rng: np
     one, other = np.zeros((2, 3 + margin, 200)), np.zeros((2, count + margin, 200))
     d_point, d_parameters = one[:, margin:], other[:, margin:]
     x, y, z = points.T
-    u, v, seen = brown_derivatives((x, y, z), PARAMETERS[:count], 0.9, d_point, d_parameters)
+    u, v, seen = brown_pixels((x, y, z), PARAMETERS[:count], 0.9, d_point, d_parameters)
     assert (seen == valid).all()
     for found, expected in (
         (np.stack([u, v], axis=-1), pixels),
@@ -36,5 +36,6 @@ def test_pixels_and_derivatives_are_as_defined(count: int, within: bool, rng: np
         np.testing.assert_allclose(found[valid], expected[valid], rtol=ROUNDING, atol=ROUNDING)
     assert not one[:, :margin].any() and not other[:, :margin].any()
     alone = np.empty((2, 3, 200))
-    brown_derivatives((x, y, z), PARAMETERS[:count], 0.9, alone, None)
+    brown_pixels((x, y, z), PARAMETERS[:count], 0.9, alone, None)
     np.testing.assert_array_equal(alone, d_point)
+    np.testing.assert_array_equal(brown_pixels((x, y, z), PARAMETERS[:count], 0.9), (u, v, seen))

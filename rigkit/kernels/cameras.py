@@ -1,0 +1,93 @@
+"""Calls of the kernels in brown.c and radial.c: pixels of cameras, and their derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+
+Coordinates = tuple[FloatArray, FloatArray, FloatArray]
+"""x, y, z of points in the camera frame, (N,) each."""
+
+
+@structure("brown_points_t")
+class _BrownPoints(Struct):
+    """Points in the camera frame and a camera with Brown's distortion."""
+
+
+@structure("radial_points_t")
+class _RadialPoints(Struct):
+    """Points in the camera frame and a camera that looks the same all around."""
+
+
+def brown_pixels(
+    points: Coordinates,
+    parameters: FloatArray,
+    max_r: float,
+    d_pixels_d_point: FloatArray | None = None,
+    d_pixels_d_parameters: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Project points and write those Jacobians that are given as `Camera.derivatives` does; return u, v and valid.
+
+    `max_r` is the tangent of the largest angle at which the camera, of 8, 9 or 12 `parameters`, sees anything.
+    """
+    own = parameters.size
+    camera = {"parameters": np.concatenate([parameters, np.zeros(12 - own)]), "rational": int(own > 9), "max_r": max_r}
+    kernel = kernels().differentiate_brown
+    return _written(kernel, _BrownPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
+
+
+def radial_pixels(
+    model: str,
+    points: Coordinates,
+    polynomial: FloatArray,
+    linear: tuple[float, float, float, float, float],
+    limits: tuple[float, float],
+    d_pixels_d_point: FloatArray | None = None,
+    d_pixels_d_parameters: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """As `brown_pixels`, for the radial camera `model`: "kannala_brandt" or "scaramuzza".
+
+    Parameters
+    ----------
+    polynomial : k1 ... k4, or the coefficients of f(rho), of the power zero first.
+    linear : l00, l01, l11 and the centre, px, as of `RadialCamera`.
+    limits : the largest angle, rad, or the largest radius, px, that the camera sees; the other does not count.
+    """
+    # A copy: what is read-only takes longer to pass.
+    camera: dict[str, Any] = {"polynomial": np.array(polynomial), "terms": len(polynomial)}
+    camera |= zip(("l00", "l01", "l11", "cx", "cy", "max_angle", "max_radius"), (*linear, *limits), strict=True)
+    kernel = getattr(kernels(), f"differentiate_{model}")
+    return _written(kernel, _RadialPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
+
+
+def _written(
+    kernel: Any,
+    struct: type[Struct],
+    points: Coordinates,
+    d_pixels_d_point: FloatArray | None,
+    d_pixels_d_parameters: FloatArray | None,
+    camera: dict[str, Any],
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Call the kernel for the points and the `camera`, members of the structure, and return u, v and valid."""
+    count = len(points[0])
+    x, y, z = (np.ascontiguousarray(one, np.float64) for one in points)
+    by_point, by_parameters = (_memory(out, count) for out in (d_pixels_d_point, d_pixels_d_parameters))
+    at = struct.of(x=x, y=y, z=z, count=count, axes=by_point.shape[1], rows=by_parameters.shape[1], **camera)
+    u, v, valid = np.empty(count), np.empty(count), np.empty(count, dtype=bool)
+    kernel(at, by_point, by_parameters, u, v, valid)
+    for out, memory in ((d_pixels_d_point, by_point), (d_pixels_d_parameters, by_parameters)):
+        if out is not None and out is not memory:
+            out[...] = memory
+    return u, v, valid
+
+
+def _memory(out: FloatArray | None, count: int) -> FloatArray:
+    """Return `out`, or a copy of what is there where its rows do not lie one after the other; no rows for None."""
+    if out is None:
+        return np.empty((2, 0, count))
+    return out if out.flags.c_contiguous else out.copy()
