@@ -6,7 +6,8 @@ Conventions: A21 = d pixel2 / d pixel1 along the surface, vec(A) = (a11, a12, a2
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,9 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.core.printing import brief
 from rigkit.geometry.sampson import epipolar_normals
+
+STEP_OF_DIRECTION = 1e-6
+"""Of its length, for differences: far above rounding, far below where the second order shows."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -148,19 +152,27 @@ class DirectionNoise:
         return DirectionNoise(build @ self.covariance1 @ build.T, build @ self.covariance2 @ build.T)
 
 
-def propagated(by1: FloatArray, by2: FloatArray, use: BoolArray, noise: DirectionNoise) -> FloatArray:
-    """Return the covariance (N, 4, 4) of vec(A21) to first order.
+def propagated(
+    solve: Callable[[DirectionPairs], Affines], directions: DirectionPairs, noise: DirectionNoise
+) -> FloatArray:
+    """Return the covariance (N, 4, 4) of vec(A21) to first order, by central differences of an estimator.
 
-    Parameters
-    ----------
-    by1, by2 : (N, 4, K, 2) d vec(A21) / d directions of either image.
-    use : (N, K); directions not in use have no influence, but their noise may be NaN.
+    Directions that are not valid have no influence, though their noise may be NaN.
     """
-    n, k = use.shape
-    unused = np.repeat(~use, 2, axis=1)
+    n, k = directions.valid.shape
+    unused = np.repeat(~directions.valid, 2, axis=1)
     ignore = unused[:, :, None] | unused[:, None, :]
     total = np.zeros((n, 4, 4))
-    for by, covariance in ((by1, noise.covariance1), (by2, noise.covariance2)):
+    for image, covariance in (("image1", noise.covariance1), ("image2", noise.covariance2)):
+        d = getattr(directions, image)
+        length = np.linalg.norm(d, axis=-1)
+        step = STEP_OF_DIRECTION * np.where(directions.valid & (length > 0.0), length, 1.0)
+        by = np.zeros((n, 4, k, 2))
+        for j, axis in np.ndindex(k, 2):
+            move = np.zeros_like(d)
+            move[:, j, axis] = step[:, j]
+            ahead, back = (solve(replace(directions, **{image: d + sign * move})) for sign in (1.0, -1.0))
+            by[:, :, j, axis] = (ahead - back).reshape(n, 4) / (2.0 * step[:, j, None])
         flat = by.reshape(n, 4, 2 * k)
         total += flat @ np.where(ignore, 0.0, covariance) @ np.swapaxes(flat, 1, 2)
     return total

@@ -86,15 +86,6 @@ def unit_weights(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
     return inverse_square(directions.x1, directions.y1), inverse_square(directions.x2, directions.y2)
 
 
-def solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solutions of N square systems (N, M, M), (N, M, R); one that is singular is NaN, not an error."""
-    determinant = np.linalg.det(matrices)
-    good = np.isfinite(determinant) & (determinant != 0.0)
-    out = np.full(right.shape, np.nan)
-    out[good] = np.linalg.solve(matrices[good], right[good])
-    return out
-
-
 def smallest_singular(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
     """Return the smaller singular value of a K x 2 system from its normal matrix, without cancellation."""
     half = 0.5 * (m11 + m22)

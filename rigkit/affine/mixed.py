@@ -48,8 +48,22 @@ def affines_from_mixed_directions(
     Rows in unit directions: perp(u2)^T A u1 = 0, and u2^T A u1 = |d2| / |d1| where the length counts: both angles and
     relative lengths are pure numbers, so they are weighted alike.
     """
+    counts = _checked(directions.valid.shape, scaled, epipolar)
+    A21, conditioning = _solved(directions, counts, epipolar)
+    valid = finite(A21) & (conditioning >= min_conditioning)
+    A21[~valid] = np.nan
+    covariance = None
+    if noise is not None:
+        covariance = propagated(lambda moved: _solved(moved, counts, epipolar)[0], directions, noise)
+        covariance[~valid] = np.nan
+    return Affinities(A21, valid, conditioning, covariance)
+
+
+def _solved(
+    directions: DirectionPairs, counts: BoolArray, epipolar: EpipolarNormals | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the affinities (N, 2, 2), and the smallest singular values (N,) of their systems."""
     n, k = directions.valid.shape
-    counts = _checked(n, k, scaled, epipolar)
     length1, length2 = (np.linalg.norm(d, axis=-1) for d in (directions.image1, directions.image2))
     use = directions.valid & (length1 > 0.0) & (length2 > 0.0)
     length1, length2 = np.where(use, length1, 1.0), np.where(use, length2, 1.0)
@@ -61,26 +75,13 @@ def affines_from_mixed_directions(
     right = np.zeros((n, k, 2))
     right[..., 1] = weight[..., 1] * length2 / length1
     base, free = _unknowns(n, epipolar)
-    a, gain, conditioning = _least_squares(rows @ free, right.reshape(n, 2 * k) - np.einsum("nrj,nj->nr", rows, base))
-    A21 = (base + np.einsum("nij,nj->ni", free, a)).reshape(n, 2, 2)
-    valid = finite(A21) & (conditioning >= min_conditioning)
-    A21[~valid] = np.nan
-    covariance = None
-    if noise is not None:
-        # Residuals change by left . (A dd1 - alpha dd2) / |d1|, alpha = |A d1| / |d2|, which is 1 where lengths count.
-        mapped = np.linalg.norm(np.einsum("nij,nkj->nki", A21, u1), axis=-1) * length1
-        scale = (weight / length1[..., None])[..., None]
-        by1 = scale * np.einsum("nkri,nij->nkrj", left, A21)
-        by2 = -scale * np.where(counts, 1.0, mapped / length2)[..., None, None] * left
-        spread = (free @ gain).reshape(n, 4, k, 2)
-        by1, by2 = (np.einsum("nakr,nkrj->nakj", spread, by) for by in (by1, by2))
-        covariance = propagated(by1, by2, use, noise)
-        covariance[~valid] = np.nan
-    return Affinities(A21, valid, conditioning, covariance)
+    a, conditioning = _least_squares(rows @ free, right.reshape(n, 2 * k) - np.einsum("nrj,nj->nr", rows, base))
+    return (base + np.einsum("nij,nj->ni", free, a)).reshape(n, 2, 2), conditioning
 
 
-def _checked(n: int, k: int, scaled: BoolArray, epipolar: EpipolarNormals | None) -> BoolArray:
+def _checked(shape: tuple[int, ...], scaled: BoolArray, epipolar: EpipolarNormals | None) -> BoolArray:
     """Return `scaled` as (N, K). Raises InputError where that or the epipolar normals do not fit."""
+    n, k = shape
     if epipolar is not None and len(epipolar) != n:
         raise InputError(f"mixed directions: {n} corners but epipolar normals of {len(epipolar)}")
     try:
@@ -102,14 +103,13 @@ def _unknowns(n: int, epipolar: EpipolarNormals | None) -> tuple[FloatArray, Flo
     return base, np.einsum("ni,jl->nijl", m, np.eye(2)).reshape(n, 4, 2)
 
 
-def _least_squares(system: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the solutions (N, U), d solution / d right (N, U, R), and the smallest singular values (N,)."""
-    n, _, unknowns = system.shape
-    normal = np.swapaxes(system, -1, -2) @ system
+def _least_squares(system: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the solutions (N, U), NaN where singular, and the smallest singular values (N,)."""
+    transposed = np.swapaxes(system, -1, -2)
+    normal = transposed @ system
     good = finite(normal) & finite(right)
-    conditioning = np.full(n, np.nan)
+    conditioning, out = np.full(len(system), np.nan), np.full((len(system), system.shape[2]), np.nan)
     conditioning[good] = np.sqrt(np.maximum(np.linalg.eigvalsh(normal[good])[:, 0], 0.0))
     good &= np.nan_to_num(conditioning) > SINGULAR
-    gain = np.full((n, unknowns, system.shape[1]), np.nan)
-    gain[good] = np.linalg.solve(normal[good], np.swapaxes(system[good], -1, -2))
-    return np.einsum("nur,nr->nu", gain, right), gain, conditioning
+    out[good] = np.linalg.solve(normal[good], (transposed @ right[..., None])[good])[..., 0]
+    return out, conditioning

@@ -7,9 +7,8 @@ import numpy as np
 from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals, propagated
 from rigkit.affine.components import MIN_CONDITIONING, PlanarDirections, blocks, finite, first_of
 from rigkit.affine.epipolar import epipolar_block, soft_epipolar, usable_directions
-from rigkit.affine.mixed import affines_from_mixed_directions
-from rigkit.affine.scaled import scaled_block, scaled_sensitivity
-from rigkit.affine.unscaled import SCALES, determinant_block, determinant_sensitivity
+from rigkit.affine.scaled import scaled_block
+from rigkit.affine.unscaled import SCALES, determinant_block
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
@@ -76,7 +75,7 @@ def affines_from_directions(
     A21[~valid] = np.nan
     covariance = None
     if noise is not None:
-        covariance = _covariance(directions, method, use, valid, A21, epipolar, scale, determinant is not None, noise)
+        covariance = _covariance(directions, method, use, valid, epipolar, scale, determinant, noise)
     return Affinities(A21, valid, conditioning, covariance)
 
 
@@ -117,15 +116,14 @@ def _covariance(
     method: str,
     use: BoolArray,
     valid: BoolArray,
-    A21: Affines,
     epipolar: EpipolarNormals | None,
     scale: str,
-    determinant_given: bool,
+    determinant: FloatArray | None,
     noise: DirectionNoise,
 ) -> FloatArray:
-    """Propagate the direction noise to vec(A), (N, 4, 4), to first order; NaN where invalid."""
-    out = np.full((len(valid), 4, 4), np.nan)
-    of_valid = DirectionNoise(noise.covariance1[valid], noise.covariance2[valid])
+    """Propagate the noise of the directions in use to vec(A), (N, 4, 4), to first order; NaN where invalid."""
+    lines = None if epipolar is None else EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])
+    known = None if determinant is None else np.asarray(determinant, dtype=np.float64)[valid]
     some = DirectionPairs(
         image1=directions.image1[valid],
         image2=directions.image2[valid],
@@ -133,20 +131,12 @@ def _covariance(
         scaled=directions.scaled,
         kinds=directions.kinds,
     )
-    if epipolar is not None and needs_epipolar(method):
-        normals, no_lengths = EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid]), np.zeros(1, dtype=bool)
-        found = affines_from_mixed_directions(
-            some, no_lengths, epipolar=normals, noise=of_valid, min_conditioning=0.0
-        ).covariance
-        assert found is not None
-        out[valid] = found
-        return out
-    if method == "DET3UDIR":
-        given = determinant_given
-        by1, by2 = determinant_sensitivity(some, use[valid], A21[valid], scale, determinant_given=given)
-    else:
-        by1, by2 = scaled_sensitivity(some, use[valid], A21[valid])
-    out[valid] = propagated(by1, by2, use[valid], of_valid)
+
+    def solve(moved: DirectionPairs) -> Affines:
+        return _solved(moved, method, lines, scale, known, 0.0)[0]
+
+    out = np.full((len(valid), 4, 4), np.nan)
+    out[valid] = propagated(solve, some, DirectionNoise(noise.covariance1[valid], noise.covariance2[valid]))
     return out
 
 

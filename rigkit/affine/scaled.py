@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, smallest_singular, solve_each, unit_weights
-from rigkit.core.arrays import Affines, BoolArray, FloatArray
-from rigkit.core.matches import DirectionPairs
+from rigkit.affine.components import PlanarDirections, smallest_singular, unit_weights
+from rigkit.core.arrays import FloatArray
 
 
 def scaled_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
@@ -33,18 +32,3 @@ def scaled_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
         )
     w1, _ = unit_weights(directions)
     return a, smallest_singular((w1 * x1 * x1).sum(0), (w1 * x1 * y1).sum(0), (w1 * y1 * y1).sum(0))
-
-
-def scaled_sensitivity(directions: DirectionPairs, use: BoolArray, A21: Affines) -> tuple[FloatArray, FloatArray]:
-    """Return d vec(A) / d directions of image 1 and of image 2, each (N, 4, K, 2), to first order at consistent data.
-
-    Notes
-    -----
-    From A M = D2 D1^T with M = D1 D1^T: dA = sum_k (dd2_k - A dd1_k) (M^-1 d1_k)^T.
-    """
-    d1 = np.where(use[..., None], directions.image1, 0.0)
-    gain = solve_each(np.einsum("nki,nkj->nij", d1, d1), np.swapaxes(d1, 1, 2))  # (N, 2, K)
-    by2 = np.einsum("il,njk->nijkl", np.eye(2), gain)
-    by1 = -np.einsum("nil,njk->nijkl", A21, gain)
-    n, k = use.shape
-    return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)

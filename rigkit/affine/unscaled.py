@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, first_of, last_of, solve_each, unit_weights
-from rigkit.core.arrays import Affines, BoolArray, FloatArray
+from rigkit.affine.components import PlanarDirections, first_of, last_of, unit_weights
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.core.matches import DirectionPairs
 
 SCALES = ("area", "ls", "sqmean", "diagonal")
 
@@ -228,66 +227,3 @@ def determinant_block(
     s = determinant_from_lengths(directions, shape, scale) if determinant is None else determinant
     with np.errstate(invalid="ignore"):
         return shape * np.sqrt(np.where(s > 0.0, s, np.nan)), conditioning
-
-
-def determinant_sensitivity(
-    directions: DirectionPairs, use: BoolArray, A21: Affines, scale: str, *, determinant_given: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Return d vec(A) / d directions of image 1 and of image 2, each (N, 4, K, 2), to first order at consistent data.
-
-    Notes
-    -----
-    Constrained least squares: [S, c; c^T, 0] [da; -dmu] = [-sum_k k_k dr_k; dc], k_k the residual rows and c^T da =
-    dc the linearised condition on the lengths.
-    """
-    n, k = use.shape
-    d1 = np.where(use[..., None], directions.image1, 0.0)
-    d2 = np.where(use[..., None], directions.image2, 0.0)
-    length1, length2 = np.sqrt((d1**2).sum(-1) + ~use), np.sqrt((d2**2).sum(-1) + ~use)
-    across2 = np.stack([-d2[..., 1], d2[..., 0]], axis=-1)
-    per_unit = 1.0 / (length1 * length2)
-    rows = per_unit[..., None] * (across2[..., :, None] * d1[..., None, :]).reshape(n, k, 4)
-    stretch = np.linalg.norm(np.einsum("nij,nkj->nki", A21, d1), axis=-1) / length2
-    right1 = np.zeros((n, 5, k, 2))
-    right2 = np.zeros((n, 5, k, 2))
-    # d2 x A d1 changes by d2 x (A dd1 - alpha dd2).
-    right1[:, :4] = -np.einsum("nkr,nk,nki,nij->nrkj", rows, per_unit, across2, A21, optimize=True)
-    right2[:, :4] = np.einsum("nkr,nk,nk,nki->nrki", rows, per_unit, stretch, across2, optimize=True)
-    cofactor = np.stack([A21[:, 1, 1], -A21[:, 1, 0], -A21[:, 0, 1], A21[:, 0, 0]], axis=-1)
-    constraint = cofactor
-    if determinant_given:
-        pass
-    elif scale == "area":
-        right1[:, 4], right2[:, 4] = _area_sensitivity(d1, d2, use, A21)
-    elif scale == "ls":
-        # sum_k |d2_k| (|d2_k| - |A d1_k|) = 0
-        constraint = np.einsum("nki,nkj->nij", d2, d1).reshape(n, 4)
-        right2[:, 4] = d2
-        right1[:, 4] = -np.einsum("nki,nij->nkj", d2, A21)
-    else:
-        used = use if scale == "sqmean" else last_of(use.T).T
-        ratio = np.where(used, length2 / length1, 0.0)
-        gain = np.where(used, (2.0 * ratio.sum(1) / used.sum(1) ** 2)[:, None], 0.0)
-        right2[:, 4] = (gain / (length1 * length2))[..., None] * d2
-        right1[:, 4] = -(gain * ratio / length1**2)[..., None] * d1
-    system = np.zeros((n, 5, 5))
-    system[:, :4, :4] = np.einsum("nki,nkj->nij", rows, rows)
-    system[:, 4, :4] = system[:, :4, 4] = constraint
-    by1 = solve_each(system, right1.reshape(n, 5, 2 * k))[:, :4]
-    by2 = solve_each(system, right2.reshape(n, 5, 2 * k))[:, :4]
-    return by1.reshape(n, 4, k, 2), by2.reshape(n, 4, k, 2)
-
-
-def _area_sensitivity(d1: FloatArray, d2: FloatArray, use: BoolArray, A21: Affines) -> tuple[FloatArray, FloatArray]:
-    """Return d det / d directions of either image, (N, K, 2), where det = (d2_a x d2_b) / (d1_a x d1_b)."""
-    n = len(use)
-    order = np.argsort(~use, axis=1, kind="stable")
-    row = np.arange(n)
-    a, b = order[:, 0], order[:, 1]
-    area1 = d1[row, a, 0] * d1[row, b, 1] - d1[row, a, 1] * d1[row, b, 0]
-    det = np.linalg.det(A21)
-    by1, by2 = np.zeros_like(d1), np.zeros_like(d2)
-    for out, d, gain in ((by2, d2, 1.0 / area1), (by1, d1, -det / area1)):
-        out[row, a] = gain[:, None] * np.stack([d[row, b, 1], -d[row, b, 0]], axis=-1)
-        out[row, b] = gain[:, None] * np.stack([-d[row, a, 1], d[row, a, 0]], axis=-1)
-    return by1, by2
