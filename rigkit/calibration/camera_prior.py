@@ -6,6 +6,8 @@ millionth of that). One or two views do not determine a lens by themselves: thes
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from rigkit.cameras.base import Camera, image_center
@@ -24,8 +26,21 @@ DENOMINATOR_SIGMA = 1.0
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
     names, values = camera.parameter_names(), camera.parameters
-    middle = image_center(camera.size_px).tolist()
-    reach = CENTRE_SIGMA * max(camera.size_px)
+    rows, mean = _expected(names, camera.size_px)
+    if "fy" not in names:
+        return rows, rows @ (values - mean)
+    x, y = names.index("fx"), names.index("fy")
+    fx, fy = float(values[x]), float(values[y])
+    rows, size = rows.copy(), SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
+    rows[-1, x], rows[-1, y] = 1.0 / size, -1.0 / size
+    return rows, rows @ (values - mean)
+
+
+@lru_cache
+def _expected(names: tuple[str, ...], size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return d r / d parameters (m, P), and the parameters (P,) of which r = 0; the last row, where there are two focal
+    lengths, is theirs, and empty: it depends on them."""
+    middle, reach = image_center(size_px).tolist(), CENTRE_SIGMA * max(size_px)
     expected = {
         "cx": (middle[0], reach),
         "cy": (middle[1], reach),
@@ -35,16 +50,9 @@ def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
     if "k6" in names:
         expected |= dict.fromkeys(("k4", "k5", "k6"), (0.0, DENOMINATOR_SIGMA))
     known = [name for name in expected if name in names]
-    index = np.array([names.index(name) for name in known], dtype=np.int64)
-    mean, sigma = np.array([expected[name] for name in known]).reshape(-1, 2).T
-    has_two_focals = "fx" in names and "fy" in names
-    rows = np.zeros((len(known) + has_two_focals, len(names)))
-    residuals = np.empty(len(rows))
-    rows[np.arange(len(known)), index] = 1.0 / sigma
-    residuals[: len(index)] = (values[index] - mean) / sigma
-    if has_two_focals:
-        x, y = names.index("fx"), names.index("fy")
-        fx, fy = float(values[x]), float(values[y])
-        size = SQUARE_SIGMA * 0.5 * (abs(fx) + abs(fy))
-        rows[-1, x], rows[-1, y], residuals[-1] = 1.0 / size, -1.0 / size, (fx - fy) / size
-    return rows, residuals
+    rows, mean = np.zeros((len(known) + ("fy" in names), len(names))), np.zeros(len(names))
+    for row, name in zip(rows, known, strict=False):
+        k = names.index(name)
+        mean[k], row[k] = expected[name][0], 1.0 / expected[name][1]
+    rows.flags.writeable = mean.flags.writeable = False
+    return rows, mean

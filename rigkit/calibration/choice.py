@@ -59,6 +59,8 @@ def choose(observations: Observations, options: Sequence[Option], surely: float 
     Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
     rule, here paired over images.
     """
+    if len(options) == 1:
+        return options[0]
     judged = [o for o in settled(options) if o.heldout is not None]
     if not judged:
         return min(options, key=lambda o: _bic(observations, o))

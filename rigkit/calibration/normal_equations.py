@@ -12,6 +12,7 @@ from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.kernels.schur import schur_step
 
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
@@ -91,9 +92,10 @@ class NormalEquations:
         gg, g, cost = self.gg.copy(), self.g.copy(), 0.0
         for own, camera in cameras:
             rows, residual = camera_prior(camera)
-            gg[own, own] += sigma_px**2 * rows.T @ rows
-            g[own] -= sigma_px**2 * rows.T @ residual
-            cost += sigma_px**2 * float(residual @ residual)
+            rows, residual = sigma_px * rows, sigma_px * residual
+            gg[own, own] += rows.T @ rows
+            g[own] -= rows.T @ residual
+            cost += float(residual @ residual)
         if unknowns.size:
             weight = (sigma_px / shape_sigma) ** 2
             diagonal = np.arange(shape.start, shape.stop)
@@ -117,12 +119,13 @@ class NormalEquations:
 
     def step(self, damping: float) -> SchurStep | None:
         """Return the damped Gauss-Newton step, None where the damped system is not positive definite."""
-        damping_g, damping_p = damping * _diagonal(self.gg), damping * _diagonal(self.pp)
         first = self.points_from
-        many = first is not None and len(self.g) - first > 6 * len(self.pp)
+        if first is None or len(self.g) - first <= 6 * len(self.pp):
+            found = schur_step(self.gg, self.gp, self.pp, self.g, self.p, damping)
+            return None if found is None else SchurStep(*found)
+        damping_g, damping_p = damping * _diagonal(self.gg), damping * _diagonal(self.pp)
         try:
-            solve = self._eliminate_points if many else self._eliminate_poses
-            step_g, step_p = solve(damping_g, damping_p)
+            step_g, step_p = self._eliminate_points(damping_g, damping_p)
         except np.linalg.LinAlgError:
             return None
         if not (np.isfinite(step_g).all() and np.isfinite(step_p).all()):
@@ -131,15 +134,6 @@ class NormalEquations:
         predicted = float(step_g @ (damping_g * step_g + self.g))
         predicted += float((step_p * (damping_p * step_p + self.p)).sum())
         return SchurStep(step_g, step_p, predicted)
-
-    def _eliminate_poses(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        count = len(self.g)
-        coupled = np.concatenate([self.gp, self.p[:, None]], axis=1)
-        back = np.linalg.inv(_damped(self.pp, damping_p)) @ np.swapaxes(coupled, -1, -2)
-        through = _gemm(self.gp, back)
-        reduced = _damped(self.gg, damping_g) - through[:, :count]
-        step_g = _solve_positive(reduced, self.g - through[:, count])
-        return step_g, -(back @ np.append(step_g, -1.0))
 
     def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Eliminate the released points by their 3x3 blocks: with many points and few views the system of the other

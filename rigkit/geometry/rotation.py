@@ -27,11 +27,11 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 def exp_so3(rotation_vector: ArrayLike) -> Mat3:
     """Return the rotation by |w| radians about w. `rotation_vector` (..., 3) -> (..., 3, 3), exact at zero."""
     w = np.asarray(rotation_vector, dtype=np.float64)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    # Both coefficients are exact down to the smallest angle: (1 - cos a) / a^2 = 2 (sin(a / 2) / a)^2.
+    angle = np.maximum(np.sqrt((w * w).sum(axis=-1)), np.finfo(float).tiny)[..., None, None]
     k = skew(w)
-    # sinc keeps both coefficients exact down to zero: (1 - cos a) / a^2 = sinc(a/2)^2 / 2.
-    first = np.sinc(angle / np.pi)
-    second = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    first = np.sin(angle) / angle
+    second = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 

@@ -80,6 +80,23 @@ EXPORT void add_views(
     ARRAY(const double, u, count), ARRAY(const double, v, count), ARRAY(const uint8_t, projects, count),
     ARRAY(const double, lever, 3, count), ARRAY(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
 
+/* schur.c */
+
+/* Blocks of normal equations over globals and the poses of views (calibration.normal_equations). */
+typedef struct {
+    ARRAY(const double, gg, globals, globals);
+    ARRAY(const double, gp, views, globals, POSE);
+    ARRAY(const double, pp, views, POSE, POSE);
+    ARRAY(const double, g, globals);
+    ARRAY(const double, p, views, POSE);
+    int64_t globals, views;
+} normal_equations_t;
+
+EXPORT int64_t schur_memory(int64_t globals, int64_t views);
+EXPORT int64_t solve_schur(
+    const normal_equations_t *normal, double damping, ARRAY(double, memory, schur_memory(normal.globals, normal.views)),
+    ARRAY(double, step_g, normal.globals), ARRAY(double, step_p, normal.views, POSE), ARRAY(double, predicted, 1));
+
 /* coverage.c */
 
 EXPORT void cover_pixels(
