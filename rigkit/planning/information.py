@@ -25,6 +25,7 @@ from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 
 LENS_UNKNOWN = 0.1
@@ -178,24 +179,29 @@ def pose_information(camera: Camera, held: HeldBoards, error: CornerError) -> Fl
 
 
 def _products(camera: Camera, held: HeldBoards, error: CornerError, shape: ShapeModel | None = None) -> FloatArray:
-    views, corners = held.seen.shape
-    observations = Observations(
-        views=(),
-        pixels=np.zeros((views, corners, 2)),
-        corner=np.broadcast_to(np.arange(corners), held.seen.shape),
-        sigma_px=np.ones(held.seen.shape),
-        weight=held.seen.astype(np.float64),
-        present=held.seen,
-        boards=(),
-        first_row=np.array([0, corners]),
-        board=np.zeros(views, dtype=np.int64),
-    )
+    corners = held.seen.shape[1]
     if shape is None:
         none = np.zeros(0, dtype=np.int64)
         shape = ShapeModel("flat", held.points_mm, np.zeros((corners, 3, 0)), np.zeros(0), none)
     state = State(camera, held.rotation, held.translation_mm, shape, np.zeros(len(shape.sigma)))
     weight = held.seen / np.sqrt(error.variance(held.seen.sum(axis=1, dtype=np.float64)))[:, None]
-    return view_products(observations, state, weight)
+    return view_products(observations_of(held.seen), state, weight)
+
+
+def observations_of(seen: BoolArray, boards: tuple[Board, ...] = ()) -> Observations:
+    """Return the observations of views that could be taken, of one board whose corners `seen` (C, N) each sees."""
+    views, corners = seen.shape
+    return Observations(
+        views=(),
+        pixels=np.zeros((views, corners, 2)),
+        corner=np.broadcast_to(np.arange(corners), seen.shape),
+        sigma_px=np.ones(seen.shape),
+        weight=seen.astype(np.float64),
+        present=seen,
+        boards=boards,
+        first_row=np.array([0, corners]),
+        board=np.zeros(views, dtype=np.int64),
+    )
 
 
 def lens_prior(camera: Camera) -> FloatArray:

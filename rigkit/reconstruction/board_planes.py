@@ -18,7 +18,7 @@ from rigkit.geometry.rotation import angle_between, skew
 from rigkit.optim.damping import Damping, Stop
 from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
-from rigkit.reconstruction.noise_level import variance_factor
+from rigkit.relative_pose.refinement.noise_level import variance_factor
 
 MIN_CORNERS_OF_BOARD = 8
 """A board with fewer corners in a view has no pose there worth the name."""

@@ -16,8 +16,8 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
-from rigkit.reconstruction.noise_level import variance_factor
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
+from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose, rules_out
 from rigkit.relative_pose.refinement.select import DEFAULT_LEVEL_RAD, PoseTypeEvidence, pose_type_evidence
 from rigkit.relative_pose.solvers.pose import choose_pose, essential_from_pose
@@ -31,9 +31,6 @@ MAX_BASELINE_SIGMA = 0.2
 
 NOTABLE_SCATTER = 2.0
 """Corners that scatter this many times more than predicted are worth a word: blur, JPEG, a bad calibration."""
-
-POSE_FREEDOM = 5
-"""Degrees of freedom of a relative pose without its length."""
 
 SAME_COST = 1e-9
 """Costs that differ by less than this part are one minimum, reached from two sides."""

@@ -22,8 +22,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.colmap import colmap_pair, solve_pair
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
-from rigkit.reconstruction.geometry import POSE_FREEDOM
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM
 from rigkit.validation.check import Check, compare
 from rigkit.validation.colmap_method import colmap_reconstruction
 from rigkit.validation.measure import Measured, measure

@@ -18,8 +18,9 @@ from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, editions, ensure_register, load_history
 from rigkit.io.reading import about
+from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.report.history_page import history_page, overwritten
-from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts

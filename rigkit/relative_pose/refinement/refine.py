@@ -27,7 +27,6 @@ from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, es
 from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import (
     MIN_SIGMA_A,
-    RowWeights,
     WeightRule,
     estimate_sigma_A,
     usable_affinities,
@@ -116,7 +115,7 @@ def estimate_pose(
     pose_type: PoseType | str = PoseType.GENERAL,
     level_sigma_rad: float | None = None,
     *,
-    weights: WeightRule | RowWeights | None = None,
+    weights: WeightRule | None = None,
 ) -> RefinedPose:
     """Return the refined pose from scratch: linear solution, cheirality, maximum likelihood.
 
@@ -211,7 +210,7 @@ def _split(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
     return np.array(pose.rotation), unit(pose.translation_mm)
 
 
-def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule | RowWeights | None) -> Matches:
+def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule | None) -> Matches:
     """Return the matches with the sigma_A that the weight rule stands for: one for all starts, of the best of them."""
     if weights == "points" or (weights == "auto" and not usable_affinities(matches).any()):
         return replace(matches, A21=None, sigma_A=None)

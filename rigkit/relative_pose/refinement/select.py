@@ -19,6 +19,7 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import rotation_angle, unit
+from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
 from rigkit.relative_pose.refinement.refine import RefinedPose, estimate_pose, refine_pose
 from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import translation_basis
@@ -28,9 +29,6 @@ DEFAULT_LEVEL_RAD = float(np.radians(0.2))
 
 CONTRADICTION_P = 1e-3
 """Chance with which a true declaration would be called contradicted."""
-
-SIGMA_BELIEF = 4.0
-"""The stated sigmas count as much as this many residuals when the noise level is corrected from the fit."""
 
 SELECTED_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 
@@ -120,10 +118,7 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
     fits = _fits(matches, level)
     general = fits.get(PoseType.GENERAL)
     n = len(matches)
-    noise2 = 1.0
-    if general is not None:
-        left = max(n - 5, 0)
-        noise2 = (general.variance_factor * left + SIGMA_BELIEF) / (left + SIGMA_BELIEF)
+    noise2 = 1.0 if general is None else variance_factor(general.cost, n - POSE_FREEDOM)
     raw = {kind: _log_evidence(fit, kind, level, noise2) for kind, fit in fits.items()}
     top = max(raw.values())
     total = sum(np.exp(value - top) for value in raw.values())

@@ -76,16 +76,10 @@ class RobustPose:
     refined : the pose, refined on the weighted matches.
     inliers : (N,) bool, matches that fit at one and a half times the noise that the fitting ones show, lie in front of
         both cameras (by more than noise) and, where there are affinities with sigmas, agree by them.
-    weights : (N,) of the marginalised loss at that noise, 0 for those not in front or with a wrong affinity.
-    quality : sum of the marginal quality at that noise over the same matches.
-    trials : samples drawn.
     """
 
     refined: RefinedPose
     inliers: BoolArray
-    weights: FloatArray
-    quality: float
-    trials: int
 
 
 def robust_pose(
@@ -126,7 +120,7 @@ def robust_pose(
         r = rows.residuals(essential_from_pose(end.cam2_from_cam1)[None])[0]
         qualities = marginal_quality(r, noise) * plausible
         inliers = plausible & (np.abs(r) < QUANTILE * noise)
-        return RobustPose(end, inliers, loss(r) * plausible, float(qualities.sum()), trials), qualities
+        return RobustPose(end, inliers), qualities
 
     for start, plausible in _poses(matches, rows, finalists, kind, noise, max_noise):
         try:

@@ -58,26 +58,22 @@ class FundamentalSolver(Protocol):
         """Of the set of epipolar geometries that the solver chooses from."""
         ...
 
-    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+    def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Estimate the epipolar geometry; `weights` None is the rule "noise". Raises DegenerateError or InputError."""
         ...
 
 
 def reweighted(
-    matches: Matches,
-    weights: WeightRule | RowWeights | None,
-    solve: Callable[[RowWeights], FloatArray],
+    matches: Matches, rule: WeightRule | None, solve: Callable[[RowWeights], FloatArray]
 ) -> tuple[FloatArray, RowWeights]:
     """Return E21 (3, 3) of `solve(row weights)`, repeated with the weights that its own result implies.
 
-    Explicit RowWeights and the rule "equal" are used once and as they are. With the rule "auto" sigma_A starts from the
-    geometry of the points alone where they suffice, and is estimated again with every repetition.
+    The rule "equal" is used once. With the rule "auto" sigma_A starts from the geometry of the points alone where they
+    suffice, and is estimated again with every repetition. None is the rule "noise".
     """
-    if isinstance(weights, RowWeights):
-        return solve(weights), weights
-    rule: WeightRule = "noise" if weights is None else weights
+    rule = "noise" if rule is None else rule
     if not isinstance(rule, str):
-        raise InputError(f"weights: RowWeights or the name of a rule are needed, got {type(rule).__name__}")
+        raise InputError(f"weights: the name of a rule is needed, got {type(rule).__name__}")
     if rule == "equal":
         row_weights = equal_weights(matches)
         return solve(row_weights), row_weights

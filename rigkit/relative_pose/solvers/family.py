@@ -46,7 +46,7 @@ class FamilySolver:
     def degrees_of_freedom(self) -> int:
         return len(self.family) - 1
 
-    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+    def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return E21 of the family; see FundamentalSolver. Raises DegenerateError where it is not determined."""
         rows = LinearRows.of(matches, self.family)
 

@@ -24,7 +24,7 @@ class GeneralSolver:
 
     degrees_of_freedom: int = 7
 
-    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+    def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return F21 (rank two) and the nearest E21; see FundamentalSolver.
 
         Raises DegenerateError where one plane explains the matches to within their noise.

@@ -35,7 +35,7 @@ class PlanarSolver:
 
     degrees_of_freedom: int = 2
 
-    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+    def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return the globally optimal planar E21; see FundamentalSolver."""
         rows = LinearRows.of(matches, np.eye(9)[list(PLANAR_ENTRIES)])
 

@@ -36,7 +36,7 @@ class RowsSolver:
 
     degrees_of_freedom: int = 2
 
-    def solve(self, matches: Matches, weights: WeightRule | RowWeights | None = None) -> EpipolarEstimate:
+    def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return the epipolar geometry of standard stereo with free rows; see FundamentalSolver.
 
         F21 obeys the relation of the rows; E21, which cannot have another focal length, is the nearest to it.

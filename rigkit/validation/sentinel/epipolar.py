@@ -25,7 +25,8 @@ from rigkit.geometry.rotation import skew
 from rigkit.geometry.sampson import sampson_distances
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import MIN_SIGMA_PX, FreshEvidence, Watched
+from rigkit.planning.information import MIN_SIGMA_PX
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
 from rigkit.validation.sentinel.whitened import NULL_RANK
 

@@ -26,9 +26,8 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.planning.information import MIN_SIGMA_PX, observations_of
 
-MIN_SIGMA_PX = 0.02
-"""No corner is better than this: of exact ones everything would be a change."""
 SAME_BOARD = 0.02
 """A board of the calibration's name whose corners lie farther from where it found them than this part of its size is
 another one."""
@@ -179,21 +178,7 @@ def told_by(
     for each camera, the corners that it sees.
     """
     frames = np.arange(len(rotation))
-    corner = np.broadcast_to(np.arange(board.corner_count), seen[0].shape)
-    observations = tuple(
-        Observations(
-            views=(),
-            pixels=np.zeros((*own.shape, 2)),
-            corner=corner,
-            sigma_px=np.ones(own.shape),
-            weight=own.astype(np.float64),
-            present=own,
-            boards=(board,),
-            first_row=np.array([0, board.corner_count]),
-            board=np.zeros(len(own), dtype=np.int64),
-        )
-        for own in seen
-    )
+    observations = tuple(observations_of(own, (board,)) for own in seen)
     placed = _Placed(
         rotation, translation_mm, frames, observations, (frames,) * len(seen), tuple(o.weight for o in observations)
     )

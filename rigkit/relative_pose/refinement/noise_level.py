@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+POSE_FREEDOM = 5
+"""Degrees of freedom of a relative pose without its length."""
 STATED_RESIDUALS = 2.0
 """The stated sigmas count as much as one more corner in one image: a unit-information prior (Kass and Wasserman, J. Am.
 Stat. Assoc. 90, 1995) on the variance, conjugate as a scaled inverse chi-square. A handful of residuals that happen to
