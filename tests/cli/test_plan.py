@@ -90,7 +90,8 @@ def test_a_rig_is_planned_camera_by_camera(tmp_path: Path, capsys: pytest.Captur
     path.write_text('{"schema": "rigkit.rig/1"}')
     assert main(["plan", str(path)]) == 2
     assert "rig-CAMERA.json" in capsys.readouterr().err
-    session.write_text('schema = "rigkit.session/1"\n[[cameras]]\n[[cameras]]\n')
+    cameras = "".join(f'[[cameras]]\nid = "{name}"\nimages = "{name}*.png"\n' for name in ("left", "right"))
+    session.write_text(f'schema = "rigkit.session/1"\nboard = "board.toml"\n{cameras}')
     assert main(["plan", str(session), "--check"]) == 2
     assert "rig.json" in capsys.readouterr().err
 
