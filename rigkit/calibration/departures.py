@@ -33,8 +33,8 @@ from rigkit.kernels.departures import POSE, LensCorners, averaged_amounts, displ
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
 """A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
 smaller than the first are rounding, and tell nothing."""
-SIZES_TRIED = 8
-"""So many sizes between them are tried."""
+SIZES_TRIED = np.geomspace(SMALLEST_PX, LARGEST_PX, 17)[1::2]
+"""The sizes between them that are tried: the middles of eight equal parts of their logarithm."""
 ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
 """Of at least so many corners every second (third ...) is taken, where as many of each view are left."""
 RIDGE = 1e-12
@@ -79,9 +79,7 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     # Where nothing is known, rounding may say less than nothing.
     values, axes = np.linalg.eigh(information)
     information = (axes * np.maximum(values, 0.0)) @ axes.T
-    # The middles of so many equal parts.
-    sizes = np.geomspace(SMALLEST_PX, LARGEST_PX, 2 * SIZES_TRIED + 1)[1::2]
-    return averaged_amounts(information, score, sizes)
+    return averaged_amounts(information, score, SIZES_TRIED)
 
 
 def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, int]:
