@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
+from rigkit.kernels.close_pairs import pairs_within
 
 REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
-PAIRS_AT_A_TIME = 2**18
-"""Keeps the memory small."""
 MAX_ALONG_ONE_AXIS = 1024
 """So many points at most are sorted along one axis; more of them along two."""
 MIN_STRIP = 1e-6
@@ -52,7 +51,7 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     """Return which of the points (N, D), D > 1, are within `reach` of each other along every axis: i < j, (P,) each."""
     extent = np.ptp(points, axis=0)
     axes = np.argsort(extent, kind="stable")
-    there, many = np.arange(len(points)), len(points) > MAX_ALONG_ONE_AXIS
+    many = len(points) > MAX_ALONG_ONE_AXIS
     side = max(reach, MIN_STRIP * float(extent.max()), np.finfo(float).tiny)
     place, length = points[:, axes[-1]], 0.0
     if many:
@@ -62,27 +61,17 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
         length = float(extent[axes[-2]]) + 4.0 * side
         place = along - along.min() + strip * length
     order = np.argsort(place, kind="stable")
-    place, ordered = place[order], points[order][:, axes].T.copy()
-    runs = [(there + 1, np.searchsorted(place, place + SOUGHT_FURTHER * side, side="right"))]
+    place = place[order]
+    ends = np.zeros((len(points), 4), np.int64)
+    ends[:, 0] = np.arange(1, len(points) + 1)
+    ends[:, 1] = np.searchsorted(place, place + SOUGHT_FURTHER * side, side="right")
     if many:
-        ends = place + length - SOUGHT_FURTHER * side, place + length + SOUGHT_FURTHER * side
-        runs.append((np.searchsorted(place, ends[0]), np.searchsorted(place, ends[1])))
-    found = [np.zeros((2, 0), np.int64)]
-    for begin, end in runs:
-        ahead = end - begin
-        for block in np.array_split(there, 1 + int(ahead.sum()) // PAIRS_AT_A_TIME):
-            count = ahead[block]
-            first = np.repeat(block, count)
-            second = np.arange(len(first)) + np.repeat(begin[block] - np.cumsum(count) + count, count)
-            # The widest axis but the one that they are sorted along tells the most of them apart.
-            for values in np.roll(ordered[::-1], -1, axis=0):
-                close = np.abs(values[first] - values[second]) <= reach
-                first, second = first[close], second[close]
-                if not len(first):
-                    break
-            found.append(order[np.stack([first, second])])
-    pairs = np.sort(np.concatenate(found, axis=1), axis=0)
-    return pairs[0], pairs[1]
+        ends[:, 2] = np.searchsorted(place, place + length - SOUGHT_FURTHER * side)
+        ends[:, 3] = np.searchsorted(place, place + length + SOUGHT_FURTHER * side)
+    # The widest axis but the one that they are sorted along tells the most of them apart.
+    pairs = order[pairs_within(points[order][:, np.roll(axes[::-1], -1)], reach, ends)]
+    pairs.sort(axis=1)
+    return pairs[:, 0], pairs[:, 1]
 
 
 def _places(pixels: Sequence[Pixels]) -> FloatArray:

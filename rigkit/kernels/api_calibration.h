@@ -97,6 +97,12 @@ EXPORT int64_t solve_schur(
     const normal_equations_t *normal, double damping, ARRAY(double, memory, schur_memory(normal.globals, normal.views)),
     ARRAY(double, step_g, normal.globals), ARRAY(double, step_p, normal.views, POSE), ARRAY(double, predicted, 1));
 
+/* close_pairs.c */
+
+EXPORT int64_t close_pairs(
+    ARRAY(const double, points, count, axes), int64_t count, int64_t axes, double reach, ARRAY(const int64_t, ends, count, 4),
+    ARRAY(int64_t, pairs, capacity, 2), int64_t capacity);
+
 /* coverage.c */
 
 EXPORT void cover_pixels(

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import rigkit.calibration.repeats as repeats
+import rigkit.kernels.close_pairs as kernel
 from rigkit.calibration.repeats import close_pairs
 from rigkit.core.arrays import FloatArray
 
 
 @pytest.mark.parametrize("count", [1, 2, 300, 1100])
-@pytest.mark.parametrize("at_a_time", [7, 2**18])
+@pytest.mark.parametrize("room", [0, 2])
 def test_close_pairs_are_those_of_all_with_all(
-    count: int, at_a_time: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    count: int, room: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(repeats, "PAIRS_AT_A_TIME", at_a_time)
+    monkeypatch.setattr(kernel, "USUAL_PARTNERS", room)
     points: FloatArray = rng.integers(0, 40, (count, 3)).astype(np.float64) * 0.25
     apart = np.abs(points[:, None] - points).max(axis=2)
     expected = np.argwhere(np.triu(apart <= 0.5, 1))
