@@ -14,13 +14,10 @@ from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
-from rigkit.kernels.cameras import brown_pixels
+from rigkit.kernels.cameras import brown_pixels, brown_places
 
 FARTHEST = 50.0
 """Tangent of 88.9 degrees: no lens of this kind sees further."""
-MAX_INVERSE_STEPS = 30
-NEWTON_SETTLED = 1e-13
-"""Newton in the plane stops where the next step would be this small, in units of the focal length."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -101,40 +98,6 @@ class Brown(Camera):
             limit = min(limit, float(np.sqrt(first_root(bottom, FARTHEST**2))))
         object.__setattr__(self, "_max_r", limit)
 
-    def _radial(self, t: FloatArray) -> tuple[FloatArray, FloatArray | float]:
-        """Return L and its denominator."""
-        top, bottom = self._polynomials()
-        factor = horner(top, t)
-        if bottom.size == 1:
-            return factor, 1.0
-        denominator = horner(bottom, t)
-        factor /= denominator
-        return factor, denominator
-
-    def _distort(self, plane: FloatArray, squares: FloatArray, factor: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return m (2, N) and (t + 2 x^2, 2 x y, t + 2 y^2) from (x, y), (x^2, x y, y^2) and L."""
-        p1, p2 = self.parameters[6:8].tolist()
-        tangential = 2.0 * squares
-        tangential[::2] += squares[0] + squares[2]
-        m = factor * plane
-        m += np.array([[p2, p1, 0.0], [0.0, p2, p1]]) @ tangential
-        return m, tangential
-
-    def _slope(
-        self, plane: FloatArray, squares: FloatArray, t: FloatArray, factor: FloatArray, denominator: FloatArray | float
-    ) -> FloatArray:
-        """Return the entries xx, xy, yy (3, N) of the symmetric d m / d (x, y)."""
-        top, bottom = self._polynomials()
-        p1, p2 = self.parameters[6:8].tolist()
-        by_t2 = horner(top[1:] * np.array([2.0, 4.0, 6.0]), t)
-        if bottom.size > 1:
-            by_t2 -= factor * horner(bottom[1:] * np.array([2.0, 4.0, 6.0]), t)
-            by_t2 /= denominator
-        slope = np.array([[6.0 * p2, 2.0 * p1], [2.0 * p1, 2.0 * p2], [2.0 * p2, 6.0 * p1]]) @ plane
-        slope += by_t2 * squares
-        slope[::2] += factor
-        return slope
-
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         return brown_pixels((x, y, z), self.parameters, self._max_r)
 
@@ -143,30 +106,8 @@ class Brown(Camera):
         m = np.stack([(u - cx) / fx, (v - cy) / fy])
         valid = np.isfinite(m[0] + m[1])
         m = np.where(valid, m, 0.0)
-        plane = here = self._radial_start(m)
-        moving, before = np.arange(valid.size), np.full(valid.size, 1e-300)
-        for _ in range(MAX_INVERSE_STEPS):
-            squares = _squares(here)
-            t = squares[0] + squares[2]
-            factor, denominator = self._radial(t)
-            miss_x, miss_y = self._distort(here, squares, factor)[0] - m
-            xx, xy, yy = self._slope(here, squares, t, factor, denominator)
-            step = np.stack([yy * miss_x - xy * miss_y, xx * miss_y - xy * miss_x]) / (xx * yy - xy * xy)
-            # Kept inside the circle, where the derivative is positive definite: Newton cannot leave for another branch.
-            here = here - step
-            length = np.sqrt(here[0] ** 2 + here[1] ** 2 + 1e-300)
-            here *= np.minimum(1.0, self._max_r / length)
-            # The next step is (size / before)^2 of this one, for as long as the convergence is quadratic.
-            size = np.abs(step[0]) + np.abs(step[1])
-            reached = np.minimum(length, self._max_r)
-            unsettled = ~(size * np.minimum(size / before, 1.0) ** 2 <= NEWTON_SETTLED * (1.0 + reached))
-            before = np.maximum(size, 1e-300)
-            plane[:, moving] = here
-            if not unsettled.all():
-                moving, here, m, before = moving[unsettled], here[:, unsettled], m[:, unsettled], before[unsettled]
-            if not moving.size:
-                break
-        valid[moving] = False
+        plane, settled = brown_places(m, self._radial_start(m), self.parameters, self._max_r)
+        valid &= settled
         z = 1.0 / np.sqrt(1.0 + plane[0] ** 2 + plane[1] ** 2)
         return plane[0] * z, plane[1] * z, z, valid
 
@@ -176,7 +117,8 @@ class Brown(Camera):
         knots = np.tan(np.linspace(0.0, np.arctan(self._max_r), KNOTS))
         radius = np.sqrt(m[0] ** 2 + m[1] ** 2)
         # Where the denominator vanishes at the edge, rounding may have it infinite or negative there.
-        values = np.fmax.accumulate(knots * self._radial(knots * knots)[0])
+        top, bottom = (horner(polynomial, knots * knots) for polynomial in self._polynomials())
+        values = np.fmax.accumulate(knots * (top / bottom))
         found = np.interp(radius, values, knots)
         return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
 
@@ -194,11 +136,3 @@ class Brown(Camera):
 def _product(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the product of two polynomials."""
     return a * b if b.size == 1 else np.convolve(a, b)
-
-
-def _squares(plane: FloatArray) -> FloatArray:
-    """Return (x^2, x y, y^2) of (x, y) (2, N)."""
-    out = np.empty((3, plane.shape[1]))
-    np.multiply(plane, plane, out=out[::2])
-    np.multiply(plane[0], plane[1], out=out[1])
-    return out

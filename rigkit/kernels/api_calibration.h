@@ -127,6 +127,9 @@ EXPORT void differentiate_brown(
     const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
     ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
     ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+EXPORT void undistort_brown(
+    ARRAY(const double, parameters, 12), double max_r, int64_t rational, ARRAY(const double, m, 2, count), int64_t count,
+    ARRAY(double, plane, 2, count), ARRAY(uint8_t, valid, count));
 
 /* radial.c */
 

@@ -5,49 +5,71 @@
 /* Where the parameters stand. */
 enum { FX, FY, CX, CY, K1, K2, P1, P2, K3, K4, K5, K6 };
 
-/* Write what the points come to; without denominator where the model is not `rational`. */
+/* Newton in the plane stops where the next step would be this small, in units of the focal length. */
+#define SETTLED 1e-13
+#define MAX_STEPS 30
+/* Keeps lengths off zero, where they divide. */
+#define TINY 1e-300
+
+/* A place (x, y) in the plane at unit depth: t = x^2 + y^2, the radial factor L and its denominator, the tangential part's
+ * (t + 2 x^2, 2 x y, t + 2 y^2), where it is imaged, m, and the symmetric d m / d (x, y). */
+typedef struct {
+    double t, factor, bottom, along_x, across, along_y, mx, my, xx, xy, yy;
+} bent_t;
+
+/* Return what a place comes to; without denominator where the model is not `rational`. */
+INLINE bent_t bend(const double *k, const int rational, double x, double y)
+{
+    bent_t b;
+    const double t = x * x + y * y, p1 = k[P1], p2 = k[P2];
+    b.t = t;
+    b.bottom = rational ? 1.0 + t * (k[K4] + t * (k[K5] + t * k[K6])) : 1.0;
+    const double top = 1.0 + t * (k[K1] + t * (k[K2] + t * k[K3]));
+    b.factor = rational ? top / b.bottom : top;
+    b.along_x = t + 2.0 * (x * x), b.across = 2.0 * (x * y), b.along_y = t + 2.0 * (y * y);
+    b.mx = b.factor * x + p2 * b.along_x + p1 * b.across;
+    b.my = b.factor * y + p2 * b.across + p1 * b.along_y;
+    /* d factor / d (x, y) is this times (x, y). */
+    double slope = 2.0 * k[K1] + t * (4.0 * k[K2] + t * 6.0 * k[K3]);
+    if (rational)
+        slope = (slope - b.factor * (2.0 * k[K4] + t * (4.0 * k[K5] + t * 6.0 * k[K6]))) / b.bottom;
+    b.xx = 6.0 * p2 * x + 2.0 * p1 * y + slope * (x * x) + b.factor;
+    b.xy = 2.0 * p1 * x + 2.0 * p2 * y + slope * (x * y);
+    b.yy = 2.0 * p2 * x + 6.0 * p1 * y + slope * (y * y) + b.factor;
+    return b;
+}
+
+/* Write what the points come to. */
 INLINE void differentiate(
     const brown_points_t *at, const int rational, double *by_point, double *by, double *u, double *v, uint8_t *valid)
 {
     const double *k = at->parameters;
-    const double fx = k[FX], fy = k[FY], cx = k[CX], cy = k[CY], p1 = k[P1], p2 = k[P2];
+    const double fx = k[FX], fy = k[FY], cx = k[CX], cy = k[CY];
     const double farthest = at->max_r * at->max_r;
     const int64_t N = at->count, P = at->rows;
     double *by_u = by, *by_v = by + P * N;
 #pragma omp simd
     for (int64_t n = 0; n < N; n++) {
         const double inverse = 1.0 / at->z[n], x = at->x[n] * inverse, y = at->y[n] * inverse;
-        const double xx = x * x, xy = x * y, yy = y * y, t = xx + yy;
-        const double bottom = rational ? 1.0 + t * (k[K4] + t * (k[K5] + t * k[K6])) : 1.0;
-        const double top = 1.0 + t * (k[K1] + t * (k[K2] + t * k[K3]));
-        const double factor = rational ? top / bottom : top;
-        /* The tangential part's (t + 2 x^2, 2 x y, t + 2 y^2). */
-        const double along_x = t + 2.0 * xx, across = 2.0 * xy, along_y = t + 2.0 * yy;
-        const double mx = factor * x + p2 * along_x + p1 * across, my = factor * y + p2 * across + p1 * along_y;
-        /* d factor / d (x, y) is this times (x, y). */
-        double slope = 2.0 * k[K1] + t * (4.0 * k[K2] + t * 6.0 * k[K3]);
-        if (rational)
-            slope = (slope - factor * (2.0 * k[K4] + t * (4.0 * k[K5] + t * 6.0 * k[K6]))) / bottom;
-        const double by_xx = 6.0 * p2 * x + 2.0 * p1 * y + slope * xx + factor;
-        const double by_xy = 2.0 * p1 * x + 2.0 * p2 * y + slope * xy;
-        const double by_yy = 2.0 * p2 * x + 6.0 * p1 * y + slope * yy + factor;
-        const double ux = fx * inverse * by_xx, uy = fx * inverse * by_xy;
-        const double vx = fy * inverse * by_xy, vy = fy * inverse * by_yy;
+        const bent_t b = bend(k, rational, x, y);
+        const double t = b.t, factor = b.factor, bottom = b.bottom;
+        const double ux = fx * inverse * b.xx, uy = fx * inverse * b.xy;
+        const double vx = fy * inverse * b.xy, vy = fy * inverse * b.yy;
         if (at->axes) {
             by_point[n] = ux, by_point[N + n] = uy, by_point[2 * N + n] = -(ux * x + uy * y);
             by_point[3 * N + n] = vx, by_point[4 * N + n] = vy, by_point[5 * N + n] = -(vx * x + vy * y);
         }
-        u[n] = fx * mx + cx;
-        v[n] = fy * my + cy;
+        u[n] = fx * b.mx + cx;
+        v[n] = fy * b.my + cy;
         valid[n] = (at->z[n] > 0.0) & (t <= farthest);
         if (P) {
-            by_u[FX * N + n] = mx;
-            by_v[FY * N + n] = my;
+            by_u[FX * N + n] = b.mx;
+            by_v[FY * N + n] = b.my;
             by_u[CX * N + n] = by_v[CY * N + n] = 1.0;
-            by_u[P1 * N + n] = fx * across;
-            by_u[P2 * N + n] = fx * along_x;
-            by_v[P1 * N + n] = fy * along_y;
-            by_v[P2 * N + n] = fy * across;
+            by_u[P1 * N + n] = fx * b.across;
+            by_u[P2 * N + n] = fx * b.along_x;
+            by_v[P1 * N + n] = fy * b.along_y;
+            by_v[P2 * N + n] = fy * b.across;
             const double ray_u = fx * x / bottom * t, ray_v = fy * y / bottom * t;
             by_u[K1 * N + n] = ray_u;
             by_v[K1 * N + n] = ray_v;
@@ -71,4 +93,41 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_brown(
         differentiate(points, 1, d_pixels_d_point, d_pixels_d_parameters, u, v, valid);
     else
         differentiate(points, 0, d_pixels_d_point, d_pixels_d_parameters, u, v, valid);
+}
+
+INLINE void undistort(
+    const double *k, double max_r, const int rational, const double *m, int64_t count, double *plane, uint8_t *valid)
+{
+    for (int64_t n = 0; n < count; n++) {
+        double x = plane[n], y = plane[count + n], before = TINY;
+        valid[n] = 0;
+        for (int step = 0; step < MAX_STEPS && !valid[n]; step++) {
+            const bent_t b = bend(k, rational, x, y);
+            const double miss_x = b.mx - m[n], miss_y = b.my - m[count + n], area = b.xx * b.yy - b.xy * b.xy;
+            const double dx = (b.yy * miss_x - b.xy * miss_y) / area, dy = (b.xx * miss_y - b.xy * miss_x) / area;
+            x -= dx;
+            y -= dy;
+            /* Kept inside the circle, where the derivative is positive definite: Newton cannot leave for another branch. */
+            const double length = sqrt(x * x + y * y + TINY);
+            if (length > max_r) {
+                x *= max_r / length;
+                y *= max_r / length;
+            }
+            /* The next step is (size / before)^2 of this one, for as long as the convergence is quadratic. */
+            const double size = fabs(dx) + fabs(dy), slower = size < before ? size / before : 1.0;
+            valid[n] = size * slower * slower <= SETTLED * (1.0 + (length < max_r ? length : max_r));
+            before = size > TINY ? size : TINY;
+        }
+        plane[n] = x;
+        plane[count + n] = y;
+    }
+}
+
+EXPORT FOR_EACH_PROCESSOR void undistort_brown(
+    const double *parameters, double max_r, int64_t rational, const double *m, int64_t count, double *plane, uint8_t *valid)
+{
+    if (rational)
+        undistort(parameters, max_r, 1, m, count, plane, valid);
+    else
+        undistort(parameters, max_r, 0, m, count, plane, valid);
 }

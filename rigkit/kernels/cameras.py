@@ -35,10 +35,25 @@ def brown_pixels(
 
     `max_r` is the tangent of the largest angle at which the camera, of 8, 9 or 12 `parameters`, sees anything.
     """
-    own = parameters.size
-    camera = {"parameters": np.concatenate([parameters, np.zeros(12 - own)]), "rational": int(own > 9), "max_r": max_r}
+    camera = {"parameters": _of_twelve(parameters), "rational": int(parameters.size > 9), "max_r": max_r}
     kernel = kernels().differentiate_brown
     return _written(kernel, _BrownPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
+
+
+def brown_places(
+    m: FloatArray, start: FloatArray, parameters: FloatArray, max_r: float
+) -> tuple[FloatArray, BoolArray]:
+    """Return the (x, y) (2, N) in the plane at unit depth that a camera distorts to m (2, N), by Newton's method from
+    `start` (2, N) inside the circle of `max_r`, and where it came to an end (N,)."""
+    plane, valid = np.array(start, order="C"), np.empty(m.shape[1], dtype=bool)
+    own, rational = _of_twelve(parameters), int(parameters.size > 9)
+    kernels().undistort_brown(own, max_r, rational, np.ascontiguousarray(m), m.shape[1], plane, valid)
+    return plane, valid
+
+
+def _of_twelve(parameters: FloatArray) -> FloatArray:
+    """Return all that Brown's model may have, zero where the camera has less."""
+    return np.concatenate([parameters, np.zeros(12 - parameters.size)])
 
 
 def radial_pixels(
