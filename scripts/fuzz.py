@@ -193,14 +193,16 @@ def run_class(label: str, args: argparse.Namespace, seeds: Path) -> tuple[list[t
         died[last] = reason
         start = last + 1
     notes = list(map(json.loads, log.read_text().splitlines()))
-    findings = {}
+    # One that ended before it noted anything, the case not made, is a finding, too: there is but the run to show again.
+    again = f"python {shlex.quote(str(Path(__file__).resolve()))} --classes {label} --seed {args.seed} --count"
+    findings = {number: (number, fault, f"{again} {number + 1}") for number, fault in died.items()}
     for note in notes:
         number = note["number"]
         fault = note.get("fault") or died.get(number)
         if fault:
             place = args.keep / f"{label}-{args.seed}-{number}"
-            findings[number] = (number, fault, _command(label, note.get("words", ["?"]), place))
-    return list(findings.values()), max((note.get("mb", 0) for note in notes), default=0)
+            findings[number] = (number, fault, _command(label, note["words"], place))
+    return sorted(findings.values()), max((note.get("mb", 0) for note in notes), default=0)
 
 
 def _wait(child: ForkServerProcess, log: Path, patience: float) -> str | None:

@@ -82,11 +82,20 @@ def test_a_few_damaged_inputs_of_each_class(
 
 
 def test_the_harness_counts_what_it_finds(tmp_path: Path, seeds: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """In processes of their own: one that ends badly, here for want of memory (to load a
-    library that reads images), is a finding, and the rest goes on."""
+    """In processes of their own: one that ends badly, here for want of memory, is a finding, and the rest goes on."""
     shutil.copytree(seeds, tmp_path / "seeds")
-    told = ["--classes", "png", "--count", "2", "--seed", "1", "--keep", str(tmp_path)]
+    told = ["--classes", "truth-csv", "--count", "2", "--seed", "1", "--keep", str(tmp_path)]
     assert fuzz.main(told) == 0
-    assert "png: 2 cases, 0 findings" in capsys.readouterr().out
+    assert "truth-csv: 2 cases, 0 findings" in capsys.readouterr().out
     assert fuzz.main([*told, "--memory-gb", "0.001"]) == 1
-    assert "png: 2 cases, 2 findings" in capsys.readouterr().out
+    assert "truth-csv: 2 cases, 2 findings" in capsys.readouterr().out
+
+
+def test_a_case_that_could_not_be_made_is_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The process ends before it notes anything: no good files to change are there."""
+    (tmp_path / "seeds").mkdir()
+    for label in ("truth-csv", "api"):
+        told = ["--classes", label, "--count", "1", "--seed", "1", "--keep", str(tmp_path)]
+        lost = [] if label == "truth-csv" else ["--memory-gb", "0.00001"]
+        assert fuzz.main([*told, *lost]) == 1
+        assert f"{label}: 1 cases, 1 findings" in capsys.readouterr().out
