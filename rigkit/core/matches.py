@@ -114,7 +114,7 @@ class Matches:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        n = len(np.asarray(self.pixels1))
+        n = len(as_array(self.pixels1, (None, 2), "pixels1"))
         keep_arrays(self, pixels1=(n, 2), pixels2=(n, 2), rays1=(n, 3), rays2=(n, 3))
         keep_arrays(self, jacobians1=(n, 3, 2), jacobians2=(n, 3, 2), sigma1_px=(n,), sigma2_px=(n,))
         keep_indices(self, board_index=(n,), grid=(n, 2))
@@ -141,9 +141,10 @@ class Matches:
     ) -> Matches:
         """Fill rays and Jacobians from the cameras. K1 and K2 are set where a camera is a plain pinhole.
 
-        Raises InputError where a pixel has no ray in its camera.
+        Raises InputError where a pixel has no ray in its camera, or where pixels are no arrays (N, 2) of as many.
         """
-        n = len(pixels1)
+        n = len(as_array(pixels1, (None, 2), "matches' pixels1"))
+        as_array(pixels2, (n, 2), "matches' pixels2")
         rays1, valid1 = camera1.unproject(pixels1)
         rays2, valid2 = camera2.unproject(pixels2)
         if not (valid1.all() and valid2.all()):

@@ -14,6 +14,7 @@ import rigkit.io.calibration_file
 from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
+from rigkit.core.matches import Matches
 
 PINHOLE = camera_model("pinhole")((640, 480), np.array([500.0, 500.0, 320.0, 240.0]))
 
@@ -45,6 +46,8 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
         (lambda: PINHOLE.project_with_jacobians(np.zeros(4)), r"\(4,\)"),
         (lambda: PINHOLE.unproject(np.zeros((2, 5))), r"\(2, 5\)"),
         (lambda: PINHOLE.on_image(np.zeros((4, 3))), r"\(4, 3\)"),
+        (lambda: Matches.from_cameras(PINHOLE, PINHOLE, np.float64(0.0), np.zeros((1, 2))), "pixels1.*scalar"),  # type: ignore[arg-type]
+        (lambda: Matches.from_cameras(PINHOLE, PINHOLE, np.zeros((3, 2)), np.zeros((2, 2))), "pixels2.*3x2"),
         (lambda: rigkit.Board("b", 9.5, 6, 30.0, 30.0), "whole numbers"),  # type: ignore[arg-type]
         (lambda: rigkit.Board("b", 9, 6, 30.0, 30.0, square_sigma_mm=-1.0), "square_sigma_mm"),
         (lambda: rigkit.PoseType("sideways"), "general, planar, standard, forward, auto"),
