@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note
+    from rigkit.cli.console import note, progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.board_words import board_of_words
     from rigkit.planning.candidates import Reach
@@ -84,5 +84,5 @@ def run(args: argparse.Namespace) -> int:
         lan=args.lan,
     )
     note("open this page in a browser; Ctrl-C ends, and the same command goes on from there")
-    run_coach(options, lambda words: print(words, flush=True))
+    run_coach(options, lambda words: print(words, flush=True), progress_on_stderr())
     return ExitCode.WELL

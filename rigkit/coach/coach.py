@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.coach.guide import GuideOptions
+from rigkit.coach.guide import WORTH_OF_PHOTO, WORTH_TAKING, GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import RigAdvice, RigGuide
@@ -101,7 +101,8 @@ class Coach:
         with self._lock:
             whole = photo or take is Take.YES
             glances = self._glances(images, whole=whole, photo=photo)
-            advice = self.guide.advise(glances)
+            worth_taking = WORTH_OF_PHOTO if photo else WORTH_TAKING
+            advice = self.guide.advise(glances, worth_taking)
             kept = take is Take.YES or (take is Take.WORTH and advice.take)
             taken = None
             if kept and any(glance.view is not None for glance in glances):
@@ -113,8 +114,9 @@ class Coach:
             self._offered = None if taken else (images, photo)
             self._show(glances, advice, taken=taken)
             if photo and not taken:
-                self._tell(f"{source or 'photo'}: not taken, as {_reason(glances)}")
-                self.say(f"Not taken, as {_reason(glances)}. {self._shown['words']}")
+                reason = _reason(glances, advice)
+                self._tell(f"{source or 'photo'}: not taken, as {reason}")
+                self.say(f"Not taken, as {reason}. {self._shown['words']}")
             return self._shown
 
     def _keep(self, images: Sequence[Image], glances: Sequence[Glance], source: str) -> str:
@@ -206,14 +208,12 @@ class Coach:
             return self.finished
 
 
-def _reason(glances: Sequence[Glance]) -> str:
+def _reason(glances: Sequence[Glance], advice: RigAdvice) -> str:
     """Return why a picture is not taken."""
     seeing = [glance for glance in glances if glance.view is not None]
     wrong = next((glance.complaint for glance in seeing if glance.complaint), "")
-    return (
-        f"it is not good enough ({wrong})"
-        if wrong
-        else "it brings little that is new"
-        if seeing
-        else "no board is seen"
-    )
+    if not seeing:
+        return "no board is seen"
+    if wrong:
+        return f"it is not good enough ({wrong})"
+    return f"it brings little that is new: {100.0 * max(advice.worth, 0.0):.0f} % of what the place asked for would"

@@ -32,6 +32,8 @@ ENOUGH_FRAMES = 8
 """With fewer nobody can tell whether the lens model fits."""
 WORTH_TAKING = 0.6
 """A frame that brings this part of what the outline would bring is taken, wherever the board is."""
+WORTH_OF_PHOTO = 0.2
+"""A photo is there already, and another like the outline may never come: five of these bring as much."""
 WORTH_GOING_ON = 0.05
 """Where two more frames would bring less than this, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
@@ -126,13 +128,13 @@ class CaptureGuide:
         self._stale = False
         return self._found
 
-    def advise(self, glance: Glance) -> Advice:
-        """Return what to do, and whether to take this frame."""
+    def advise(self, glance: Glance, least_worth: float = WORTH_TAKING) -> Advice:
+        """Return what to do, and whether to take this frame: it must be worth at least so much."""
         plan = self._planned(glance.size_px)
         target = plan.views[0]
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth = self._worth(glance.view, plan)
-        take = glance.view is not None and glance.still and glance.sharp and glance.exposed and worth >= WORTH_TAKING
+        take = glance.view is not None and glance.still and glance.sharp and glance.exposed and worth >= least_worth
         error = plan.error if self.calibration is not None else None
         enough = (
             error is not None
@@ -141,7 +143,7 @@ class CaptureGuide:
         )
         unit = plan.goal.unit
         words = f"Hold the board: {where}"
-        if glance.view is not None and worth >= WORTH_TAKING and glance.complaint:
+        if glance.view is not None and worth >= least_worth and glance.complaint:
             words = glance.complaint.capitalize()
         error_px = None if error is None else self._error_px(plan)
         if error_px is not None and enough:

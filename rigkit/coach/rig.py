@@ -64,9 +64,9 @@ class RigGuide:
             if glance.view is not None:
                 lens.add(glance.view, glance.size_px)
 
-    def advise(self, glances: Sequence[Glance]) -> RigAdvice:
-        """Return what to do, and whether to take these frames."""
-        lenses = tuple(lens.advise(glance) for lens, glance in zip(self.lenses, glances, strict=True))
+    def advise(self, glances: Sequence[Glance], least_worth: float = WORTH_TAKING) -> RigAdvice:
+        """Return what to do, and whether to take these frames: they must be worth at least so much."""
+        lenses = tuple(lens.advise(glance, least_worth) for lens, glance in zip(self.lenses, glances, strict=True))
         seeing = [g for g in glances if g.view is not None]
         good = bool(seeing) and all(g.still and g.sharp and g.exposed for g in seeing)
         # Nobody knows an error: the lens with the fewest frames goes first.
@@ -91,10 +91,10 @@ class RigGuide:
                 self._asked[speaks] = self._shared_target(speaks)
             words, targets = self._asked[speaks]
             worth = self._shared_worth(speaks, glances)
-        take = good and worth >= WORTH_TAKING and not enough
+        take = good and worth >= least_worth and not enough
         if take:
             words = TAKING
-        elif not enough and worth >= WORTH_TAKING:
+        elif not enough and worth >= least_worth:
             words = next((g.complaint.capitalize() for g in seeing if g.complaint), words)
         return RigAdvice(
             words=words,

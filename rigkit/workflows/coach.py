@@ -23,6 +23,7 @@ from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import Severity, worst
+from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
@@ -142,7 +143,13 @@ def coach_frames(
             break
 
 
-def coach_recording(coach: Coach, videos: Sequence[Path], *, show: Callable[[Sequence[Image]], None] = ignored) -> str:
+def coach_recording(
+    coach: Coach,
+    videos: Sequence[Path],
+    *,
+    show: Callable[[Sequence[Image]], None] = ignored,
+    progress: Progress = silent,
+) -> str:
     """Let the coach choose frames of a video, or of several that run together; return what the recording lacks, in
     words, "" where nothing.
 
@@ -153,6 +160,7 @@ def coach_recording(coach: Coach, videos: Sequence[Path], *, show: Callable[[Seq
 
     def tell(what: str, done: int, total: int) -> None:
         coach.say(f"{what.capitalize()}: {done} of {total}")
+        progress(what, done, total)
 
     with TemporaryDirectory(prefix="rigkit-coach-") as place:
         kept = frames_of_videos(sources, Path(place) / "frames", boards, timestamps=times, progress=tell)
@@ -175,8 +183,9 @@ def _preview(frame: NDArray[Any]) -> bytes:
     return bytes(cv2.imencode(".jpg", bgr)[1])
 
 
-def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
-    """Serve the coach's page on this machine until it is stopped; `told` is given its address.
+def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Progress = silent) -> None:
+    """Serve the coach's page on this machine until it is stopped; `told` is given its address, `progress` how much of
+    a recording has been looked at.
 
     Raises InputError for a folder or source that cannot be used, InstallationError without the extra `coach`.
     """
@@ -198,7 +207,7 @@ def run_coach(options: CoachOptions, told: Callable[[str], None]) -> None:
         missing = ""
         try:
             if frames is None:
-                missing = coach_recording(coach, options.video, show=show)
+                missing = coach_recording(coach, options.video, show=show, progress=progress)
             else:
                 coach_frames(coach, frames, photos=bool(options.watch), show=show)
             if coach.finished is None:

@@ -36,6 +36,9 @@ MAX_FRAMES = 40
 SEARCH_PIXELS = 1.3e6
 """Boards are looked for in frames made smaller than this: a video of 4K takes a ninth of the time."""
 
+SEARCHING = "looking at frames"
+"""What progress is called."""
+
 RECORD, FRAMES_SCHEMA = "frames.json", "rigkit.frames/1"
 PNG_FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
@@ -127,13 +130,15 @@ def frames_of_videos(
         with suppress(*((KeyboardInterrupt,) if live else ())):
             for number, pictures in _moments(videos, moments):
                 looked_at += 1
-                progress("looking at frames", looked_at, max(total, looked_at))
+                progress(SEARCHING, looked_at, max(total, looked_at))
                 frame = _described(number, pictures, boards)
                 if frame is not None:
                     with_boards += 1
                     keeper.offer(frame, {name: pictures[name] for name in frame.views})
                 if live and len(keeper.choice.kept) >= most:
                     break
+        # Moments that were told of and had no frame are not waited for.
+        progress(SEARCHING, looked_at, looked_at)
     images = keeper.finish()
     if not images:
         names = ", ".join(f"'{path}'" for path in sources.values())

@@ -15,11 +15,12 @@ import pytest
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach, Take
-from rigkit.coach.guide import CaptureGuide, GuideOptions
-from rigkit.coach.look import glance_at
+from rigkit.coach.guide import WORTH_OF_PHOTO, WORTH_TAKING, CaptureGuide, GuideOptions
+from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
 from rigkit.coach.sources import device_frames, watched_frames
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
@@ -82,6 +83,19 @@ def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.nda
     assert np.isfinite(advice.target_px).all()
 
 
+def test_a_photo_that_is_there_needs_to_bring_less_than_a_frame_that_may_be_waited_for(poses: list[Rigid3]) -> None:
+    coarse = Board("board", 4, 3, 25.0, 25.0)
+    guide = CaptureGuide(GuideOptions(boards=(coarse,), hfov_deg=52.0))
+    away = Rigid3(poses[0].rotation, 3.0 * poses[0].translation_mm)
+    pixels, _ = CAMERA.project(away.apply(coarse.points()))
+    far = Glance(
+        size_px=SIZE, view=BoardView("far", coarse, coarse.grid(), pixels, np.full(len(pixels), 0.1)), contrast=100.0
+    )
+    photo = far.as_photo()
+    assert WORTH_OF_PHOTO < guide.advise(photo).worth < WORTH_TAKING
+    assert not guide.advise(photo).take and guide.advise(photo, WORTH_OF_PHOTO).take
+
+
 def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[np.ndarray], tmp_path: Path) -> None:
     watched = tmp_path / "incoming"
     watched.mkdir()
@@ -99,14 +113,19 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
         photos=True,
         show=lambda images: said.append(coach.state().get("words")),
     )
-    assert any(str(words).startswith("Not taken, as it brings little that is new. Hold the board: ") for words in said)
+    assert any(
+        str(words).startswith("Not taken, as it brings little that is new: 0 % of what the place asked for would. ")
+        for words in said
+    )
     assert len(coach.guide.frames) >= 7
     kept = sorted((tmp_path / "session/images").glob("*.png"))
     assert len(kept) == len(coach.guide.frames)
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
     assert coach.finish().startswith("Done")
-    assert "00.png: taken as frame-0001.png" in told and "001.png: not taken, as it brings little that is new" in told
+    assert "00.png: taken as frame-0001.png" in told and any(
+        line.startswith("001.png: not taken, as it brings little that is new: 0 % of") for line in told
+    )
     assert len([line for line in told if ": taken as " in line]) == len(kept) and told[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")
     error = compare_cameras(CAMERA, found.camera).rms_px
@@ -126,7 +145,11 @@ def test_a_recording_is_gone_through_whole_and_what_it_lacks_is_said(
     writer.release()
     coach = open_coach(options(tmp_path / "session", video=(film,)))
     shown: list[object] = []
-    lacks = coach_recording(coach, [film], show=shown.append)
+    told: list[tuple[int, int]] = []
+    lacks = coach_recording(
+        coach, [film], show=shown.append, progress=lambda what, done, total: told.append((done, total))
+    )
+    assert (told[0], told[-1]) == ((1, 11), (11, 11))
     kept = [np.asarray(cv2.imread(str(path))) for path in sorted((tmp_path / "session/images").glob("*.png"))]
     assert 4 <= len(kept) == len(shown) == len(coach.guide.frames)
     # Grey as the recording is decoded: of every pose the sharp picture.
