@@ -163,6 +163,6 @@ EXPORT void fit_circles(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
     ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2), ARRAY(const double, bends, count, 2, 3),
     ARRAY(const double, blur, count), ARRAY(const double, reach, count), const circle_rules_t *rules, int64_t most,
-    ARRAY(double, scratch, most, SPOT), ARRAY(double, out, count, CIRCLE_OUTCOMES));
+    ARRAY(double, scratch, SPOT, most), ARRAY(double, out, count, CIRCLE_OUTCOMES));
 
 #endif

@@ -33,7 +33,7 @@ def fit_circles(
     grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
     known = [np.ascontiguousarray(part, np.float64) for part in (pixels, maps, bends, blur, reach)]
     out = np.empty((len(pixels), CIRCLE_OUTCOMES))
-    scratch = np.empty((most, SPOT))
+    scratch = np.empty((SPOT, most))
     height, width = grey.shape
     kernels().fit_circles(
         *(grey, grey.dtype == np.uint8, width, height, len(pixels)), *known, rules, most, scratch, out
