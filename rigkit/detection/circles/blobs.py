@@ -85,8 +85,7 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
     mean = cv2.blur(smooth, window)
     off = smooth - mean
     # Sums of floats may end a little below zero.
-    deviation = np.sqrt(np.maximum(cv2.blur(off * off, window), 0.0))
-    limit = np.float32(DEVIATIONS) * deviation
+    limit = np.float32(DEVIATIONS) * cv2.sqrt(np.maximum(cv2.blur(off * off, window), 0.0))
     parts = []
     for sign, mask in ((1.0, off > limit), (-1.0, off < -limit)):
         pixels, covariance, area = _moments(mask)
@@ -105,7 +104,7 @@ def _of_level(level: FloatImage, scale: float) -> Blobs:
 
 def _moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return centroids (N, 2), covariances (N, 2, 2) and areas (N,) of components of fitting area off the border."""
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    count, labels, stats, centroids = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=4)
     area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
     left, top, wide, high = (stats[:, k] for k in range(4))
     height, width = mask.shape
@@ -117,9 +116,9 @@ def _moments(mask: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     wanted = np.flatnonzero(inside)
     number = np.full(count, -1)
     number[wanted] = np.arange(len(wanted))
-    of_pixel = number[labels.ravel()]
-    at = np.flatnonzero(of_pixel >= 0)
-    which = of_pixel[at]
+    at = np.flatnonzero(mask)
+    which = number[labels.ravel()[at]]
+    at, which = at[which >= 0], which[which >= 0]
     v, u = np.divmod(at, width)
     du, dv = u - centroids[wanted, 0][which], v - centroids[wanted, 1][which]
     sums = [np.bincount(which, part, len(wanted)) for part in (du * du, du * dv, dv * dv)]
