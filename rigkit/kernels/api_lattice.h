@@ -27,15 +27,20 @@ EXPORT void smooth_bytes(
 
 /* peaks.c */
 
-/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. */
-enum { STRIP = 64 };
+/* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. Each such
+ * strip of STRIP_ROWS rows has a threshold of its own: strip (u - STRIPS_FROM) / STRIP of band v / STRIP_ROWS. */
+enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 
 EXPORT void typical_values(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width, int64_t step,
     int64_t few, ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
     ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
+EXPORT void fill_thresholds(
+    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float floor, float least, float darkest,
+    float brightest, ARRAY(float, out, height / STRIP_ROWS + 1, width / STRIP + 1));
 EXPORT int64_t find_peaks(
-    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float threshold,
+    ARRAY(const float, smooth, height, width), int64_t height, int64_t width,
+    ARRAY(const float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1),
     ARRAY(float, scratch, 5 * (width + STRIP + 4)), ARRAY(uint8_t, high, 5 * (width / STRIP + 1)),
     ARRAY(int32_t, at, (height / 3 + 1) * (width / 3 + 1), 2),
     ARRAY(float, response, (height / 3 + 1) * (width / 3 + 1)));

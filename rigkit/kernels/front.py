@@ -10,7 +10,7 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-STRIP, HALF = (header().constants[name] for name in ("STRIP", "HALF"))
+STRIP, STRIP_ROWS, STRIPS_FROM, HALF = (header().constants[name] for name in ("STRIP", "STRIP_ROWS", "STRIPS_FROM", "HALF"))
 
 WHOLE = 16.0
 """A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
@@ -99,8 +99,17 @@ def typical(smooth: Image, step: int, extreme: float) -> tuple[float, float, flo
     return response, darkest, brightest
 
 
-def peaks(smooth: Image, threshold: float, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
-    """Return (u, v) and response of the peaks above `threshold`, row by row.
+def thresholds(smooth: Image, floor: float, least: float, darkest: float, brightest: float) -> Image:
+    """Return for each STRIP pixels of STRIP_ROWS rows `floor` times the square of how bright they get, `darkest` being 0 and
+    `brightest` 1, but `least` at least."""
+    height, width = smooth.shape
+    out = np.empty((height // STRIP_ROWS + 1, width // STRIP + 1), np.float32)
+    kernels().fill_thresholds(smooth, height, width, floor, least, darkest, brightest, out)
+    return out
+
+
+def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
+    """Return (u, v) and response of the peaks above their `thresholds`, row by row.
 
     Of more than `limit` peaks, about so many are kept: those strongest beside the strongest in their square of `side`
     pixels, to one part in `finest`.
@@ -109,7 +118,7 @@ def peaks(smooth: Image, threshold: float, limit: int, side: int, finest: int) -
     most = (height // 3 + 1) * (width // 3 + 1)
     at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
     scratch, high = np.empty(5 * (width + STRIP + 4), np.float32), np.empty(5 * (width // STRIP + 1), np.uint8)
-    found = kernels().find_peaks(smooth, height, width, threshold, scratch, high, at, response)
+    found = kernels().find_peaks(smooth, height, width, above, scratch, high, at, response)
     at, response = at[:found], response[:found]
     if found > limit:
         squares = np.zeros((height // side + 1) * (width // side + 1), np.float32)

@@ -68,6 +68,29 @@ void typical_values(
     out[2] = value_at_rank(brightness, count, count - 1 - few);
 }
 
+/* reference.front.thresholds: for each strip of each band `floor` times the square of how bright its brightest pixel is
+ * between `darkest` and `brightest`, but not below `least`. Every fourth pixel is looked at: the edges of boards are wider
+ * than the squares that could hide between them. */
+void fill_thresholds(
+    const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest,
+    float *out)
+{
+    enum { APART = 4 };
+    const int64_t strips = width / STRIP + 1, bands = height / STRIP_ROWS + 1;
+    const float span = brightest > darkest ? brightest - darkest : 1.0f;
+    for (int64_t band = 0; band < bands; band++)
+        for (int64_t strip = 0; strip < strips; strip++) {
+            const int64_t left = STRIPS_FROM + strip * STRIP, right = left + STRIP < width ? left + STRIP : width;
+            const int64_t top = band * STRIP_ROWS, bottom = top + STRIP_ROWS < height ? top + STRIP_ROWS : height;
+            float most = darkest;
+            for (int64_t v = top; v < bottom; v += APART)
+                for (int64_t u = left; u < right; u += APART)
+                    most = smooth[v * width + u] > most ? smooth[v * width + u] : most;
+            const float part = most < brightest ? (most - darkest) / span : 1.0f, lower = floor * part * part;
+            out[band * strips + strip] = lower > least ? lower : least;
+        }
+}
+
 /* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row are peaks: not lower than the
  * neighbours that follow within two pixels, higher than those before (a corner between pixels makes two equal ones), and
  * above the threshold. */
@@ -124,10 +147,9 @@ INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t 
 /* reference.front.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
  * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
 FOR_EACH_PROCESSOR int64_t find_peaks(
-    const float *smooth, int64_t height, int64_t width, float threshold, float *scratch, uint8_t *high, int32_t *at,
+    const float *smooth, int64_t height, int64_t width, const float *thresholds, float *scratch, uint8_t *high, int32_t *at,
     float *response)
 {
-    enum { FIRST = 3 };
     const int64_t stride = width + STRIP + 4, strips = width / STRIP + 1;
     for (int64_t k = 0; k < 5 * stride; k++)
         scratch[k] = -1e30f;
@@ -136,12 +158,13 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
         const float *from = smooth + v * width;
         float *last = scratch + v % 5 * stride;
         uint8_t *mark = high + v % 5 * strips;
+        const float *threshold = thresholds + v / STRIP_ROWS * strips;
         last[1] = saddle_response(from + 1, width);
         last[2] = saddle_response(from + 2, width);
-        for (int64_t u = FIRST; u < width - 1; u += STRIP, mark++)
+        for (int64_t u = STRIPS_FROM; u < width - 1; u += STRIP, mark++, threshold++)
             /* Twice, so that the compiler knows how many there are. */
-            *mark = (uint8_t)(u + STRIP < width ? fill_response(from + u, width, STRIP, threshold, last + u)
-                                                : fill_response(from + u, width, width - 1 - u, threshold, last + u));
+            *mark = (uint8_t)(u + STRIP < width ? fill_response(from + u, width, STRIP, *threshold, last + u)
+                                                : fill_response(from + u, width, width - 1 - u, *threshold, last + u));
         /* The middle one of the five rows is v - 2. */
         if (v < 5)
             continue;
@@ -149,10 +172,11 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
         for (int k = 0; k < 5; k++)
             rows[k] = scratch + (v + 1 + k) % 5 * stride;
         mark = high + (v - 2) % 5 * strips;
-        for (int64_t u = FIRST; u < width - 3; u += STRIP, mark++) {
+        threshold = thresholds + (v - 2) / STRIP_ROWS * strips;
+        for (int64_t u = STRIPS_FROM; u < width - 3; u += STRIP, mark++, threshold++) {
             if (!*mark)
                 continue;
-            for (uint64_t left = peaks_among(rows, u, threshold); left; left &= left - 1) {
+            for (uint64_t left = peaks_among(rows, u, *threshold); left; left &= left - 1) {
                 const int64_t at_u = u + __builtin_ctzll(left);
                 if (at_u >= width - 3)
                     break;

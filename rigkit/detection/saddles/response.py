@@ -38,8 +38,9 @@ NOISE_FACTOR = 8.0
 
 THRESHOLD_FLOOR, THRESHOLD_CEILING = 2.0, 16.0
 """Bounds of the threshold on D for an image that spans 200 grey levels, in (grey levels per px^2)^2; they go with the
-square of the span. Below the floor is only quantisation and compression, and the median of a richly textured image must
-not hide the corners of a board in it."""
+square of the span, and the floor with that of the light: where the brightest is half as bright, so are the differences.
+Below the floor is only quantisation and compression, and the median of a richly textured image must not hide the
+corners of a board in it."""
 
 MIN_SPAN = 2.5
 """An image that spans fewer grey levels shows nothing but its quantisation."""
@@ -50,7 +51,7 @@ TYPICAL = 4e3
 EXTREME = 0.005
 """The span of brightness leaves out this part at either end: glints, dead pixels."""
 
-PIXELS_A_PEAK, MAX_PEAKS = 480, 3200
+PIXELS_A_PEAK, MAX_PEAKS = 240, 6400
 """Keep the strongest peaks of a level, one for so many of its pixels, or the second number if that is more: texture and
 noise have more, a board never."""
 
@@ -66,12 +67,12 @@ class Level:
     Attributes
     ----------
     smooth : (H, W) float32, 0..255.
-    threshold : smallest D of a peak.
+    thresholds : (bands, strips) float32, smallest D of a peak in each part of the level (`front.thresholds`).
     scale, offset : full-resolution pixel = scale * level pixel + offset.
     """
 
     smooth: FloatImage
-    threshold: float
+    thresholds: FloatImage
     scale: float
     offset: float
 
@@ -143,7 +144,7 @@ def pyramid(grey: GreyImage) -> list[Level]:
     levels: list[Level] = []
     while len(levels) < OCTAVES and min(base.shape) >= 16:
         smooth, base = front.smoothed(base, SMOOTH)
-        levels.append(Level(smooth, _threshold(smooth), float(scale), offset))
+        levels.append(Level(smooth, _thresholds(smooth), float(scale), offset))
         scale *= 2
     return levels
 
@@ -155,18 +156,19 @@ def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     return front.shrunk(grey, factor)
 
 
-def _threshold(smooth: FloatImage) -> float:
-    """Return the smallest D of a peak."""
+def _thresholds(smooth: FloatImage) -> FloatImage:
+    """Return the smallest D of a peak in each part of a level."""
     step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
     response, darkest, brightest = front.typical(smooth, step, EXTREME)
     contrast = (max(brightest - darkest, MIN_SPAN) / 200.0) ** 2
-    return min(max(NOISE_FACTOR * response, THRESHOLD_FLOOR * contrast), THRESHOLD_CEILING * contrast)
+    noise = min(NOISE_FACTOR * response, THRESHOLD_CEILING * contrast)
+    return front.thresholds(smooth, THRESHOLD_FLOOR * contrast, noise, darkest, brightest)
 
 
 def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:
     """Return the local maxima of the response above the threshold, (N, 2) as (u, v) of the level, row by row, and D."""
     most = max(MAX_PEAKS, level.smooth.size // PIXELS_A_PEAK)
-    return front.peaks(level.smooth, level.threshold, most, PEAK_SQUARE_PX, SHARES)
+    return front.peaks(level.smooth, level.thresholds, most, PEAK_SQUARE_PX, SHARES)
 
 
 def sample(image: GreyImage, pixels: NDArray[np.floating]) -> FloatImage:

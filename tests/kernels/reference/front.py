@@ -39,7 +39,7 @@ from rigkit.detection.saddles.ring import (
     arm_vectors,
 )
 from rigkit.detection.saddles.saddle import MAX_STEP, Corners
-from rigkit.kernels.front import HALF, LinkRules, RingRules
+from rigkit.kernels.front import STRIP_ROWS, STRIPS_FROM, HALF, STRIP, LinkRules, RingRules
 
 QUICK = 4
 """Every so many samples of a ring are looked at before it is read."""
@@ -57,6 +57,22 @@ def smoothed(image: GreyImage, kernel: FloatImage) -> tuple[FloatImage, FloatIma
     return smooth, np.ascontiguousarray(smooth[::2, ::2])
 
 
+def thresholds(smooth: FloatImage, floor: float, least: float, darkest: float, brightest: float) -> FloatImage:
+    height, width = smooth.shape
+    most = np.full((height // STRIP_ROWS + 1, width // STRIP + 1), darkest)
+    for band, strip in np.ndindex(most.shape):
+        left = STRIPS_FROM + strip * STRIP
+        part = smooth[band * STRIP_ROWS : (band + 1) * STRIP_ROWS : 4, left : left + STRIP : 4]
+        most[band, strip] = part.max(initial=darkest)
+    part = np.where(most < brightest, (most - darkest) / (brightest - darkest if brightest > darkest else 1.0), 1.0)
+    return np.asarray(np.maximum(floor * part**2, least), np.float32)
+
+
+def threshold_at(above: FloatImage, u: IntArray, v: IntArray) -> FloatImage:
+    """Return the threshold of pixels (u, v) of a level."""
+    return np.asarray(above[v // STRIP_ROWS, np.maximum(u - STRIPS_FROM, 0) // STRIP], np.float32)
+
+
 def typical(smooth: FloatImage, step: int, extreme: float) -> tuple[float, float, float]:
     response = np.sort(np.abs(_response(smooth)[::step, ::step]), axis=None)
     brightness = np.sort(smooth[1:-1:step, 1:-1:step], axis=None)
@@ -64,12 +80,12 @@ def typical(smooth: FloatImage, step: int, extreme: float) -> tuple[float, float
     return float(response[len(response) // 2]), float(brightness[few]), float(brightness[-1 - few])
 
 
-def peaks(smooth: FloatImage, threshold: float, limit: int, side: int, finest: int) -> tuple[IntArray, FloatImage]:
+def peaks(smooth: FloatImage, above: FloatImage, limit: int, side: int, finest: int) -> tuple[IntArray, FloatImage]:
     response = _response(smooth)
     # What overflows twice is no number: a maximum with it is another one on each processor, and no peak.
     response = np.where(np.isnan(response), np.float32(-np.inf), response)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
-    mask = (response >= highest) & (response > threshold)
+    mask = (response >= highest) & (response > threshold_at(above, 1 + np.arange(response.shape[1]), 1 + np.arange(len(response))[:, None]))
     mask[:2] = mask[-2:] = False
     mask[:, :2] = mask[:, -2:] = False
     flat = np.flatnonzero(mask)
@@ -116,7 +132,7 @@ def links(
     assert np.array_equal(bounds, _bounds(contrast)) and rules.neighbours == NEIGHBOURS
     angles = np.arctan2(lines[..., 1], lines[..., 0])
     given = Corners(pixels, angles, contrast, reach * scale / MAX_ASIDE_PX)
-    return _without_long(_mutual(given, Level(image, 0.0, scale, offset)), pixels).reshape(-1, 4)
+    return _without_long(_mutual(given, Level(image, np.zeros((0, 0), np.float32), scale, offset)), pixels).reshape(-1, 4)
 
 
 def _response(smooth: FloatImage) -> FloatImage:

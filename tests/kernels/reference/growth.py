@@ -96,7 +96,7 @@ def grown(
     rules: GrowthRules,
     rings: int,
 ) -> int:
-    lattice, level = Lattice(pixels, contrast, sign > 0.0), Level(image, 0.0, scale, offset)
+    lattice, level = Lattice(pixels, contrast, sign > 0.0), Level(image, np.zeros((0, 0), np.float32), scale, offset)
     assert rules.tried == MAX_SADDLES_TRIED
     points = saddles._kept["points"]
     due = np.ones((2, *lattice.contrast.shape), bool)

@@ -39,7 +39,7 @@ def shifts_of_edges(
     steps: int,
     most: int,
 ) -> FloatArray:
-    lattice, level = Lattice(pixels, np.full(pixels.shape[:2], np.nan), rising), Level(image, 0.0, scale, offset)
+    lattice, level = Lattice(pixels, np.full(pixels.shape[:2], np.nan), rising), Level(image, np.zeros((0, 0), np.float32), scale, offset)
     pixels, signs = level.to_level(lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
     first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
