@@ -33,6 +33,9 @@ MAX_GUIDE_GAIN = 4.0
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 """Without a camera a ring of corners is predicted at a time: the cells beside known ones."""
 
+NEIGHBOURS = 8
+"""Corners by which one beside them is judged."""
+
 POSE_CELLS = 0.06
 POSE_PX = 1.5
 """A camera whose best pose of the board misses the corners by more than this (median; the larger of the two) did not
@@ -79,6 +82,16 @@ class BoardState:
     @property
     def usual_sigma(self) -> float:
         return float(np.nanmedian(self.sigma_px[self.known]))
+
+    def usual_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return contrast and residual that are usual around each of the `cells` (R, C), (M,) each: light, blur and the
+        squares' size differ over a board, in a shadow by as much as from one board to another."""
+        row, column = np.nonzero(cells)
+        known_row, known_column = np.nonzero(self.known & np.isfinite(self.residual))
+        apart = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
+        nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+        around = known_row[nearest], known_column[nearest]
+        return np.median(self.contrast[around], axis=1), np.median(self.residual[around], axis=1)
 
     def with_fit(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
         """Return the state with the `good` of the corners fitted at `cells` put in."""

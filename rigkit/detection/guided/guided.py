@@ -301,7 +301,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     rough = fit_corners(image, guide.board, cells, shape, shape.pixels, signs, wide)
     start = np.where(rough.valid[:, None], rough.pixels, shape.pixels)
     fit = fit_corners(image, guide.board, cells, shape, start, signs, blur)
-    good = _confirmed(guide, state, shape, side, fit)
+    good = _confirmed(guide, state, cells, shape, side, fit)
     return state.with_fit(cells, fit, good) if good.any() else None
 
 
@@ -309,15 +309,17 @@ def _of(shape: LocalFit, keep: BoolArray) -> LocalFit:
     return LocalFit(*(getattr(shape, name)[keep] for name in LocalFit.__slots__))
 
 
-def _confirmed(guide: Guide, state: BoardState, shape: LocalFit, side: FloatArray, fit: EdgeFit) -> BoolArray:
-    """Return which of the corners fitted at cells of `shape` are what was predicted there."""
+def _confirmed(
+    guide: Guide, state: BoardState, cells: BoolArray, shape: LocalFit, side: FloatArray, fit: EdgeFit
+) -> BoolArray:
+    """Return which of the corners fitted at `cells` of `shape` are what was predicted there."""
     known = state.known
     moved = np.linalg.norm(fit.pixels - shape.pixels, axis=1)
     limit = MOVED_CELLS * side
     if guide.camera is not None:
         usual = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
         limit = np.minimum(limit, np.maximum(MOVED_FACTOR * usual * shape.gain, MOVED_PX))
-    contrast, residual = float(np.nanmedian(state.contrast)), float(np.nanmedian(state.residual))
+    contrast, residual = state.usual_near(cells)
     good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
     # Noise is the same at any contrast; what the model gets wrong grows with it.
     most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
