@@ -57,7 +57,9 @@ def find_lattices(
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     found = fitted(grey, candidates(grey, min_corners, _sampled if marked else _promising), min_corners, sizes)
-    return [item for item in found if min_corners < MIN_BOARD_CORNERS or compact(item.lattice, size_px)]
+    if min_corners < MIN_BOARD_CORNERS:
+        return found
+    return [item for item in found if _of_size(item.lattice, sizes) or compact(item.lattice, size_px)]
 
 
 def candidates(
@@ -123,15 +125,19 @@ def _confirmed(
     if room <= 0:
         return sure
     rest = [(before.count, known_part(after, sizes)) for before, after in every if not any(after is s for s in sure)]
-    asked = {frozenset(size) for size in sizes}
     likely = [
         after
         for before, after in rest
-        if after.lattice.count >= MIN_EXPECTED_CORNERS and frozenset(after.lattice.size) in asked
+        if _of_size(after.lattice, sizes)
         if trustworthy(after, min(before, after.lattice.known.size), min_corners, OF_EXPECTED_SIZE)
         if ends_quietly(grey, after.lattice)
     ]
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
+
+
+def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether `lattice` has the rows and columns of one of `sizes`, and corners enough for that to mean much."""
+    return lattice.count >= MIN_EXPECTED_CORNERS and frozenset(lattice.size) in {frozenset(size) for size in sizes}
 
 
 def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
