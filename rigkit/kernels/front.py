@@ -10,7 +10,8 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-STRIP, STRIP_ROWS, STRIPS_FROM, HALF = (header().constants[name] for name in ("STRIP", "STRIP_ROWS", "STRIPS_FROM", "HALF"))
+_CONSTANTS = header().constants
+STRIP, STRIP_ROWS, STRIPS_FROM, HALF = (_CONSTANTS[name] for name in ("STRIP", "STRIP_ROWS", "STRIPS_FROM", "HALF"))
 
 WHOLE = 16.0
 """A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
@@ -100,8 +101,8 @@ def typical(smooth: Image, step: int, extreme: float) -> tuple[float, float, flo
 
 
 def thresholds(smooth: Image, floor: float, least: float, darkest: float, brightest: float) -> Image:
-    """Return for each STRIP pixels of STRIP_ROWS rows `floor` times the square of how bright they get, `darkest` being 0 and
-    `brightest` 1, but `least` at least."""
+    """Return for each STRIP pixels of STRIP_ROWS rows `floor` times the square of how bright they get, `darkest` being
+    0 and `brightest` 1, but `least` at least."""
     height, width = smooth.shape
     out = np.empty((height // STRIP_ROWS + 1, width // STRIP + 1), np.float32)
     kernels().fill_thresholds(smooth, height, width, floor, least, darkest, brightest, out)

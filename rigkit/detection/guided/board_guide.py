@@ -33,7 +33,7 @@ MAX_GUIDE_GAIN = 4.0
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 """Without a camera a ring of corners is predicted at a time: the cells beside known ones."""
 
-NEIGHBOURS = 8
+JUDGES = 8
 """Corners by which one beside them is judged."""
 
 POSE_CELLS = 0.06
@@ -89,7 +89,7 @@ class BoardState:
         row, column = np.nonzero(cells)
         known_row, known_column = np.nonzero(self.known & np.isfinite(self.residual))
         apart = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
-        nearest = np.argsort(apart, axis=1, kind="stable")[:, :NEIGHBOURS]
+        nearest = np.argsort(apart, axis=1, kind="stable")[:, :JUDGES]
         around = known_row[nearest], known_column[nearest]
         return np.median(self.contrast[around], axis=1), np.median(self.residual[around], axis=1)
 

@@ -22,29 +22,23 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, BoardState, Guide
+from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.subpixel.correlation import with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
-from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, Geometry, ends_of
+from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
-
-RADIUS_PX, FIT_STEPS = 18.0, 8
-"""Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 
 START_BLUR_PX = 1.0
 """s that the first fit of the corners found starts from, px."""
 
 WIDE_BLUR_CELLS = 0.05
 """A missing corner is first sought with edges so wide, in sides of the cell: they reach as far as predictions err."""
-
-MARKER_BLURS = 2.0
-"""The edges of a ChArUco board's markers reach so many s towards the corners."""
 
 MAX_GUIDE_ROUNDS = 40
 """Rounds of adding at most, without a camera one ring of corners each: more than any board has rows or columns."""
@@ -124,51 +118,6 @@ def _board_of(found: BoardDetection, boards: Sequence[Board]) -> Board | None:
     ]
     named = [b for b in fitting if b.board_id == found.board_id]
     return next(iter(named or [b for b in fitting if not b.identified]), None)
-
-
-def fit_corners(
-    image: GreyImage,
-    board: Board,
-    cells: BoolArray,
-    shape: LocalFit,
-    start: FloatArray,
-    signs: FloatArray,
-    blur: FloatArray | float,
-    bends: tuple[FloatArray, FloatArray] | None = None,
-) -> EdgeFit:
-    """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
-
-    `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `bends` is the curvature of the lines and how well it is
-    known, (M, 2) each, where corners' sigmas tell more of it than `shape`. Windows end before the markers of a ChArUco
-    board.
-    """
-    sides, (curvature, loose) = shape.sides, bends or (shape.curvature(), None)
-    geometry = Geometry(sides, curvature, shape.gaps(), ends_of(np.ones_like(cells), cells))
-    width = _short_of_markers(board, sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
-    fit = fit_edges(
-        *(image, start, geometry, signs, width), radius_px=RADIUS_PX, iterations=FIT_STEPS, curvature_sigma=loose
-    )
-    if isinstance(board.pattern, Charuco):
-        # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-        more = fit.residual / fit.noise
-        products = fit.products * (more**2)[:, None]
-        fit = replace(fit, sigma_px=fit.sigma_px * more, noise=fit.residual, products=products)
-    return fit
-
-
-def _short_of_markers(board: Board, sides: FloatArray, blur: FloatArray) -> FloatArray:
-    """Return the s (M,) to start from, so small that the windows, a few s to either side of a line, are narrow."""
-    if isinstance(board.pattern, Charuco):
-        gap = gap_to_markers(board, sides)
-        blur = np.minimum(blur, (gap - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
-    return np.clip(blur, *BLUR_RANGE)
-
-
-def gap_to_markers(board: Board, sides: FloatArray) -> FloatArray:
-    """Return how far it is (N,), px, from the lines of a ChArUco `board` to its markers; `sides` (N, 2, 2) are px."""
-    assert isinstance(board.pattern, Charuco)
-    white = 0.5 * (1.0 - board.pattern.marker_mm / np.array(board.squares_mm))
-    return np.asarray((white * np.linalg.norm(sides, axis=2)).min(axis=1))
 
 
 def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Camera | None) -> BoardDetection:

@@ -9,6 +9,7 @@ lattice has not. The mean of both sides goes, over the same edge, from that of t
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -50,6 +51,32 @@ margin may have ended."""
 
 MAX_PAPER = 1.6
 """Paper is this much brighter or darker than the mean of the squares at most, in half contrasts; squares are by 1."""
+
+PAPER_ROUNDS, SETTLED_PX = 4, 0.03
+"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again for those that
+then move by more than the second number."""
+
+
+def fitted_beside_paper(
+    image: GreyImage,
+    geometry: Geometry,
+    fit: EdgeFit,
+    fitted: Callable[[BoolArray, Geometry], EdgeFit],
+    signs: FloatArray,
+    owner: IntArray,
+) -> EdgeFit:
+    """Return the `fit` of N corners with those `fitted` again that see what lies beyond their board, `owner` (N,)."""
+    again = beside_paper(geometry, fit, owner)
+    moving = again
+    for _ in range(PAPER_ROUNDS if again.any() else 0):
+        beside = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])
+        before, which = fit.pixels[moving], moving[again]
+        fit = fit.with_part(moving, fitted(moving, beside.of(which)))
+        moving = moving.copy()
+        moving[moving] = np.linalg.norm(fit.pixels[moving] - before, axis=1) >= SETTLED_PX
+        if not moving.any():
+            break
+    return fit
 
 
 def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:

@@ -20,7 +20,7 @@ from rigkit.detection.subpixel.correlation import sigma_factors, uneven_factors
 from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
-from rigkit.detection.subpixel.outer_squares import beside_paper, with_paper
+from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 
@@ -33,10 +33,6 @@ FIRST_PASS = (8.0, 4, 0.02)
 LAST_PASS = (18.0, 8, 0.01)
 """Radius in px, Gauss-Newton steps at most, and the step in px that ends them: the first pass only has to bring the
 lattice to a few hundredths of a pixel; after the last step of the last one there is a ten-thousandth to go."""
-
-PAPER_ROUNDS, SETTLED_PX = 4, 0.03
-"""What lies beyond the outermost squares is read with the corners as they are fitted so far, and again for those that
-then move by more than the second number."""
 
 REACHED = 0.25
 """Of the corners of a board: where blur brings the edges of neighbouring lines into so many windows, all are fitted
@@ -187,35 +183,13 @@ def _last_pass(
     if _reached_by_others(geometry.gaps, blur[known], mine).any():
         geometry = tilted(geometry, known)
     fit = fitted(slice(None), geometry)
-    fit = _fitted_beside_paper(image, geometry, fit, fitted, signs[known], mine)
+    fit = fitted_beside_paper(image, geometry, fit, fitted, signs[known], mine)
     good = fit.valid & (fit.contrast > 0.0)
     factors = sigma_factors(fit, good, shape.sides, mine, len(parts), radius_px)
     uneven = uneven_factors(fit, good, shape.sides, mine, factors, radius_px)
     reached = np.zeros(known.shape, np.bool_)
     reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
     return _spread(start, fit, fit.sigma_px * factors[mine] * uneven), reached, factors
-
-
-def _fitted_beside_paper(
-    image: GreyImage,
-    geometry: Geometry,
-    fit: EdgeFit,
-    fitted: Callable[[BoolArray, Geometry], EdgeFit],
-    signs: FloatArray,
-    owner: IntArray,
-) -> EdgeFit:
-    """Return the `fit` of N corners with those `fitted` again that see what lies beyond their board, `owner` (N,)."""
-    again = beside_paper(geometry, fit, owner)
-    moving = again
-    for _ in range(PAPER_ROUNDS if again.any() else 0):
-        beside = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])
-        before, which = fit.pixels[moving], moving[again]
-        fit = fit.with_part(moving, fitted(moving, beside.of(which)))
-        moving = moving.copy()
-        moving[moving] = np.linalg.norm(fit.pixels[moving] - before, axis=1) >= SETTLED_PX
-        if not moving.any():
-            break
-    return fit
 
 
 def _reached_by_others(gaps: FloatArray, blur: FloatArray, owner: IntArray) -> BoolArray:

@@ -19,9 +19,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, BoardState, Guide
+from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.guided.guided import (
     MARGIN_PX,
-    MARKER_BLURS,
     MAX_ADDED_RESIDUAL_MARKED,
     MAX_SIGMA_CELLS,
     MIN_ADDED_CONTRAST,

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.guided.board_guide import BoardState
-from rigkit.detection.guided.guided import MARKER_BLURS
+from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_fit import (
     BLUR_RANGE,

@@ -20,7 +20,8 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
-from rigkit.detection.guided.guided import MARKER_BLURS, RADIUS_PX, completed, fit_corners, gap_to_markers
+from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
+from rigkit.detection.guided.guided import completed
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid

@@ -39,10 +39,13 @@ from rigkit.detection.saddles.ring import (
     arm_vectors,
 )
 from rigkit.detection.saddles.saddle import MAX_STEP, Corners
-from rigkit.kernels.front import STRIP_ROWS, STRIPS_FROM, HALF, STRIP, LinkRules, RingRules
+from rigkit.kernels.front import HALF, STRIP, STRIP_ROWS, STRIPS_FROM, LinkRules, RingRules
 
 QUICK = 4
 """Every so many samples of a ring are looked at before it is read."""
+
+NO_THRESHOLDS = np.zeros((0, 0), np.float32)
+"""Of a level whose peaks nobody asks for."""
 
 
 def shrunk(image: GreyImage, factor: int) -> FloatImage:
@@ -85,7 +88,9 @@ def peaks(smooth: FloatImage, above: FloatImage, limit: int, side: int, finest: 
     # What overflows twice is no number: a maximum with it is another one on each processor, and no peak.
     response = np.where(np.isnan(response), np.float32(-np.inf), response)
     highest = cv2.dilate(response, np.ones((5, 5), np.uint8))
-    mask = (response >= highest) & (response > threshold_at(above, 1 + np.arange(response.shape[1]), 1 + np.arange(len(response))[:, None]))
+    mask = (response >= highest) & (
+        response > threshold_at(above, 1 + np.arange(response.shape[1]), 1 + np.arange(len(response))[:, None])
+    )
     mask[:2] = mask[-2:] = False
     mask[:, :2] = mask[:, -2:] = False
     flat = np.flatnonzero(mask)
@@ -132,7 +137,7 @@ def links(
     assert np.array_equal(bounds, _bounds(contrast)) and rules.neighbours == NEIGHBOURS
     angles = np.arctan2(lines[..., 1], lines[..., 0])
     given = Corners(pixels, angles, contrast, reach * scale / MAX_ASIDE_PX)
-    return _without_long(_mutual(given, Level(image, np.zeros((0, 0), np.float32), scale, offset)), pixels).reshape(-1, 4)
+    return _without_long(_mutual(given, Level(image, NO_THRESHOLDS, scale, offset)), pixels).reshape(-1, 4)
 
 
 def _response(smooth: FloatImage) -> FloatImage:

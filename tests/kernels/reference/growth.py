@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from kernels.reference.front import edge_contrast, quads, read_rings
+from kernels.reference.front import NO_THRESHOLDS, edge_contrast, quads, read_rings
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -96,7 +96,7 @@ def grown(
     rules: GrowthRules,
     rings: int,
 ) -> int:
-    lattice, level = Lattice(pixels, contrast, sign > 0.0), Level(image, np.zeros((0, 0), np.float32), scale, offset)
+    lattice, level = Lattice(pixels, contrast, sign > 0.0), Level(image, NO_THRESHOLDS, scale, offset)
     assert rules.tried == MAX_SADDLES_TRIED
     points = saddles._kept["points"]
     due = np.ones((2, *lattice.contrast.shape), bool)

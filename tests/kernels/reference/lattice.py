@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
+from kernels.reference.front import NO_THRESHOLDS
 
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import Lattice
@@ -39,7 +40,10 @@ def shifts_of_edges(
     steps: int,
     most: int,
 ) -> FloatArray:
-    lattice, level = Lattice(pixels, np.full(pixels.shape[:2], np.nan), rising), Level(image, np.zeros((0, 0), np.float32), scale, offset)
+    lattice, level = (
+        Lattice(pixels, np.full(pixels.shape[:2], np.nan), rising),
+        Level(image, NO_THRESHOLDS, scale, offset),
+    )
     pixels, signs = level.to_level(lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
     first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
