@@ -193,6 +193,17 @@ def test_a_blurred_board_is_placed_together_with_a_camera_too() -> None:
     assert np.sqrt(np.mean(judged(guided, scene)[2] ** 2)) < 1.3
 
 
+def test_corners_are_judged_by_those_beside_them() -> None:
+    state = BoardState.unfitted(np.zeros((6, 9, 2)), np.ones((6, 9)))
+    shade = np.where(np.arange(9) < 4, 0.25, 1.0) * np.ones((6, 1))
+    state = replace(state, contrast=120.0 * shade, residual=2.0 * shade)
+    missing = np.zeros((6, 9), bool)
+    missing[2:4, [0, 8]] = True
+    contrast, residual = state.without(missing).usual_near(missing)
+    assert np.array_equal(contrast, [30.0, 120.0, 30.0, 120.0])
+    assert np.array_equal(residual, [0.5, 2.0, 0.5, 2.0])
+
+
 def test_a_corner_without_a_fit_of_its_own_does_not_spoil_the_others() -> None:
     scene = one_board(np.random.default_rng(1), board=BOARD)
     image = develop(scene.radiance(Optics(4.0)), BENCH_PHOTOMETRY, np.random.default_rng(1))

@@ -13,7 +13,9 @@ from detection_bench.score import FoundBoard, score
 from helpers.data import shared_data
 
 from rigkit import detect_boards
+from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
+from rigkit.core.boards import Board
 from rigkit.io.images import read_image
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
@@ -69,6 +71,16 @@ def test_squares_cut_short_do_not_pull_at_corners(
     assert len(found.grid) == COLUMNS * ROWS
     off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
     # Noise alone makes 0.01 px; without a model of what lies beyond, corners lie 0.14 to 2.4 px aside.
+    assert off.max() < MOST_PER_BLUR * blur_px
+
+
+@pytest.mark.parametrize("blur_px", [2.0, 3.0])
+def test_nor_with_a_camera(blur_px: float) -> None:
+    image, truth = cut_board((0.45, 1.0, 0.6, 1.0), blur_px, 200.0)
+    camera = Pinhole((image.shape[1], image.shape[0]), np.array([800.0, 800.0, 190.0, 150.0]))
+    (found,) = detect_boards(image, [Board("b", COLUMNS, ROWS, 30.0, 30.0)], camera=camera)
+    off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
+    assert len(found.grid) == COLUMNS * ROWS
     assert off.max() < MOST_PER_BLUR * blur_px
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 from detection_bench.scenes import one_board
@@ -63,3 +64,14 @@ def test_sigmas_hold_beside_shadows_and_glare(pattern: Charuco | None, light: Li
             seen += len(off)
     assert seen > 60
     assert RATIO[0] < np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < RATIO[1]
+
+
+def test_a_board_in_the_dark_beside_a_bright_wall_is_found(rng: np.random.Generator) -> None:
+    squares = np.kron((np.arange(20)[:, None] + np.arange(26)) % 2, np.ones((8, 8)))
+    image = np.full((320, 640), 240.0)
+    image[:, 300:] = 12.0
+    image[80:240, 360:568] = 4.0 + 8.0 * squares
+    image = cv2.GaussianBlur(image, (0, 0), 1.2) + rng.normal(0.0, 0.4, image.shape)
+    (found,) = detect_boards(np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    assert found.complete
+    assert (found.columns, found.rows) == (25, 19)
