@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.between_models import rival_fits, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
-from rigkit.calibration.fit import Fit
 from rigkit.calibration.lens_choice import (
     Choice,
     Lenses,
@@ -224,7 +223,7 @@ def _result(
     in_force = [name for name, value in (("model", how.model), ("board_shape", how.board)) if value == "auto"]
     moved = moved_lens(found.observations, fit) if how.folds else ()
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
-    far, clusters = _determined(result, found.observations, fit), found.observations.clusters()
+    far, clusters = _determined(result), found.observations.clusters()
     solved_for = found.observations, fit
     verdicts = judge(result, also, far=far, clusters=clusters, in_force=in_force, solved=solved_for)
     return replace(result, verdicts=verdicts)
@@ -239,10 +238,9 @@ def _others(tried: Lenses, model: str) -> list[Candidate]:
     return described([*(o for o in tried.options if o not in own), against], against)[:-1]
 
 
-def _determined(result: Calibration, observations: Observations, fit: Fit) -> FarProjection:
+def _determined(result: Calibration) -> FarProjection:
     """Return how sure the result is far away; raises DegenerateError where the views do not determine the camera."""
-    points, _ = fit.state.points_in_cam(observations)
-    far = FarProjection.of(result, points[fit.kept])
+    far = FarProjection.of(result, from_boards=True)
     require_determined(result, far.of_parameters_px)
     return far
 

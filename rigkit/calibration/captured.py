@@ -15,7 +15,7 @@ from rigkit.calibration.coverage import corner_ranges, covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
 from rigkit.core.findings import Finding, Severity
 
 FEW_IMAGES = 8
@@ -126,7 +126,7 @@ def _upright(c: Calibration) -> list[Finding]:
     along = _axes(c, 0) @ np.array([1.0, 1.0j, 0.0])
     doubled = (along / np.maximum(np.abs(along), np.finfo(float).tiny)) ** 2
     turned = 0.5 * np.degrees(np.abs(np.angle(doubled * np.conj(doubled.sum()))))
-    if len(c.views) < 2 or float(np.quantile(turned, NEARLY_ALL)) > UPRIGHT_DEG:
+    if len(c.views) < 2 or quantiles_of(turned, [NEARLY_ALL])[0] > UPRIGHT_DEG:
         return []
     return [
         _look(
@@ -173,7 +173,7 @@ def _distances(c: Calibration) -> list[Finding]:
     """Say where all boards were equally far away: then depth was seen on their tilts alone."""
     if len(c.views) < 2:
         return []
-    near, far = np.quantile(corner_ranges(c), [0.05, 0.95])
+    near, far = quantiles_of(corner_ranges(c), [0.05, 0.95])
     if far > ONE_DISTANCE * near:
         return []
     return [_look("all boards were at one distance", "hold some at half and some at double of it")]

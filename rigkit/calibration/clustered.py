@@ -30,14 +30,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray, IntArray, symmetric_pinv
+from rigkit.kernels.leverage import chebyshev_series
 
 MIN_CLUSTERS = 2
 """One image (or frame) says nothing about how they differ."""
 MIN_LEFT = 0.05
 """What is left of an image's pull in a direction that it alone determines: less is rounding."""
-MAX_FOR_EIGENVALUES = 24
-"""Of so few unknowns all eigenvalues are found as quickly."""
 MAX_FOR_SERIES, SERIES_LEFT_OUT = 0.8, 1e-13
 """Up to such a leverage x a series of Chebyshev polynomials approximates (1 - x)^-1/2; its coefficients fall by
 (1 - sqrt(1 - x)) / (1 + sqrt(1 - x)) each, down to about the second."""
@@ -138,9 +137,9 @@ def clustered_covariance(
 
 def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
     """Return (I - M)^-1/2 z (N, n) of clusters with leverages M (N, n, n) and z (N, n)."""
-    out, size = np.empty_like(pull), np.linalg.norm(leverage, axis=(1, 2))
+    out, size = np.empty_like(pull), np.sqrt((leverage * leverage).sum(axis=(1, 2)))
     # Frobenius' norm bounds the eigenvalues of M. Where it is well below one, powers of M take less than all of those.
-    small = (size < MAX_FOR_SERIES) & (pull.shape[1] > MAX_FOR_EIGENVALUES)
+    small = size < MAX_FOR_SERIES
     if small.any():
         bound = max(float(size[small].max()), RANK)
         fall = (1.0 - np.sqrt(1.0 - bound)) / (1.0 + np.sqrt(1.0 - bound))
@@ -150,12 +149,7 @@ def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
         values = 1.0 / np.sqrt(1.0 - 0.5 * bound * (1.0 + np.cos(angle)))
         series = 2.0 / len(angle) * np.cos(np.outer(np.arange(count + 1), angle)) @ values
         series[0] *= 0.5
-        centred = leverage[small] * (2.0 / bound) - np.eye(pull.shape[1])
-        before, term = pull[small], (centred @ pull[small][..., None])[..., 0]
-        out[small] = series[0] * before + series[1] * term
-        for factor in series[2:]:
-            before, term = term, 2.0 * (centred @ term[..., None])[..., 0] - before
-            out[small] += factor * term
+        out[small] = chebyshev_series(leverage[small], pull[small], bound, series)
     if not small.all():
         left, axes = np.linalg.eigh(np.eye(pull.shape[1]) - leverage[~small])
         along = np.swapaxes(axes, -1, -2) @ pull[~small, :, None]
@@ -181,7 +175,7 @@ def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> Floa
     n = len(block)
     before = covariance[:n, :n]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(before), np.finfo(float).tiny))
-    inverse = np.linalg.pinv(before * scale[:, None] * scale, rcond=RANK, hermitian=True) * scale[:, None] * scale
+    inverse = symmetric_pinv(before * scale[:, None] * scale, RANK) * scale[:, None] * scale
     follow = covariance[n:, :n] @ inverse
     out = np.empty_like(covariance)
     out[:n, :n] = block

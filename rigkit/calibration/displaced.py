@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection, projection_design
+from rigkit.calibration.uncertainty import Along, FarProjection
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
@@ -189,18 +189,18 @@ def telling_modes(far: FarProjection) -> FloatArray:
     pixels = grid_pixels(far.camera.size_px, MODES_GRID).reshape(-1, 2)
     rays, valid = far.camera.unproject(pixels)
     rays = rays[valid]
-    design = projection_design(far.camera, rays)
+    at = Along.of(far.camera, rays)
     whole = np.sqrt(np.trace(far.covariance(rays), axis1=1, axis2=2))
     known = np.isfinite(whole) & (whole > 0.0)
     if not known.any():
         return np.zeros((DISPLACEMENTS, 0))
     # In sigmas of the whole: what matters where boards were is not less than what matters far from them.
-    rays, design, whole = rays[known], design[..., known], whole[known]
-    relative = far.left_over(rays, design).transpose(1, 2, 0) / whole[:, None]
+    at, whole = at[known], whole[known]
+    relative = far.left_over(at).transpose(1, 2, 0) / whole[:, None]
     fields = relative.reshape(DISPLACEMENTS, -1)
     covariance = far.departures.covariance.copy()
-    for rival, away in far.away(rays, design):
-        amounts = _amounts_like(far, rays, design, whole, fields, np.sqrt(rival.likely) * away)
+    for rival, away in far.away(at):
+        amounts = _amounts_like(far, at, whole, fields, np.sqrt(rival.likely) * away)
         covariance += np.outer(amounts, amounts)
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
@@ -212,12 +212,10 @@ def telling_modes(far: FarProjection) -> FloatArray:
     return np.asarray((root @ turn)[:, matters])
 
 
-def _amounts_like(
-    far: FarProjection, rays: Rays, design: FloatArray, whole: FloatArray, fields: FloatArray, away: FloatArray
-) -> FloatArray:
-    """Return the amounts (J,) with which the displaced camera, its parameters following, shows rays (M, 3) nearest to
-    `away` (M, 2) px from where it has them, in units of `whole` (M,) px; `fields` (J, 2 M) are the displacements less
-    what parameters and a rotation have taken up, in these units, `design` is `projection_design`.
+def _amounts_like(far: FarProjection, at: Along, whole: FloatArray, fields: FloatArray, away: FloatArray) -> FloatArray:
+    """Return the amounts (J,) with which the displaced camera, its parameters following, shows M rays nearest to `away`
+    (M, 2) px from where it has them, in units of `whole` (M,) px; `fields` (J, 2 M) are the displacements less what
+    parameters and a rotation have taken up, in these units.
 
     Displacements of many pixels that parameters and a turned camera take up again but for a little would show any
     difference at first order. Of a camera that is moved so far that is not true, and what is seen in its frame turns
@@ -225,23 +223,22 @@ def _amounts_like(
     camera that is really moved comes nearest.
     """
     p = len(far.sigmas)
-    turned = np.einsum("wj,iwm->jmi", far.hides_departures, design[:, p:]) / whole[:, None]
+    turned = np.einsum("wj,iwm->jmi", far.hides_departures, at.design[:, p:]) / whole[:, None]
     values, axes = np.linalg.eigh(far.departures.covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
     rows = np.concatenate([fields, turned.reshape(DISPLACEMENTS, -1)], axis=1).T @ root
-    wanted = np.concatenate([(away / whole[:, None]).ravel(), np.zeros(2 * len(rays))])
+    wanted = np.concatenate([(away / whole[:, None]).ravel(), np.zeros(2 * len(at.rays))])
     left, size, right = np.linalg.svd(rows, full_matrices=False)
-    pixels = far.camera.project(rays)[0]
     best, amounts = float((wanted**2).sum()), np.zeros(DISPLACEMENTS)
     for penalty in size[0] * np.geomspace(SOFTEST, HARDEST, PENALTIES):
         tried = root @ (right.T @ (size / (size**2 + penalty**2) * (left.T @ wanted)))
         parameters = np.append(far.camera.parameters - far.departures.followed @ tried, tried)
         try:
             moved = DisplacedCamera(far.camera.size_px, parameters, far.camera, np.eye(DISPLACEMENTS))
-            shown, valid = moved.project(rays)
+            shown, valid = moved.project(at.rays)
         except InputError:
             continue
-        off = ((np.where(valid[:, None], shown, np.inf) - pixels - away) / whole[:, None]).ravel()
+        off = ((np.where(valid[:, None], shown, np.inf) - at.pixels - away) / whole[:, None]).ravel()
         error = float((off**2).sum())
         if error < best:
             best, amounts = error, tried

@@ -52,7 +52,7 @@ def normal_equations(
         p=products[:, count:-1, -1],
         costs=sums.costs,
         # Coordinates first in memory: every later step takes u and v apart.
-        residuals=(Residuals(np.moveaxis(sums.residuals, 0, -1), sums.valid),),
+        residuals=(Residuals(sums.residuals.transpose(1, 2, 0), sums.valid),),
         products=(products,),
     )
     return _with_released(normal, sums) if shape.kind == "released" else normal

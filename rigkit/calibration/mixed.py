@@ -39,6 +39,8 @@ def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
     rotation, centre = calibration.corners.rotation, calibration.corners.translation_mm
     boards = np.unique([view.board_id for view in views], return_inverse=True)[1]
     start, end = _partners(rotation, centre, boards, number)
+    if len(start) < MIN_PARTNERS:
+        return []
     alike = len(np.unique(number[start]))
     together = np.unique(np.concatenate([number[start], number[end]]))
     chained = np.intersect1d(number[start], number[end])
@@ -64,29 +66,29 @@ def _partners(
     # A pose as four points: the board's origin, and the ends of axes half as long as it is far away.
     frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     reach = SAME_MOTION * distance * 2.0
-    points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
     starts = np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))
-    # Where each motion takes a frame that stands where boards usually were, as products of all ends and all starts.
+    # By how much each motion moves a frame that stands where boards usually were, as products of all ends and starts:
+    # coordinates first, then start, end and point.
     usual = frame + centre.mean(axis=0)
     seen_from = (usual - centre[starts, None]) @ rotation[starts]
-    ends = (rotation.reshape(-1, 3) @ seen_from.reshape(-1, 3).T).reshape(len(centre), 3, len(starts), len(frame))
-    ends = ends.transpose(2, 0, 3, 1) + centre[:, None]
-    chosen = (number[starts, None] != number) & (boards[starts, None] == boards)
-    off = ends - usual
-    chosen &= np.einsum("svkc,svkc->svk", off, off).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
-    i, j = np.nonzero(chosen)
-    i, ends = starts[i], ends[chosen]
-    flat = ends.reshape(-1, 12)
-    alike = _neighbours(flat, reach) if len(flat) else np.zeros(0, np.int64)
+    moved = np.swapaxes(rotation, 0, 1).reshape(-1, 3) @ seen_from.reshape(-1, 3).T
+    moved = moved.reshape(3, len(centre), len(starts), len(frame))
+    moved += centre.T[:, :, None, None] - usual.T[:, None, None]
+    chosen = (number[:, None] != number[starts]) & (boards[:, None] == boards[starts])
+    chosen &= (moved * moved).sum(axis=0).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
+    i, j = np.nonzero(chosen.T)
+    moved = np.moveaxis(moved[:, j, i], 0, 1).reshape(-1, 12)
+    alike = _neighbours(moved, reach) if len(moved) else np.zeros(0, np.int64)
     if alike.max(initial=0) < 2:
         # No motion comes twice.
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    near = np.linalg.norm(flat - flat[int(np.argmax(alike))], axis=1) <= reach
+    near = np.linalg.norm(moved - moved[int(np.argmax(alike))], axis=1) <= reach
     best = np.flatnonzero(near)
+    points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
     # The motion of the one that lies in the middle of those.
-    middle = best[int(np.argmin(np.linalg.norm(ends[best] - np.median(ends[best], axis=0), axis=(1, 2))))]
-    turn = rotation[j[middle]] @ rotation[i[middle]].T
-    landed = (points - centre[i[middle]]) @ turn.T + centre[j[middle]]
+    middle = best[int(np.argmin(np.linalg.norm(moved[best] - np.median(moved[best], axis=0), axis=1)))]
+    start, end = starts[i[middle]], j[middle]
+    landed = (points - centre[start]) @ (rotation[end] @ rotation[start].T).T + centre[end]
     one, other = landed.reshape(-1, 12), points.reshape(-1, 12)
     # |a - b|^2 - |a|^2, all of them as one product.
     end = ((other**2).sum(axis=1) - 2.0 * one @ other.T).argmin(axis=1)

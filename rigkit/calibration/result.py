@@ -270,6 +270,12 @@ class CalibrationCorners:
     rotation: FloatArray
     translation_mm: Points
 
+    def in_cam(self, chosen: IntArray) -> Points:
+        """Return the corners `chosen` (M,) in the camera frame, (M, 3)."""
+        view = self.view[chosen]
+        turned = np.einsum("nij,nj->ni", self.rotation[view], self.points_mm[chosen])
+        return np.asarray(turned + self.translation_mm[view])
+
     @classmethod
     def of(cls, views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> Self:
         count = np.array([len(view.grid) for view in views])

@@ -69,6 +69,8 @@ class ShapeModel:
 
     def points(self, unknowns: FloatArray) -> Points:
         """Return the board points, (M, 3) mm."""
+        if not unknowns.size:
+            return self.flat.copy()
         count = self.basis.shape[-1]
         points: Points = self.flat + self.basis @ unknowns[:count]
         points[self.released] += unknowns[count:].reshape(-1, 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,4 +64,4 @@ def evaluate(state: State, observations: Observations) -> Residuals:
 
 def lost_px(camera: Camera) -> float:
     """Return the residual per coordinate of a corner outside the model's field of view: the diagonal of the image."""
-    return float(np.hypot(*camera.size_px))
+    return math.hypot(*camera.size_px)

@@ -29,7 +29,7 @@ from rigkit.calibration.departures import Departures
 from rigkit.calibration.result import Calibration, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, symmetric_pinv
 from rigkit.geometry.rotation import exp_so3, skew
 
 CORNERS = 400
@@ -71,7 +71,7 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     else:
         known = calibration.widening**2 * calibration.frame_covariance
         found = _propagated(known, projection_design(calibration.camera, flat, range_mm))
-        found += far.beyond_model(flat, projection_design(calibration.camera, flat))
+        found += far.beyond_model(Along.of(calibration.camera, flat))
     covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
 
@@ -80,6 +80,25 @@ def worst_direction(covariance: FloatArray) -> FloatArray:
     """Return the standard deviation in the worst direction (...,) of covariances (..., 2, 2)."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Along:
+    """What a camera makes of `rays` (M, 3): their `pixels` (M, 2), NaN where it has none, and the `design`
+    (2, P + 3, M) of `projection_design`."""
+
+    rays: Rays
+    pixels: Pixels
+    design: FloatArray
+
+    @classmethod
+    def of(cls, camera: Camera, rays: Rays) -> Along:
+        pixels, design = _projected(camera, rays, np.inf)
+        return cls(rays, pixels, design)
+
+    def __getitem__(self, chosen: BoolArray) -> Along:
+        """Return the same of the rays chosen."""
+        return Along(self.rays[chosen], self.pixels[chosen], self.design[..., chosen])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,7 +111,7 @@ class FarProjection:
     camera : the camera.
     correlation, sigmas : (P, P) and (P,) of its parameters.
     rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
-    rays, corners : (N, 3) those, and (2, P + 3, N) `projection_design` along them.
+    corners : the projection along those N rays.
     hides : (3, P) the rotation that hides a step of one standard deviation of each parameter.
     departures, hides_departures : what the lens may do beyond its model, and (3, J) the rotations that hide that.
     corners_left : (2, P + J, N) what that leaves, at the corners, of such steps and of the displacements.
@@ -104,8 +123,7 @@ class FarProjection:
     correlation: FloatArray
     sigmas: FloatArray
     rays_valid: BoolArray
-    rays: Rays
-    corners: FloatArray
+    corners: Along
     hides: FloatArray
     departures: Departures
     hides_departures: FloatArray
@@ -113,30 +131,30 @@ class FarProjection:
     rivals: tuple[tuple[Rival, FloatArray, Mat3], ...]
 
     @classmethod
-    def of(cls, calibration: Calibration, points_in_cam: Points | None = None) -> FarProjection:
-        """Return it for a calibration. `points_in_cam` (N, 3) are the boards' corners in the camera frame, of the
-        corners used, where they are known: it saves the way back from the pixels."""
-        camera = calibration.camera
-        if points_in_cam is None:
-            pixels = calibration.corners.pixels[calibration.corners.kept]
-            rays, valid = camera.unproject(pixels[_spread(len(pixels))])
-            rays = rays[valid]
+    def of(cls, calibration: Calibration, *, from_boards: bool = False) -> FarProjection:
+        """Return it for a calibration; the rays to the corners `from_boards` as they were solved, where all are known
+        to project: it saves the way back from the pixels."""
+        camera, corners = calibration.camera, calibration.corners
+        chosen = np.flatnonzero(corners.kept)
+        chosen = chosen[_spread(len(chosen))]
+        if from_boards:
+            points = corners.in_cam(chosen)
+            rays, valid = points / np.sqrt((points * points).sum(axis=-1, keepdims=True)), np.ones(len(points), bool)
         else:
-            points = points_in_cam[_spread(len(points_in_cam))]
-            rays, valid = points / np.linalg.norm(points, axis=-1, keepdims=True), np.ones(len(points), dtype=bool)
+            rays, valid = camera.unproject(corners.pixels[chosen])
+            rays = rays[valid]
         p = camera.parameters.size
         # Parameters have units of their own: in standard deviations they can be compared.
         known = calibration.widening**2 * calibration.covariance
         sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
-        design = projection_design(camera, rays)
-        departures, pixels = Departures.of(calibration), camera.project(rays)[0]
-        left = np.concatenate([sigmas[:, None] * design[:, :p], departures.left_over(pixels, design)], axis=1)
-        turned = design[:, p:]
+        at, departures = Along.of(camera, rays), Departures.of(calibration)
+        left = np.concatenate([sigmas[:, None] * at.design[:, :p], departures.left_over(at.pixels, at.design)], axis=1)
+        turned = at.design[:, p:]
         square, across = (
             (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0),
             (turned @ np.swapaxes(left, 1, 2)).sum(axis=0),
         )
-        hides = np.linalg.pinv(square, hermitian=True) @ across
+        hides = symmetric_pinv(square) @ across
         left -= hides.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         return cls(
@@ -144,8 +162,7 @@ class FarProjection:
             correlation=known / np.outer(safe, safe),
             sigmas=sigmas,
             rays_valid=valid,
-            rays=rays,
-            corners=design,
+            corners=at,
             hides=hides[:, :p],
             departures=departures,
             hides_departures=hides[:, p:],
@@ -155,41 +172,38 @@ class FarProjection:
 
     def covariance(self, rays: FloatArray) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3)."""
-        design = projection_design(self.camera, rays)
-        return self._of_parameters(design) + self.beyond_model(rays, design)
+        at = Along.of(self.camera, rays)
+        return self._of_parameters(at.design) + self.beyond_model(at)
 
-    def beyond_model(self, rays: FloatArray, design: FloatArray) -> FloatArray:
-        """Return what of the covariance (M, 2, 2) along `rays` (M, 3) is what the lens may do beyond its model, from
-        `projection_design` there."""
-        return self._beyond(self.left_over(rays, design), rays, design)
+    def beyond_model(self, at: Along) -> FloatArray:
+        """Return what of the covariance (M, 2, 2) is what the lens may do beyond its model."""
+        return self._beyond(self.left_over(at), at)
 
-    def _beyond(self, left: FloatArray, rays: FloatArray, design: FloatArray) -> FloatArray:
+    def _beyond(self, left: FloatArray, at: Along) -> FloatArray:
         out = _propagated(self.departures.covariance, left)
-        for rival, away in self.away(rays, design):
+        for rival, away in self.away(at):
             out += rival.likely * away[:, :, None] * away[:, None, :]
         return out
 
-    def left_over(self, rays: FloatArray, design: FloatArray) -> FloatArray:
-        """Return what parameters and rotation leave of the displacements (2, J, M) along `rays` (M, 3)."""
-        left = self.departures.left_over(self.camera.project(rays)[0], design)
-        left -= np.einsum("wj,iwm->ijm", self.hides_departures, design[:, len(self.sigmas) :])
+    def left_over(self, at: Along) -> FloatArray:
+        """Return what parameters and rotation leave of the displacements, (2, J, M) px."""
+        left = self.departures.left_over(at.pixels, at.design)
+        left -= np.einsum("wj,iwm->ijm", self.hides_departures, at.design[:, len(self.sigmas) :])
         return left
 
-    def away(self, rays: FloatArray, design: FloatArray) -> list[tuple[Rival, FloatArray]]:
-        """Return how far each rival, followed where the boards were, projects `rays` (M, 3) elsewhere, (M, 2) px."""
-        if not self.rivals:
-            return []
-        out, pixels, p = [], self.camera.project(rays)[0], len(self.sigmas)
+    def away(self, at: Along) -> list[tuple[Rival, FloatArray]]:
+        """Return how far each rival, followed where the boards were, projects the rays elsewhere, (M, 2) px."""
+        out, p = [], len(self.sigmas)
         for rival, step, turn in self.rivals:
-            there, seen = rival.camera.project(rays @ turn.T)
-            moved = np.where(seen[:, None], there - pixels, 0.0) - np.einsum("ipm,p->mi", design[:, :p], step)
+            there, seen = rival.camera.project(at.rays @ turn.T)
+            moved = np.where(seen[:, None], there - at.pixels, 0.0) - np.einsum("ipm,p->mi", at.design[:, :p], step)
             out.append((rival, moved))
         return out
 
     @cached_property
     def at_corners_px(self) -> FloatArray:
         """Standard deviation in the worst direction, (M,) px, at the corners; NaN where one has no ray."""
-        beyond = self._beyond(self.corners_left[:, len(self.sigmas) :], self.rays, self.corners)
+        beyond = self._beyond(self.corners_left[:, len(self.sigmas) :], self.corners)
         return self._over_all(self._corners_of_parameters + beyond)
 
     @property
@@ -236,18 +250,26 @@ def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
 def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf) -> FloatArray:
     """Return d pixel / d (k, W, T), (2, P + 6, M), along rays (M, 3); at infinity the world's shift shows nothing, and
     it is (2, P + 3, M)."""
+    return _projected(camera, rays, range_mm)[1]
+
+
+def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixels, FloatArray]:
+    """Return the pixels (M, 2), NaN where there is none, and `projection_design`."""
     # Unknowns first, pixels last: one matrix product for each coordinate.
     p = camera.parameters.size
     count = p + 3 if np.isinf(range_mm) else p + 6
     design, by_x = np.zeros((2, count, len(rays))), np.empty((2, 3, len(rays)))
     ray = np.ascontiguousarray(rays.T)
-    camera.derivatives(ray[0], ray[1], ray[2], by_x, design[:, :p])
+    u, v, valid = camera.derivatives(ray[0], ray[1], ray[2], by_x, design[:, :p])
+    pixels = np.stack([u, v], axis=-1)
+    if not valid.all():
+        pixels[~valid] = np.nan
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         design[:, p + k] = ray[i] * by_x[:, j] - ray[j] * by_x[:, i]
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
-    return design
+    return pixels, design
 
 
 def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:

@@ -5,6 +5,7 @@ Reference: D. C. Brown, "Close-range camera calibration", 1971; the rational for
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
@@ -78,24 +79,24 @@ class Brown(Camera):
             return names[:8]
         return (*names, "k4", "k5", "k6") if self.parameters.size > 9 else names
 
-    def _polynomials(self) -> tuple[FloatArray, FloatArray]:
+    def _polynomials(self) -> tuple[list[float], list[float]]:
         """Numerator and denominator of L as polynomials in t."""
-        k1, k2 = self.parameters[4:6].tolist()
-        k3 = float(self.parameters[8]) if self.parameters.size > 8 else 0.0
-        return np.array([1.0, k1, k2, k3]), np.concatenate([[1.0], self.parameters[9:]])
+        values = self.parameters.tolist()
+        return [1.0, *values[4:6], values[8] if len(values) > 8 else 0.0], [1.0, *values[9:]]
 
     def _prepare(self) -> None:
         top, bottom = self._polynomials()
-        bound = 6.0 * np.hypot(self.parameters[6], self.parameters[7])
+        bound = 6.0 * math.hypot(*self.parameters[6:8].tolist())
         # d(L r)/dr = L + 2 t L' = [(N + 2 t N') D - 2 t N D'] / D^2, in powers of t; both are to exceed bound * r.
-        k, j = np.arange(top.size), np.arange(bottom.size)
-        radial = _product(top * (1.0 + 2.0 * k), bottom) - 2.0 * _product(top, bottom * j)
-        by_r = np.zeros((2, 2 * max(radial.size, 2 * bottom.size) - 1))
-        by_r[0, : 2 * radial.size : 2], by_r[1, : 2 * radial.size : 2] = radial, _product(top, bottom)
-        by_r[:, 1 : 4 * bottom.size - 2 : 2] = -bound * _product(bottom, bottom)
+        slope = _product([(1.0 + 2.0 * k) * a for k, a in enumerate(top)], bottom)
+        less = _product(top, [2.0 * k * a for k, a in enumerate(bottom)])
+        by_r = np.zeros((2, 2 * max(len(slope), 2 * len(bottom)) - 1))
+        by_r[0, : 2 * len(slope) : 2] = [a - b for a, b in zip(slope, less, strict=True)]
+        by_r[1, : 2 * len(slope) : 2] = _product(top, bottom)
+        by_r[:, 1 : 4 * len(bottom) - 2 : 2] = [-bound * a for a in _product(bottom, bottom)]
         limit = first_root(by_r, FARTHEST)
-        if bottom.size > 1:
-            limit = min(limit, float(np.sqrt(first_root(bottom, FARTHEST**2))))
+        if len(bottom) > 1:
+            limit = min(limit, math.sqrt(first_root(np.array(bottom), FARTHEST**2)))
         object.__setattr__(self, "_max_r", limit)
 
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -117,7 +118,7 @@ class Brown(Camera):
         knots = np.tan(np.linspace(0.0, np.arctan(self._max_r), KNOTS))
         radius = np.sqrt(m[0] ** 2 + m[1] ** 2)
         # Where the denominator vanishes at the edge, rounding may have it infinite or negative there.
-        top, bottom = (horner(polynomial, knots * knots) for polynomial in self._polynomials())
+        top, bottom = (horner(np.array(polynomial), knots * knots) for polynomial in self._polynomials())
         values = np.fmax.accumulate(knots * (top / bottom))
         found = np.interp(radius, values, knots)
         return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
@@ -133,6 +134,10 @@ class Brown(Camera):
         return brown_pixels((x, y, z), self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
 
 
-def _product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the product of two polynomials."""
-    return a * b if b.size == 1 else np.convolve(a, b)
+def _product(a: list[float], b: list[float]) -> list[float]:
+    """Return the product of two polynomials: of so few terms numpy would take several times as long."""
+    out = [0.0] * (len(a) + len(b) - 1)
+    for i, x in enumerate(a):
+        for j, y in enumerate(b):
+            out[i + j] += x * y
+    return out

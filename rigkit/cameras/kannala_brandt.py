@@ -6,6 +6,7 @@ fish-eye lenses", PAMI 2006, equation (6). Unlike OpenCV's implementation it is 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar, Self
 
@@ -52,12 +53,9 @@ class KannalaBrandt(CompiledCamera):
         return ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")
 
     def _prepare(self) -> None:
-        slope = self._slope_coefficients()
-        object.__setattr__(self, "_max_angle", float(np.sqrt(first_root(slope, np.pi**2))))
-
-    def _slope_coefficients(self) -> FloatArray:
-        """d|m| / d theta as a polynomial in theta^2."""
-        return np.asarray(np.arange(1.0, 10.0, 2.0) * np.concatenate([[1.0], self.parameters[4:]]))
+        # d|m| / d theta as a polynomial in theta^2.
+        slope = np.array([1.0, *((3.0 + 2.0 * k) * a for k, a in enumerate(self.parameters[4:].tolist()))])
+        object.__setattr__(self, "_max_angle", math.sqrt(first_root(slope, math.pi**2)))
 
     def _factor(self, theta2: FloatArray) -> FloatArray:
         """|m| / theta."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
@@ -34,13 +36,10 @@ def first_root(coefficients: FloatArray, limit: float) -> float:
 
     Raises InputError where a polynomial overflows: what a solver tries may be far from any lens.
     """
-    # Scaled to x in (0, 1] so that coefficients of high powers of pixels are not lost beside the others.
-    scaled = np.atleast_2d(coefficients) * limit ** np.arange(float(coefficients.shape[-1]))
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        scaled /= scaled[:, :1].copy()
-    if not np.isfinite(scaled).all():
+    root = smallest_root(np.atleast_2d(coefficients), limit)
+    if math.isnan(root):
         raise InputError("lens polynomial: its coefficients are too large for any lens; calibrate again")
-    return limit * smallest_root(scaled)
+    return root
 
 
 def invert_increasing(

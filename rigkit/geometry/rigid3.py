@@ -45,15 +45,21 @@ class Rigid3:
     @classmethod
     def stack(cls, rotation: Mat3, translation_mm: FloatArray) -> tuple[Rigid3, ...]:
         """Return the motions of rotations (N, 3, 3) and translations (N, 3), checked together as one is alone."""
-        rotation = as_array(rotation, (None, 3, 3), "rotation")
+        rotation = _checked(as_array(rotation, (None, 3, 3), "rotation"))
         translation = as_array(translation_mm, (len(rotation), 3), "translation_mm")
-        return tuple(cls._of(one, shift) for one, shift in zip(_checked(rotation), translation, strict=True))
+        rotation.flags.writeable = False
+        return tuple(cls._of(one, shift) for one, shift in zip(rotation, translation, strict=True))
+
+    @classmethod
+    def _own(cls, rotation: Mat3, translation_mm: FloatArray) -> Rigid3:
+        """Return the motion of arrays of its own that need no check: they come from motions that were checked."""
+        rotation.flags.writeable = translation_mm.flags.writeable = False
+        return cls._of(rotation, translation_mm)
 
     @classmethod
     def _of(cls, rotation: Mat3, translation_mm: FloatArray) -> Rigid3:
-        """Return the motion of arrays of its own that need no check: they come from motions that were checked."""
+        """The same of arrays that nobody can write to."""
         motion = object.__new__(cls)
-        rotation.flags.writeable = translation_mm.flags.writeable = False
         object.__setattr__(motion, "rotation", rotation)
         object.__setattr__(motion, "translation_mm", translation_mm)
         return motion
@@ -89,13 +95,13 @@ class Rigid3:
 
     def inverse(self) -> Rigid3:
         back = self.rotation.T.copy()
-        return Rigid3._of(back, -back @ self.translation_mm)
+        return Rigid3._own(back, -back @ self.translation_mm)
 
     def __matmul__(self, other: Rigid3) -> Rigid3:
         if not isinstance(other, Rigid3):
             return NotImplemented
         rotation = _orthonormal(self.rotation @ other.rotation)
-        return Rigid3._of(rotation, self.rotation @ other.translation_mm + self.translation_mm)
+        return Rigid3._own(rotation, self.rotation @ other.translation_mm + self.translation_mm)
 
     def allclose(self, other: Rigid3, *, rotation_tol: float = 1e-9, translation_tol_mm: float = 1e-9) -> bool:
         """Say whether two motions agree entry by entry."""

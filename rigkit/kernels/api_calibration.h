@@ -103,6 +103,13 @@ EXPORT int64_t close_pairs(
     ARRAY(const double, points, count, axes), int64_t count, int64_t axes, double reach, ARRAY(const int64_t, ends, count, 4),
     ARRAY(int64_t, pairs, capacity, 2), int64_t capacity);
 
+/* leverage.c */
+
+EXPORT void sum_series(
+    ARRAY(const double, leverage, clusters, n, n), ARRAY(const double, pull, clusters, n), int64_t clusters, int64_t n,
+    double bound, ARRAY(const double, series, terms), int64_t terms, ARRAY(double, memory, 3 * n),
+    ARRAY(double, out, clusters, n));
+
 /* coverage.c */
 
 EXPORT void cover_pixels(
@@ -170,6 +177,7 @@ typedef struct {
 
 EXPORT void invert_increasing(const increasing_t *functions, ARRAY(double, out, functions.count));
 EXPORT double smallest_root(
-    ARRAY(const double, polynomials, count, terms), int64_t count, int64_t terms, ARRAY(double, memory, terms));
+    ARRAY(const double, polynomials, count, terms), int64_t count, int64_t terms, double limit,
+    ARRAY(double, memory, 2 * terms));
 
 #endif

@@ -21,6 +21,9 @@ STRUCTURES: dict[str, type[Struct]] = {}
 NAMES_IN_SIZES: dict[str, Any] = dict(header().constants)
 """What sizes of arrays may be made of, beside other arguments: the constants, and the kernels once they are loaded."""
 
+EMPTY = ctypes.c_double()
+"""What is passed for an empty array, which has no first value."""
+
 AnyStruct = TypeVar("AnyStruct", bound="Struct")
 
 
@@ -57,10 +60,7 @@ class _Checks:
         tests = [f"{name}.shape == {array.shape}" for name, array in self._arrays.items()]
         # A type is one object, but for those of another order of bytes.
         tests += [_is_of(name, array.dtype) for name, array in self._arrays.items() if array.dtype is not None]
-        # An empty array has no first value.
-        passed = [
-            self._passed(name, "_addressof(_from_buffer({0})) if {0}.size else _address({0})") for name in self.names
-        ]
+        passed = [self._passed(name, "_addressof(_from_buffer({0})) if {0}.size else _empty") for name in self.names]
         checked = [self._passed(name, f"_checked('{name}', {{}}, {self._shape(name)})") for name in self.names]
         code = f"""
 def call({", ".join(self.names)}):
@@ -74,7 +74,7 @@ def call({", ".join(self.names)}):
         scope: dict[str, Any] = dict(NAMES_IN_SIZES)
         scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}
         scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_checked": self._checked}
-        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer, "_address": address}
+        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer, "_empty": ctypes.addressof(EMPTY)}
         exec(compile(code, f"api.h: {self.owner}", "exec"), scope)
         return cast("Callable[..., Any]", scope["call"])
 

@@ -64,14 +64,24 @@ static double root_of(const double *p, int64_t terms, double *memory)
     return 1.0;
 }
 
-EXPORT FOR_EACH_PROCESSOR double smallest_root(const double *polynomials, int64_t count, int64_t terms, double *memory)
+EXPORT FOR_EACH_PROCESSOR double smallest_root(
+    const double *polynomials, int64_t count, int64_t terms, double limit, double *memory)
 {
-    double least = 1.0;
+    double least = 1.0, *scaled = memory + terms;
     for (int64_t i = 0; i < count; i++) {
-        const double root = root_of(polynomials + i * terms, terms, memory);
+        /* Scaled to x in (0, 1], so that coefficients of high powers of pixels are not lost beside the others. */
+        const double *p = polynomials + i * terms;
+        double power = 1.0;
+        for (int64_t k = 0; k < terms; k++) {
+            scaled[k] = p[k] * power / p[0];
+            if (!isfinite(scaled[k]))
+                return NAN;
+            power *= limit;
+        }
+        const double root = root_of(scaled, terms, memory);
         least = root < least ? root : least;
     }
-    return least;
+    return limit * least;
 }
 
 EXPORT FOR_EACH_PROCESSOR void invert_increasing(const increasing_t *g, double *out)

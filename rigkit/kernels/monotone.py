@@ -52,8 +52,8 @@ def inverses(
     return out
 
 
-def smallest_root(polynomials: FloatArray) -> float:
-    """Return the smallest root in (0, 1] of polynomials (M, K) that are positive at zero, of the power zero first, or 1
-    where there is none."""
+def smallest_root(polynomials: FloatArray, limit: float) -> float:
+    """Return the smallest root in (0, `limit`] of polynomials (M, K) that do not vanish at zero, of the power zero
+    first, or `limit` where there is none; NaN where one overflows."""
     polynomials = np.ascontiguousarray(polynomials, np.float64)
-    return float(kernels().smallest_root(polynomials, *polynomials.shape, np.empty(polynomials.shape[1])))
+    return float(kernels().smallest_root(polynomials, *polynomials.shape, limit, np.empty(2 * polynomials.shape[1])))

@@ -204,8 +204,7 @@ def test_uncertainty_at_corners_from_pixels_or_points(rng: np.random.Generator) 
     """The way back from the pixels gives what the solved points give, but for the residuals."""
     views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0)
     result = calibrate(views, SIZE, model="brown", board="flat", folds=0)
-    points = np.concatenate([v.cam_from_board.apply(BOARD.points()) for v in result.views])
-    there = FarProjection.of(result, points).at_corners_px
+    there = FarProjection.of(result, from_boards=True).at_corners_px
     assert there == pytest.approx(FarProjection.of(result).at_corners_px, rel=0.01)
 
 

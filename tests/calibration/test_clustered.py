@@ -133,18 +133,18 @@ def test_what_follows_the_block(rng: np.random.Generator) -> None:
     assert with_block(covariance, 2.0 * covariance[:4, :4], 2.0) == pytest.approx(2.0 * covariance, rel=1e-6)
 
 
-def test_many_unknowns_have_the_covariance_of_all_eigenvalues(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("count", [9, 40])
+def test_little_leverage_has_the_covariance_of_all_eigenvalues(
+    count: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Clusters of little leverage take a series; one has so much that it does not."""
-    count = 40
     rows = rng.normal(size=(30, 60, count)) * np.where(np.arange(30) == 7, 4.0, 1.0)[:, None, None]
     information = np.swapaxes(rows, 1, 2) @ rows
     score = np.einsum("vrn,vr->vn", rows, rng.normal(size=(30, 60)))
     prior = np.eye(count)
     unit = np.linalg.inv(information.sum(axis=0) + prior)
     by_series = clustered_covariance(unit, information, score, prior, 1.0)
-    monkeypatch.setattr(clustered, "MAX_FOR_EIGENVALUES", count)
+    monkeypatch.setattr(clustered, "MAX_FOR_SERIES", 0.0)
     by_eigenvalues = clustered_covariance(unit, information, score, prior, 1.0)
     assert by_series.overdispersion == pytest.approx(by_eigenvalues.overdispersion, rel=1e-10)
     scale = np.abs(by_eigenvalues.covariance).max()

@@ -13,7 +13,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.departures import Departures
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection, projection_design, projection_uncertainty
+from rigkit.calibration.uncertainty import Along, FarProjection, projection_uncertainty
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray
@@ -40,8 +40,7 @@ def errors_and_sigmas(
     turn = best_rotation(rays[covered], pixels[covered], np.ones(int(covered.sum())), found.camera)
     error = ((found.camera.project(rays @ turn.T)[0] - pixels) ** 2).sum(axis=-1)
     stated = projection_uncertainty(found, pixels).covariance.trace(axis1=1, axis2=2)
-    own = found.camera.unproject(pixels)[0]
-    beyond = FarProjection.of(found).beyond_model(own, projection_design(found.camera, own))
+    beyond = FarProjection.of(found).beyond_model(Along.of(found.camera, found.camera.unproject(pixels)[0]))
     return covered, error, stated, stated - beyond.trace(axis1=1, axis2=2)
 
 

@@ -73,7 +73,7 @@ def far_variance(known: UncertainCamera, calibration: Calibration, pixels: Float
     """Return the variance (N,) of the projection by the covariance, after the rotation hidden at the corners."""
     camera, p = known.camera, known.camera.parameters.size
     sigmas = np.sqrt(np.diag(known.covariance))
-    corners = projection_design(camera, FarProjection.of(calibration).rays)
+    corners = projection_design(camera, FarProjection.of(calibration).corners.rays)
     there = corners.transpose(1, 0, 2).reshape(p + 3, -1)
     hides = np.linalg.lstsq(there[p:].T, (sigmas[:, None] * there[:p]).T, rcond=None)[0]
     design = projection_design(camera, calibration.camera.unproject(pixels)[0])

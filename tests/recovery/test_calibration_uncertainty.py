@@ -15,7 +15,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State
-from rigkit.calibration.uncertainty import FarProjection, projection_design, projection_uncertainty, uncertainty_map
+from rigkit.calibration.uncertainty import Along, FarProjection, projection_uncertainty, uncertainty_map
 from rigkit.cameras.registry import MODELS
 from rigkit.geometry.rotation import exp_so3
 
@@ -53,8 +53,8 @@ def observed_over_predicted(
         moved.append(fit.state.camera.project(carried)[0] - pixels)
         # Twenty views know their own disagreement to a fifth: what they say on average is what must be right.
         # The lens is known to be of the model here: what it may do beyond that is no part of the scatter.
-        there = result.camera.unproject(pixels)[0]
-        beyond = FarProjection.of(result).beyond_model(there, projection_design(result.camera, there))
+        there = Along.of(result.camera, result.camera.unproject(pixels)[0])
+        beyond = FarProjection.of(result).beyond_model(there)
         quoted = projection_uncertainty(result, pixels, range_mm=range_mm).covariance - beyond
         predicted.append(quoted / result.widening**2)
     scatter = np.array(moved)
