@@ -191,6 +191,13 @@ def without_nan(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def known_median(values: FloatArray) -> float:
+    """Return the median of those numbers that are not NaN; NaN where there are none. np.nanmedian takes five times as
+    long."""
+    known = values[~np.isnan(values)]
+    return median_of(known) if known.size else math.nan
+
+
 def upper_median(values: FloatArray) -> float:
     """Return the median of N > 0 numbers, the upper one of two; for some fifty np.median takes ten times as long."""
     half = len(values) // 2

@@ -66,6 +66,9 @@ EXPORT void find_paper(
 /* Degree of the polynomial that a lens adds to a perspective, at most, and how many terms x^i y^j that has. */
 enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGREE + 2) / 2 };
 
+EXPORT void project_places(
+    ARRAY(const double, places, count, 2), int64_t count, ARRAY(const double, homography, 3, 3),
+    ARRAY(double, out, 5, count, 2));
 EXPORT double fit_perspective(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(

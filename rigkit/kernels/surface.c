@@ -68,6 +68,23 @@ static void centred(const double *points, int64_t count, double middle[2], doubl
     *size = *size > 1e-9 ? *size : 1e-9;
 }
 
+void project_places(const double *places, int64_t count, const double *homography, double *out)
+{
+    const double *h = homography;
+    for (int64_t i = 0; i < count; i++) {
+        const double x = places[2 * i], y = places[2 * i + 1], per_depth = 1.0 / (h[6] * x + h[7] * y + h[8]);
+        for (int64_t k = 0; k < 2; k++) {
+            const double at = (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
+            out[2 * i + k] = at;
+            for (int64_t axis = 0; axis < 2; axis++) {
+                const double side = (h[3 * k + axis] - h[6 + axis] * at) * per_depth;
+                out[2 * ((1 + axis) * count + i) + k] = side;
+                out[2 * ((3 + axis) * count + i) + k] = -2.0 * h[6 + axis] * per_depth * side;
+            }
+        }
+    }
+}
+
 double fit_perspective(const double *places, const double *pixels, int64_t count, double *out)
 {
     double from[2], to[2], from_size, to_size, A[ENTRIES][ENTRIES] = {{0.0}}, own[ENTRIES];

@@ -27,6 +27,20 @@ def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, flo
     return out, float(kernels().fit_perspective(*known, len(places), out))
 
 
+def projected(homography: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return where a homography (3, 3) takes `places` (M, 2), and the first and second derivatives along x and along y,
+    (M, 2, 2)."""
+    out = np.empty((5, len(places), 2))
+    places, homography = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(homography, np.float64)
+    kernels().project_places(places, len(places), homography, out)
+    return _parted(out)
+
+
+def _parted(out: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return values (M, 2) and derivatives (M, 2, 2) of what kernels write, (5, M, 2)."""
+    return out[0], out[1:3].transpose(1, 0, 2), out[3:].transpose(1, 0, 2)
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Polynomials:
     """Polynomials of every degree through N points, in T terms x^i y^j of places in units of `size` from `middle`.
@@ -80,7 +94,7 @@ class Polynomials:
         along y, (M, 2, 2)."""
         out = np.empty((5, len(wanted), 2))
         kernels().polynomial_at(*self._asked(wanted), self.best, self.triangle, self.told, out)
-        return out[0], out[1:3].transpose(1, 0, 2), out[3:].transpose(1, 0, 2)
+        return _parted(out)
 
     def surest(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the values at `wanted` (M, 2), each by the degree that is surest there, and their gain (M,): the

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
@@ -81,7 +81,7 @@ class BoardState:
 
     @property
     def usual_sigma(self) -> float:
-        return float(np.nanmedian(self.sigma_px[self.known]))
+        return known_median(self.sigma_px[self.known])
 
     def usual_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return contrast and residual that are usual around each of the `cells` (R, C), (M,) each: light, blur and the

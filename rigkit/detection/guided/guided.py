@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
@@ -175,7 +175,7 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
     known = state.known & np.isfinite(state.sigma_px)
     shape = fit_cells(state.pixels, known)
     bends = line_bends_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
-    blur = float(np.nanmedian(state.blur))
+    blur = known_median(state.blur)
     fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, bends)
     return state.with_fit(
         known,
@@ -189,7 +189,7 @@ def _known_factor(found: BoardDetection, state: BoardState) -> float:
 
     `state` : the same corners, placed as the detector has placed them: alone or together.
     """
-    return float(np.nanmedian(found.sigma_px / state.sigma_px[found.grid[:, 1], found.grid[:, 0]]))
+    return known_median(found.sigma_px / state.sigma_px[found.grid[:, 1], found.grid[:, 0]])
 
 
 def _scatter(guide: Guide, state: BoardState) -> float:
@@ -244,7 +244,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     cells[missing] = usable
     shape = _of(shape, usable)
     side = side[usable]
-    blur = float(np.nanmedian(state.blur))
+    blur = known_median(state.blur)
     signs = state.signs[cells]
     wide = np.maximum(blur, WIDE_BLUR_CELLS * side)
     rough = fit_corners(image, guide.board, cells, shape, shape.pixels, signs, wide)
@@ -286,7 +286,7 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     cells[cells] = seen
     if not seen.any():
         return state
-    blur = float(np.nanmedian(state.blur))
+    blur = known_median(state.blur)
     fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
     fit = with_uneven(fit, shape.sides[seen], RADIUS_PX, marked=isinstance(guide.board.pattern, Charuco))
     return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, BoardState, Guide
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
@@ -102,6 +102,7 @@ class _Fitter:
         right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
         left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
         self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
+        self.signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
         self._mapped: tuple[BoardState, SmoothMap] | None = None
         self._fitted: tuple[BoardState, EdgeFit, FloatArray] | None = None
 
@@ -130,7 +131,6 @@ class _Fitter:
         heights, steps = surface.heights(), self.steps[cells]
         gaps = steps * heights[:, :, None]
         pattern, side = self.tags.pattern, self.tags.codes.modules
-        signs = np.where(self._odd(cells), 1.0, -1.0)
         single = contrast = None
         if not pattern.corner_squares:
             gaps = np.full(gaps.shape, NOTHING_NEAR_PX)
@@ -141,8 +141,7 @@ class _Fitter:
             ink, paper = start + 0.5 * pattern.border / side * inwards, start - 0.25 * pattern.spacing * inwards
             contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), LEAST_CONTRAST)
         border = pattern.border / side * heights.min(axis=1)
-        wide = np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),))
-        narrow = np.minimum(wide, (border - MARKER_BLURS * wide - NEAR_PX) / NEAR_SIGMAS)
+        narrow = np.minimum(blur, (border - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
         geometry = Geometry(
             surface.sides,
             surface.curvature(),
@@ -156,18 +155,14 @@ class _Fitter:
             self.image,
             start,
             geometry,
-            signs,
-            np.clip(narrow, *BLUR_RANGE),
+            self.signs[cells],
+            np.minimum(np.maximum(narrow, BLUR_RANGE[0]), BLUR_RANGE[1]),
             radius_px=radius_px,
             iterations=iterations,
             converged_px=converged_px,
             mirrored=mirrored and pattern.corner_squares,
             contrast=contrast,
         )
-
-    def _odd(self, cells: BoolArray) -> BoolArray:
-        row, column = np.nonzero(cells)
-        return np.asarray((row + column) % 2 == 1)
 
     def first(self, pixels: FloatArray) -> BoardState:
         """Return the rough corners fitted quickly, those that failed left out."""
@@ -195,7 +190,7 @@ class _Fitter:
         seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
         cells = cells.copy()
         cells[cells] = seen
-        blur = float(np.nanmedian(state.blur))
+        blur = known_median(state.blur)
         fit = self.fit(cells, surface.of(seen), state.pixels[cells], blur, LAST_PASS)
         good = fit.valid & (fit.contrast > 0.0)
         self._fitted = state.without(cells).with_fit(cells, fit, good), fit, surface.of(seen).sides
@@ -217,12 +212,12 @@ class _Fitter:
         cells[missing] = usable
         surface = surface.of(usable)
         gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
-        blur = float(np.nanmedian(state.blur))
+        blur = known_median(state.blur)
         rough = self.fit(cells, surface, surface.pixels, np.maximum(blur, WIDE_BLUR * gap), LAST_PASS)
         start = np.where(rough.valid[:, None], rough.pixels, surface.pixels)
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
         moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
-        contrast, residual = float(np.nanmedian(state.contrast)), float(np.nanmedian(state.residual))
+        contrast, residual = known_median(state.contrast), known_median(state.residual)
         good = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
         good &= (fit.contrast > MIN_ADDED_CONTRAST * contrast) & (fit.sigma_px < MAX_SIGMA_CELLS * gap)
         good &= fit.residual < MAX_ADDED_RESIDUAL_MARKED * residual * np.maximum(1.0, fit.contrast / contrast)
@@ -236,8 +231,8 @@ class _Fitter:
                 return state
             surface = self.map_of(state).left_out()
             off = np.nan_to_num(np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)) / surface.gain
-            usual = max(float(np.median(off)), SCATTER_FLOOR_PX)
-            usual_sigma = float(np.median(state.sigma_px[cells]))
+            usual = max(known_median(off), SCATTER_FLOOR_PX)
+            usual_sigma = known_median(state.sigma_px[cells])
             sigma = np.minimum(state.sigma_px[cells], 3.0 * usual_sigma)
             gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
             allowed = np.maximum(TAG_OUTLIER * np.hypot(usual, sigma), DISPLACED_CELLS * gap)
@@ -262,12 +257,15 @@ class _Fitter:
             good = fit.valid & (fit.contrast > 0.0)
             factor = float(sigma_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0])
         for rules in WHOLE_ROUNDS:
-            state = with_whole_tags(self.image, self.tags, self.places, state, self.map_of(state), rules)
+            whole = with_whole_tags(self.image, self.tags, self.places, state, self.map_of(state), rules)
+            if whole is state:
+                break
+            state = whole
         cells = state.known
         if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
             foretold = self.map_of(state).left_out()
             off = np.linalg.norm(state.pixels[cells] - foretold.pixels, axis=1)
             expected = factor * state.sigma_px[cells] * np.hypot(1.0, foretold.gain)
-            scatter = float(np.nanmedian(off / expected)) / MEDIAN_OF_RAYLEIGH
+            scatter = known_median(off / expected) / MEDIAN_OF_RAYLEIGH
             factor *= scatter if scatter > UNEXPLAINED else 1.0
         return state, factor

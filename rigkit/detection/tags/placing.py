@@ -110,6 +110,11 @@ def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntA
     # A tag that stands upright in the lattice turned back stands on the board.
     back = -turns % 4
     turned = np.array([grid_turned(cells, (columns - 1, rows - 1), k) for k in range(4)])[back, np.arange(len(cells))]
-    seats, votes = np.unique(np.column_stack([back, places - turned]), axis=0, return_counts=True)
+    shift = places - turned
+    # Numbered, which np.unique sorts in a tenth of the time of rows.
+    low = shift.min(axis=0)
+    width, height = np.ptp(shift, axis=0) + 1
+    seats = (back * width + shift[:, 0] - low[0]) * height + shift[:, 1] - low[1]
+    _, first, votes = np.unique(seats, return_index=True, return_counts=True)
     most = int(votes.argmax())
-    return int(votes[most]), int(seats[most, 0]), seats[most, 1:]
+    return int(votes[most]), int(back[first[most]]), shift[first[most]]

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.surface import Polynomials, perspective
+from rigkit.kernels.surface import Polynomials, perspective, projected
 
 MAX_LEVERAGE = 0.99
 """A point that a term is there for alone is foretold by nothing."""
@@ -56,13 +56,15 @@ class TagSurface:
 
     def curvature(self) -> FloatArray:
         """Return the curvature of the lines along x and along y, (M, 2) 1/px, positive towards +90 degrees."""
-        (a, b), (c, d) = self.sides.transpose(2, 1, 0), self.bends.transpose(2, 1, 0)
-        return np.asarray((a * d - b * c).T / np.maximum((self.sides**2).sum(axis=2), 1e-12) ** 1.5)
+        a, b, c, d = self.sides[..., 0], self.sides[..., 1], self.bends[..., 0], self.bends[..., 1]
+        squared = np.maximum(a * a + b * b, 1e-12)
+        return np.asarray((a * d - b * c) / (squared * np.sqrt(squared)))
 
     def heights(self) -> FloatArray:
         """Return how far a unit of the board lies from the line along x, and from that along y, (M, 2) px."""
-        area = np.abs(self.sides[:, 0, 0] * self.sides[:, 1, 1] - self.sides[:, 0, 1] * self.sides[:, 1, 0])
-        return np.asarray(area[:, None] / np.maximum(np.linalg.norm(self.sides, axis=2), 1e-9))
+        x, y = self.sides[..., 0], self.sides[..., 1]
+        area = np.abs(x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])
+        return np.asarray(area[:, None] / np.maximum(np.sqrt(x * x + y * y), 1e-9))
 
     def of(self, which: BoolArray) -> TagSurface:
         """Return the places `which` (M,)."""
@@ -92,17 +94,20 @@ class SmoothMap:
 
     def at(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), NaN where the base has none."""
-        values, along, along2 = self._polynomial.at(wanted)
-        left = TagSurface(values, along, along2, np.zeros(len(wanted)))
-        if self._base is None:
-            return left
-        flat = self._base(wanted)
-        return TagSurface(flat.pixels + left.pixels, flat.sides + left.sides, flat.bends + left.bends, left.gain)
+        return self._over_base(wanted, None, np.zeros(len(wanted)))
 
     def beyond(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), which may lie outside the points."""
-        here, (left, gain) = self.at(wanted), self._polynomial.surest(wanted)
-        return replace(here, pixels=left if self._base is None else self._base(wanted).pixels + left, gain=gain)
+        return self._over_base(wanted, *self._polynomial.surest(wanted))
+
+    def _over_base(self, wanted: FloatArray, surest: FloatArray | None, gain: FloatArray) -> TagSurface:
+        """Return the map at `wanted` (M, 2); what the base leaves there is `surest` (M, 2), where that is known."""
+        values, sides, bends = self._polynomial.at(wanted)
+        left = values if surest is None else surest
+        if self._base is None:
+            return TagSurface(left, sides, bends, gain)
+        flat = self._base(wanted)
+        return TagSurface(flat.pixels + left, flat.sides + sides, flat.bends + bends, gain)
 
     def left_out(self) -> TagSurface:
         """Return the map at the places themselves, the pixels foretold by the other points."""
@@ -163,13 +168,7 @@ def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray
 
 def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     """Return the map of a homography at places (M, 2)."""
-    image = places @ homography[:, :2].T + homography[:, 2]
-    depth = image[:, 2:]
-    pixels = image[:, :2] / depth
-    slope, turn = homography[:2, :2].T, homography[2, :2]
-    sides = (slope - turn[:, None] * pixels[:, None]) / depth[:, None]
-    bends = -2.0 * turn[:, None] * sides / depth[:, None]
-    return TagSurface(pixels, sides, bends, np.zeros(len(places)))
+    return TagSurface(*projected(homography, places), np.zeros(len(places)))
 
 
 def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:

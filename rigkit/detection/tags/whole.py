@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.guided.board_guide import BoardState
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.saddles.response import GreyImage
@@ -92,7 +92,7 @@ def with_whole_tags(
     longer = np.maximum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
     height = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0]) / longer
     # What single corners have for blur is not to be relied on where the code is in their windows.
-    blur = float(np.nanmedian(state.blur)) if len(row) else np.nan
+    blur = known_median(state.blur) if len(row) else np.nan
     narrow = tags.pattern.border / tags.codes.modules * height < NARROW_BLURS * blur
     if not narrow.any():
         return state
@@ -125,7 +125,7 @@ def _scatter(state: BoardState, smooth: SmoothMap) -> float:
     """
     foretold = smooth.left_out()
     off = np.linalg.norm(state.pixels[state.known] - foretold.pixels, axis=1)
-    return float(np.nanmedian(off / np.hypot(1.0, foretold.gain))) / MEDIAN_OF_RAYLEIGH
+    return known_median(off / np.hypot(1.0, foretold.gain)) / MEDIAN_OF_RAYLEIGH
 
 
 def _four(known: BoolArray) -> BoolArray:
