@@ -25,17 +25,19 @@ static int make_sums(const plane_grid_t *g, sums_t *out)
         if (!isfinite(z[0]))
             continue;
         double *at = out->terms + (k / g->columns + g->reach) * out->columns + k % g->columns + g->reach;
-        double WF[3][3], Wz[3], c = 0.0;
+        double Wz[3], c = 0.0;
         for (int64_t i = 0; i < 3; i++) {
             Wz[i] = W[3 * i] * z[0] + W[3 * i + 1] * z[1] + W[3 * i + 2] * z[2];
             c += z[i] * Wz[i];
-            for (int64_t j = 0; j < 3; j++)
-                WF[i][j] = W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
         }
-        for (int64_t i = 0, next = 0; i < 3; i++) {
-            for (int64_t j = i; j < 3; j++, next++)
-                at[(TERM_N + next) * out->size] = F[i] * WF[0][j] + F[3 + i] * WF[1][j] + F[6 + i] * WF[2][j];
-            at[(TERM_B + i) * out->size] = F[i] * Wz[0] + F[3 + i] * Wz[1] + F[6 + i] * Wz[2];
+        for (int64_t j = 0; j < 3; j++) {
+            /* Column j of W F, and that of the upper triangle of F'W F. */
+            double Wf[3];
+            for (int64_t i = 0; i < 3; i++)
+                Wf[i] = W[3 * i] * F[j] + W[3 * i + 1] * F[3 + j] + W[3 * i + 2] * F[6 + j];
+            for (int64_t i = 0; i <= j; i++)
+                at[(TERM_N + i * (5 - i) / 2 + j) * out->size] = F[i] * Wf[0] + F[3 + i] * Wf[1] + F[6 + i] * Wf[2];
+            at[(TERM_B + j) * out->size] = F[j] * Wz[0] + F[3 + j] * Wz[1] + F[6 + j] * Wz[2];
         }
         at[TERM_C * out->size] = c;
         at[TERM_SEEN * out->size] = 1.0;
