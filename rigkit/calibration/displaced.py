@@ -23,7 +23,7 @@ from rigkit.calibration.uncertainty import Along, FarProjection
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray, Rays
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import InputError
 from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
 

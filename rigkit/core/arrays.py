@@ -215,8 +215,8 @@ def quantiles_of(values: FloatArray, shares: Sequence[float]) -> list[float]:
 
 
 def symmetric_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
-    """Return the pseudo-inverse of one symmetric matrix (n, n), without eigenvalues of less than `rcond` of the largest.
-    Of a small one np.linalg.pinv takes six times as long."""
+    """Return the pseudo-inverse of one symmetric matrix (n, n), in which eigenvalues of up to `rcond` of the largest
+    count as zero. Of a small one np.linalg.pinv takes six times as long."""
     values, vectors = np.linalg.eigh(matrix)
     size = np.abs(values)
     known = size > rcond * size.max(initial=0.0)

@@ -74,7 +74,8 @@ def call({", ".join(self.names)}):
         scope: dict[str, Any] = dict(NAMES_IN_SIZES)
         scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}
         scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_checked": self._checked}
-        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer, "_empty": ctypes.addressof(EMPTY)}
+        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer}
+        scope |= {"_empty": ctypes.addressof(EMPTY)}
         exec(compile(code, f"api.h: {self.owner}", "exec"), scope)
         return cast("Callable[..., Any]", scope["call"])
 

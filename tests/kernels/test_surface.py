@@ -10,7 +10,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies
 from rigkit.detection.tags.surface import MAX_LEVERAGE, SmoothMap
-from rigkit.kernels.surface import TERMS_OF_DEGREE, Polynomials, perspective, read_modules
+from rigkit.kernels.surface import TERMS_OF_DEGREE, Polynomials, perspective, projected, read_modules
 
 SAME = 1e-7
 """px: two ways to solve for 45 powers of numbers up to 1 agree so well."""
@@ -34,6 +34,18 @@ def test_perspective(rng: np.random.Generator) -> None:
     matrix, nearest = perspective(places, pixels)
     np.testing.assert_allclose(matrix, reference.perspective(places, pixels), rtol=1e-6, atol=1e-9)
     assert nearest == pytest.approx((places @ matrix[2, :2] + matrix[2, 2]).min())
+
+
+def test_derivatives_of_a_perspective(rng: np.random.Generator) -> None:
+    places, pixels = seen(rng, bend=0.0)
+    matrix, _ = perspective(places, pixels)
+    here, sides, bends = projected(matrix, places)
+    image = np.column_stack([places, np.ones(len(places))]) @ matrix.T
+    np.testing.assert_allclose(here, image[:, :2] / image[:, 2:], rtol=1e-12)
+    for k, step in enumerate(1e-3 * np.eye(2)):
+        after, before = projected(matrix, places + step), projected(matrix, places - step)
+        np.testing.assert_allclose(sides[:, k], (after[0] - before[0]) / 2e-3, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(bends[:, k], (after[1][:, k] - before[1][:, k]) / 2e-3, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.1, 0.6])

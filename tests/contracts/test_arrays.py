@@ -1,0 +1,30 @@
+"""Short ways to what numpy takes longer for, to ask what is known here: they agree with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.core.arrays import known_median, median_of, quantiles_of, symmetric_pinv
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_medians_and_quantiles(count: int, rng: np.random.Generator) -> None:
+    values = rng.normal(size=count)
+    shares = [0.0, 0.05, 0.5, 0.9, 1.0]
+    assert quantiles_of(values, shares) == pytest.approx(np.quantile(values, shares), rel=1e-12)
+    assert median_of(values.copy()) == np.median(values)
+    values[:: count + 3] = np.nan
+    board = np.concatenate([values, rng.normal(size=3)]).reshape(-1, 1)
+    assert known_median(board) == np.nanmedian(board)
+
+
+def test_no_known_number_has_no_median() -> None:
+    assert np.isnan(known_median(np.full((2, 3), np.nan)))
+
+
+@pytest.mark.parametrize("rank", [0, 2, 5])
+def test_pseudo_inverse_of_a_symmetric_matrix(rank: int, rng: np.random.Generator) -> None:
+    root = rng.normal(size=(5, rank))
+    matrix = root @ root.T
+    assert symmetric_pinv(matrix, 1e-12) == pytest.approx(np.linalg.pinv(matrix, 1e-12, hermitian=True), rel=1e-9)
