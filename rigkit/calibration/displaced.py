@@ -7,6 +7,10 @@ from its model (`departures`) along with them: a camera whose image is moved by
 
 with b_j the displacements and E (J, M) a few modes of one standard deviation each, has the amounts c, all zero, as
 parameters after those of its model. The model's parameters follow each mode as the images make them.
+
+Which way such a lens looks only its model says: a lens that is not round has no axis. The frame of the camera is that in
+which the model, as it was calibrated, is nearest to the lens where boards were, so that a camera alone turns with each
+mode by what hides it there best. In a rig the mounts follow instead.
 """
 
 from __future__ import annotations
@@ -23,8 +27,9 @@ from rigkit.calibration.uncertainty import Along, FarProjection
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.core.errors import InputError
+from rigkit.geometry.rotation import exp_so3, left_jacobian, skew
 from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
 
 MODES_GRID = (24, 18)
@@ -42,26 +47,32 @@ MAX_ROUNDS, ROUNDING_PX = 20, 1e-10
 @dataclass(frozen=True, eq=False, slots=True)
 class DisplacedCamera(Camera):
     """A camera whose image is moved by amounts of the modes (J, M), px, of displacements; `parameters` are those of
-    its `lens` and the amounts. Beyond the corners of the image displacements stay as they are there."""
+    its `lens` and the amounts. Beyond the corners of the image displacements stay as they are there. With the modes the
+    rays turn by `turns` (3, M), rad, before the lens sees them; None: they do not."""
 
     lens: Camera
     modes: FloatArray
+    turns: FloatArray | None = None
     _own: Camera = field(init=False, repr=False)
     _amounts: FloatArray = field(init=False, repr=False)
+    _turned: Mat3 | None = field(init=False, repr=False)
 
     model: ClassVar[str] = "displaced"
 
     def _prepare(self) -> None:
         count = self.lens.parameters.size
         object.__setattr__(self, "_own", self.lens.with_parameters(self.parameters[:count]))
-        object.__setattr__(self, "_amounts", self.modes @ self.parameters[count:])
+        amounts = self.parameters[count:]
+        object.__setattr__(self, "_amounts", self.modes @ amounts)
+        turned = None if self.turns is None or not amounts.any() else exp_so3(self.turns @ amounts)
+        object.__setattr__(self, "_turned", turned)
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         raise InputError("a displaced camera is one that was calibrated; a radial curve starts its lens alone")
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64), self.lens, self.modes)
+        return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64), self.lens, self.modes, self.turns)
 
     def parameter_names(self) -> tuple[str, ...]:
         return (*self.lens.parameter_names(), *(f"departure {m + 1}" for m in range(self.modes.shape[1])))
@@ -82,8 +93,15 @@ class DisplacedCamera(Camera):
             return np.zeros((2, len(u)))
         return displacement(u, v, self._amounts, self.size_px)
 
+    def _turn(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return points as the lens sees them."""
+        if self._turned is None:
+            return x, y, z
+        x, y, z = self._turned @ np.stack([x, y, z])
+        return x, y, z
+
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        u, v, valid = self._own._project(x, y, z)
+        u, v, valid = self._own._project(*self._turn(x, y, z))
         du, dv = self._displacement(u, v)
         return u + du, v + dv, valid
 
@@ -93,7 +111,10 @@ class DisplacedCamera(Camera):
             before, off = off, self._displacement(u - off[0], v - off[1])
             if not np.nanmax(np.abs(off - before), initial=0.0) > ROUNDING_PX:
                 break
-        return self._own._unproject(u - off[0], v - off[1])
+        x, y, z, valid = self._own._unproject(u - off[0], v - off[1])
+        if self._turned is not None:
+            x, y, z = self._turned.T @ np.stack([x, y, z])
+        return x, y, z, valid
 
     def _derivatives(
         self,
@@ -105,18 +126,27 @@ class DisplacedCamera(Camera):
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         count = self.lens.parameters.size
         of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :count]
+        x, y, z = self._turn(x, y, z)
         u, v, valid = self._own._derivatives(x, y, z, d_pixels_d_point, of_lens)
-        if d_pixels_d_parameters is not None:
-            d_pixels_d_parameters[:, count:] = np.swapaxes(np.swapaxes(self._basis(u, v), 1, 2) @ self.modes, 1, 2)
-        if not self._amounts.any():
-            return u, v, valid
-        along_u, along_v = (
-            (self._displacement(u + s, v + t) - self._displacement(u - s, v - t)) / (2.0 * SLOPE_STEP_PX)
-            for s, t in ((SLOPE_STEP_PX, 0.0), (0.0, SLOPE_STEP_PX))
-        )
-        for block in (d_pixels_d_point, of_lens):
-            if block is not None:
-                block += along_u[:, None] * block[0] + along_v[:, None] * block[1]
+        of_amounts = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, count:]
+        if of_amounts is not None:
+            of_amounts[:] = 0.0
+            if self.turns is not None:
+                by_turn = d_pixels_d_point.transpose(2, 0, 1) @ -skew(np.stack([x, y, z], axis=-1))
+                by_amount = left_jacobian(self.turns @ self.parameters[count:]) @ self.turns
+                of_amounts[:] = (by_turn @ by_amount).transpose(1, 2, 0)
+        if self._turned is not None:
+            d_pixels_d_point[:] = self._turned.T @ d_pixels_d_point
+        if self._amounts.any():
+            along_u, along_v = (
+                (self._displacement(u + s, v + t) - self._displacement(u - s, v - t)) / (2.0 * SLOPE_STEP_PX)
+                for s, t in ((SLOPE_STEP_PX, 0.0), (0.0, SLOPE_STEP_PX))
+            )
+            for block in (d_pixels_d_point, d_pixels_d_parameters):
+                if block is not None:
+                    block += along_u[:, None] * block[0] + along_v[:, None] * block[1]
+        if of_amounts is not None:
+            of_amounts += np.swapaxes(np.swapaxes(self._basis(u, v), 1, 2) @ self.modes, 1, 2)
         du, dv = self._displacement(u, v)
         return u + du, v + dv, valid
 
@@ -129,10 +159,12 @@ def lens_of(camera: Camera) -> Camera:
 @dataclass(frozen=True, eq=False, slots=True)
 class LensModes:
     """What a lens may do beyond its model: modes (J, M) of displacements, px, of one standard deviation each,
-    independent of each other, and how much all that was solved for (G, M) is off where a mode is there."""
+    independent of each other, how much all that was solved for (G, M) is off where a mode is there, and how the rays of
+    a camera alone turn with it (3, M), rad; None: they do not."""
 
     modes: FloatArray
     moves: FloatArray
+    turns: FloatArray | None = None
 
 
 def uncertain_camera(calibration: Calibration, *, quoted: bool = True) -> UncertainCamera:
@@ -151,7 +183,7 @@ def lens_modes(calibration: Calibration) -> LensModes:
     """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it."""
     far = FarProjection.of(calibration)
     modes = telling_modes(far)
-    return LensModes(modes, -far.departures.followed @ modes)
+    return LensModes(modes, -far.departures.followed @ modes, -far.hides_departures @ modes)
 
 
 def with_modes(
@@ -170,7 +202,7 @@ def with_modes(
         amounts.append(np.arange(end + camera.parameters.size, end + camera.parameters.size + count))
         end = int(known[-1][-1]) + 1 + count
         parameters = np.append(camera.parameters, np.zeros(count))
-        out.append(DisplacedCamera(camera.size_px, parameters, camera, own.modes) if count else camera)
+        out.append(DisplacedCamera(camera.size_px, parameters, camera, own.modes, own.turns) if count else camera)
     known.append(np.arange(end, end + len(covariance) - sum(len(own) for own in known)))
     at = np.concatenate(known)
     size = len(at) + sum(len(own) for own in amounts)

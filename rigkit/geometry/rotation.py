@@ -35,6 +35,16 @@ def exp_so3(rotation_vector: ArrayLike) -> Mat3:
     return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
+def left_jacobian(rotation_vector: ArrayLike) -> Mat3:
+    """Return the matrix J (3, 3) with exp(w + dw) = exp(J dw) exp(w) at first order, of a rotation vector w (3,)."""
+    w = np.asarray(rotation_vector, dtype=np.float64)
+    angle, k = float(np.linalg.norm(w)), skew(w)
+    second = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
+    # (a - sin a) / a^3 loses its digits at small angles, where the series has them all.
+    third = (angle - np.sin(angle)) / angle**3 if angle > 0.1 else (1.0 - angle**2 / 20.0 + angle**4 / 840.0) / 6.0
+    return np.asarray(np.eye(3) + second * k + third * (k @ k))
+
+
 def log_so3(rotation: Mat3) -> FloatArray:
     """Return the rotation vector (radians, norm in [0, pi]) of `rotation` (..., 3, 3)."""
     r = np.asarray(rotation, dtype=np.float64)
