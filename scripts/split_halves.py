@@ -4,8 +4,9 @@ The images of every set are split at random into halves. Two calibrations of one
 the rotation that none of them knows and where both had boards, by what they say that they may: the ratio of the
 observed difference and the predicted one is 1 over many splits. Splits of few images are nearly one and the same, and a
 difference is mostly of one kind, so that this ratio scatters by itself: beside it stands where 95 % of such ratios lie
-if the sigmas are true (the errors of all images drawn anew, the splits the same). And a test that never alarms is
-worthless: other cameras, and slightly moved lenses, must be found.
+if the sigmas are true (the errors of all images drawn anew, the splits the same). More splits narrow that little: what
+all sets say together is the last line. And a test that never alarms is worthless: other cameras, and slightly moved
+lenses, must be found.
 
     python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
         [--model MODEL]
@@ -102,6 +103,7 @@ OTHERS = [
 """Different cameras with images of one size."""
 
 
+WITHIN_95 = 1.96
 DRAWS = 4000
 """Sessions drawn anew, for the scatter of a ratio."""
 ASKED_IMAGES, POWER_DRAWS = 20, 20
@@ -294,6 +296,38 @@ def drawn_power(whole: Calibration, move: Callable[[np.ndarray], np.ndarray], im
     return found
 
 
+def summary(name: str, found: list[CalibrationComparison], args: argparse.Namespace) -> tuple[float, float] | None:
+    """Print what the splits of a set come to. Return the logarithm of their mean ratio over what it is by the median
+    where sigmas are true, and the standard deviation that it has there; None of rendered images, and of small parts."""
+    ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
+    other = sum(c.verdict is CameraVerdict.OTHER for c in found)
+    views, size = load(name, args.data, args.cache)
+    likely, off = "", None
+    if args.images is None:
+        low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
+        likely = f" (if sigmas are true {usual:.2f}, 95 % from {low:.2f} to {high:.2f})"
+        if not CAPTURES[name].rendered:
+            off = float(np.log(ratio / usual)), float(np.log(high / low)) / (2.0 * WITHIN_95)
+    print(
+        f"{name} ({len(views)} images): geometric mean ratio {ratio:.2f}{likely}; another camera in {other} of "
+        f"{len(found)}",
+        flush=True,
+    )
+    return off
+
+
+def print_of_all(off: list[tuple[float, float]]) -> None:
+    """Print what all REAL sets together say: one set's ratio scatters from a half to twice by itself."""
+    log, sigma = np.array(off).T
+    weight = sigma**-2 / (sigma**-2).sum()
+    mean, error = float(weight @ log), float((sigma**-2).sum() ** -0.5)
+    outside = int((abs(log) > WITHIN_95 * sigma).sum())
+    print(
+        f"{len(log)} real sets: ratio {np.exp(mean):.2f} of what is usual (x or / {np.exp(error):.2f}); each is "
+        f"{np.sqrt(np.mean((log / sigma) ** 2)):.2f} of its own sigmas off (rms), {outside} outside of their 95 %"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sets", nargs="*", metavar="SET", help=f"of {', '.join(CAPTURES)}; default all")
@@ -316,20 +350,9 @@ def main() -> None:
     for a, b in pairs:
         first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))
         print(in_words(f"{a} against {b}", compare_calibrations(first, second)))
-    for name, found in everything.items():
-        if found:
-            ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
-            other = sum(c.verdict is CameraVerdict.OTHER for c in found)
-            views, size = load(name, args.data, args.cache)
-            likely = ""
-            if args.images is None:
-                low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
-                likely = f" (if sigmas are true {usual:.2f}, 95 % from {low:.2f} to {high:.2f})"
-            print(
-                f"{name} ({len(views)} images): geometric mean ratio {ratio:.2f}{likely}; another camera in {other} of "
-                f"{len(found)}",
-                flush=True,
-            )
+    off = [summary(name, found, args) for name, found in everything.items() if found]
+    if args.images is None and len(off) > 1:
+        print_of_all([one for one in off if one is not None])
 
 
 if __name__ == "__main__":

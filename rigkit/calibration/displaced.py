@@ -8,9 +8,9 @@ from its model (`departures`) along with them: a camera whose image is moved by
 with b_j the displacements and E (J, M) a few modes of one standard deviation each, has the amounts c, all zero, as
 parameters after those of its model. The model's parameters follow each mode as the images make them.
 
-Which way such a lens looks only its model says: a lens that is not round has no axis. The frame of the camera is that in
-which the model, as it was calibrated, is nearest to the lens where boards were, so that a camera alone turns with each
-mode by what hides it there best. In a rig the mounts follow instead.
+Which way such a lens looks only its model says: a lens that is not round has no axis. The frame of the camera is that
+in which the model, as it was calibrated, is nearest to the lens where boards were, so that a camera alone turns with
+each mode by what hides it there best. In a rig the mounts follow instead.
 """
 
 from __future__ import annotations

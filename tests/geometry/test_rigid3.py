@@ -7,7 +7,15 @@ from tolerances import ROUNDING
 
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
-from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, nearest_rotation, rotation_angle, skew
+from rigkit.geometry.rotation import (
+    angle_between,
+    exp_so3,
+    left_jacobian,
+    log_so3,
+    nearest_rotation,
+    rotation_angle,
+    skew,
+)
 
 POLE_TOL = 1e-7
 """Near pi the logarithm recovers the axis from a symmetric matrix: half the digits."""
@@ -23,6 +31,13 @@ def test_exp_and_log_agree_with_scipy(rng: np.random.Generator) -> None:
     assert np.abs(rotations - Rotation.from_rotvec(vectors).as_matrix()).max() < ROUNDING
     assert np.abs(log_so3(rotations) - vectors).max() < ROUNDING
     assert np.abs(rotation_angle(rotations) - np.linalg.norm(vectors, axis=1)).max() < ROUNDING
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.05, 0.1001, 2.0])
+def test_a_changed_rotation_vector_turns_by_the_left_jacobian(angle: float) -> None:
+    vector, step = angle * np.array([2.0, -1.0, 2.0]) / 3.0, 1e-5 * np.array([1.0, 2.0, -1.0])
+    turn = 0.5 * log_so3(exp_so3(vector + step) @ exp_so3(vector - step).T)
+    assert turn == pytest.approx(left_jacobian(vector) @ step, abs=1e-13)
 
 
 def test_log_near_and_at_pi(rng: np.random.Generator) -> None:

@@ -1,0 +1,1 @@
+"""The lenses of `measure_certificates.py`."""
