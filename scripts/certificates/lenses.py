@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigkit.calibration.displaced import DisplacedCamera
 from rigkit.cameras.base import Camera, RadialCurve
@@ -43,8 +44,8 @@ class RoundLens(FocalCamera):
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         raise NotImplementedError("a lens that is looked through, not fitted")
 
-    def with_parameters(self, parameters: FloatArray) -> Self:
-        return type(self)(self.size_px, np.asarray(parameters), self.kind)
+    def with_parameters(self, parameters: ArrayLike) -> Self:
+        return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64), self.kind)
 
     def parameter_names(self) -> tuple[str, ...]:
         return "fx", "fy", "cx", "cy"
