@@ -19,6 +19,9 @@ from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
 RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 
+LEAST_NOISE = 1e-9
+"""Of a fit that failed there is none."""
+
 MARKER_BLURS = 2.0
 """The edges of a ChArUco board's markers reach so many s towards the corners."""
 
@@ -32,12 +35,14 @@ def fit_corners(
     signs: FloatArray,
     blur: FloatArray | float,
     bends: tuple[FloatArray, FloatArray] | None = None,
+    *,
+    paper: bool = True,
 ) -> EdgeFit:
     """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
 
     `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `bends` is the curvature of the lines and how well it is
     known, (M, 2) each, where corners' sigmas tell more of it than `shape`. Windows end before the markers of a ChArUco
-    board.
+    board. `paper` : read what lies beyond the board.
     """
     curvature, loose = bends or (shape.curvature(), np.zeros((len(start), 2)))
     every = Geometry(shape.sides, curvature, shape.gaps(), ends_of(np.ones_like(cells), cells))
@@ -52,11 +57,11 @@ def fit_corners(
         )
 
     fit = fitted(slice(None), every)
-    if isinstance(board.pattern, Chessboard):
+    if paper and isinstance(board.pattern, Chessboard):
         fit = fitted_beside_paper(image, every, fit, fitted, signs, np.zeros(len(start), np.int64))
     if isinstance(board.pattern, Charuco):
         # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-        more = fit.residual / fit.noise
+        more = fit.residual / np.maximum(fit.noise, LEAST_NOISE)
         products = fit.products * (more**2)[:, None]
         fit = replace(fit, sigma_px=fit.sigma_px * more, noise=fit.residual, products=products)
     return fit

@@ -22,6 +22,7 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
 from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
 from rigkit.detection.guided.guided import completed
+from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
@@ -58,7 +59,9 @@ class CharucoFinder(Finder):
         found, rest = _charuco_boards(search, lattices, boards)
         finest = pyramid(search.grey)[0] if rest else None
         search.leave([item for item in rest if finest and not has_edge_offset(item.lattice, finest)])
-        return [completed(search.grey, item, boards, search.camera) for item in found]
+        named: dict[str | None, Board] = {board.board_id: board for board in boards}
+        every = [completed(search.grey, item, boards, search.camera) for item in found]
+        return every if search.quick else [relit(search.grey, item, named.get(item.board_id)) for item in every]
 
 
 def _charuco_boards(

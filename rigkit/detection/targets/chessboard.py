@@ -13,6 +13,7 @@ from rigkit.detection.checks.border import place_part
 from rigkit.detection.checks.validate import known_part
 from rigkit.detection.guided.guided import completed
 from rigkit.detection.guided.rejoin import rejoined
+from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.origin import quarter_turns
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -31,7 +32,8 @@ class ChessboardFinder(Finder):
         lattices = [known_part(item, sizes) for item in search.lattices]
         placed = _placed(search.grey, lattices, boards, search.camera)
         found = [_detection(item, sizes) for item in placed]
-        return [completed(search.grey, item, boards, search.camera) for item in found]
+        every = [completed(search.grey, item, boards, search.camera) for item in found]
+        return every if search.quick else [relit(search.grey, item) for item in every]
 
 
 def _placed(

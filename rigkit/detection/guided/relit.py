@@ -1,0 +1,163 @@
+"""The last look at a board: corners beside a shadow's edge are fitted in even light, and those missed are added."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.guided.board_guide import CROSS
+from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners, gap_to_markers
+from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.shadows import beside_shadows, in_even_light, light_steps
+
+MIN_EVEN = 9
+"""Corners in even light that say what is usual on the board."""
+
+NEARBY_CELLS = 3
+"""Corners so near, in cells, say what is usual there."""
+
+MAX_RELIT_GAIN = 3.0
+"""Corners are foretold up to this standard deviation, for corners of standard deviation 1."""
+
+FORETOLD: dict[str, Any] = {"degree": 3, "ridge": (1e-3, 1e-2)}
+"""Polynomials that foretell corners, as without a camera in `board_guide`."""
+
+MIN_FORETELLERS = 6
+"""Corners by which one is foretold."""
+
+MIN_SHADED_CELL_PX = 10.0
+"""In smaller cells there are too few pixels to tell a step of the light from a corner."""
+
+START_BLUR_PX = 1.0
+"""s that the fit of the corners in even light starts from, px."""
+
+MAX_SIGMA_CELLS = 0.03
+"""Largest standard deviation, in sides of the cell."""
+
+MOVED_SIGMAS = 5.0
+"""A corner lies within so many standard deviations of where those in even light have it."""
+
+TIMES_BETTER, MAX_RELIT_RESIDUAL = 1.5, 2.0
+"""In even light a corner leaves so many times less, relative to its contrast, than before, if it was a shadow; and at
+most so many times what is usual on the board."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Usual:
+    """What corners in even light are like: signs (R, C), blur (px), residual relative to the contrast, the factor that
+    the detector, which saw the board as a whole, gave the sigmas of their fits, and how far they lie off where the
+    others have them, px, for predictions of gain 1."""
+
+    signs: FloatArray
+    blur: float
+    relative: float
+    factor: float
+    off_px: float
+
+
+def relit(image: GreyImage, found: BoardDetection, board: Board | None = None) -> BoardDetection:
+    """Return `found` with its corners beside the edge of a shadow placed as if that were not there, and with those that
+    were missed for it.
+
+    `board` : which it is, if it is a ChArUco board.
+    """
+    pixels = found.lattice()
+    known = np.isfinite(pixels[..., 0])
+    suspect = _suspect(image, board, pixels, (cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
+    even = known & ~suspect
+    if not suspect.any() or np.count_nonzero(even) < MIN_EVEN:
+        return found
+    told = board or Board("found", found.columns, found.rows, 1.0, 1.0)
+    usual = _usual(image, told, found, even, suspect)
+    if usual is None:
+        return found
+    shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **FORETOLD)
+    before = fit_corners(image, told, suspect, shape, shape.pixels, usual.signs[suspect], usual.blur)
+    was = before.residual / np.maximum(before.contrast, 1e-6)
+    tried = (shape.support >= MIN_FORETELLERS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * usual.relative)
+    tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
+    if not tried.any():
+        return found
+    suspect[suspect] = tried
+    placed, sigma, good = _in_even_light(image, told, suspect, _of(shape, tried), was[tried], usual)
+    own = np.full(known.shape, np.nan)
+    own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
+    suspect[suspect] = good
+    pixels[suspect], own[suspect] = placed[good], sigma[good]
+    row, column = np.nonzero(np.isfinite(pixels[..., 0]))
+    grid = np.stack([column, row], axis=-1)
+    return replace(found, grid=grid, pixels=pixels[row, column], sigma_px=own[row, column])
+
+
+def _in_even_light(
+    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, was: FloatArray, usual: _Usual
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return pixels (M, 2) and sigmas (M,) of the corners at `cells` of `shape` in even light, and which are good.
+
+    `was` (M,) is the residual in the light as it is, relative to the contrast.
+    """
+    side, signs = np.linalg.norm(shape.sides, axis=2).min(axis=1), usual.signs[cells]
+    aside = _aside(board, shape.sides)
+    steps, seen = light_steps(image, shape.pixels, shape.sides, shape.curvature(), usual.blur, aside)
+    picture, moved = in_even_light(image, steps)
+    start = np.where(np.abs(steps.pixels - shape.pixels) < 1.0, steps.pixels, shape.pixels)
+    fit = fit_corners(picture, board, cells, shape, start + moved, signs, usual.blur, paper=False)
+    pixels, sigma = fit.pixels - moved, np.hypot(usual.factor * fit.sigma_px, steps.sigma_px)
+    relative = fit.residual / np.maximum(fit.contrast, 1e-6)
+    good = seen & fit.valid & (fit.contrast > 0.0) & (sigma < MAX_SIGMA_CELLS * side)
+    allowed = MOVED_SIGMAS * np.hypot(sigma, usual.off_px * np.maximum(shape.gain, 1.0))
+    good &= np.linalg.norm(pixels - shape.pixels, axis=1) < allowed
+    good &= (relative < MAX_RELIT_RESIDUAL * usual.relative) & (was > TIMES_BETTER * relative)
+    return pixels, sigma, np.asarray(good)
+
+
+def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: BoolArray) -> BoolArray:
+    """Return which of the `cells` (R, C) of a board with corners `pixels` (R, C, 2) are lit unevenly."""
+    shape = fit_cells(pixels, cells)
+    ends = np.ones_like(cells)
+    ends[1:-1, 1:-1] = False
+    at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
+    out = cells.copy()
+    out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
+    return out
+
+
+def _aside(board: Board | None, sides: FloatArray) -> FloatArray:
+    """Return how far from the lines of a board its squares are sure to be plain (N,), px."""
+    if board is None or not isinstance(board.pattern, Charuco):
+        return np.full(len(sides), RADIUS_PX)
+    return 0.5 * gap_to_markers(board, sides)
+
+
+def _usual(image: GreyImage, board: Board, found: BoardDetection, even: BoolArray, suspect: BoolArray) -> _Usual | None:
+    """Return what the corners `even` (R, C) near the `suspect` ones are like, None where too few of them are seen."""
+    reach = np.ones((2 * NEARBY_CELLS + 1, 2 * NEARBY_CELLS + 1), np.uint8)
+    near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
+    even = near if np.count_nonzero(near) >= MIN_EVEN else even
+    shape, start = fit_cells(found.lattice(), even), found.lattice()[even]
+    signs = np.where(np.add.outer(*(np.arange(count) for count in even.shape)) % 2 == 1, -1.0, 1.0)
+    fit = fit_corners(image, board, even, shape, start, signs[even], START_BLUR_PX)
+    signs = signs if np.median(fit.contrast) > 0.0 else -signs
+    fit = fit_corners(image, board, even, shape, start, signs[even], float(np.median(fit.blur)))
+    good = fit.valid & (fit.contrast > 0.0)
+    if np.count_nonzero(good) < MIN_EVEN:
+        return None
+    sigma = np.full(even.shape, np.nan)
+    sigma[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
+    factor = float(np.median(sigma[even][good] / fit.sigma_px[good]))
+    ahead = fit_cells(found.lattice(), even, **FORETOLD, leave_out=True)
+    off = np.linalg.norm(start - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
+    relative = upper_median(fit.residual[good] / fit.contrast[good])
+    return _Usual(signs, upper_median(fit.blur[good]), relative, max(factor, 1.0), upper_median(off))
+
+
+def _of(shape: LocalFit, keep: BoolArray) -> LocalFit:
+    return LocalFit(*(getattr(shape, name)[keep] for name in LocalFit.__slots__))
