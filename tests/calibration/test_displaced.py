@@ -100,7 +100,7 @@ def test_what_a_lens_may_do_beyond_its_model_does_not_turn_it() -> None:
     found = departing(0)
     known, p = uncertain_camera(found).camera, found.camera.parameters.size
     assert isinstance(known, DisplacedCamera) and known.turns is not None
-    rays = FarProjection.of(found).rays
+    rays = FarProjection.of(found).corners.rays
     pixels, everywhere = found.camera.project(rays)[0], np.ones(len(rays))
     modes = lens_modes(found)
     for k in range(modes.modes.shape[1]):
