@@ -18,8 +18,11 @@ from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.shadows import beside_shadows, in_even_light, light_steps
 
-MIN_EVEN = 9
-"""Corners in even light that say what is usual on the board."""
+MIN_EVEN, MAX_EVEN = 9, 32
+"""Corners in even light that say what is usual on the board: medians of more would tell hardly more."""
+
+MIN_SHADED = 3
+"""The edge of a shadow that crosses a board passes by several corners; one or two are dirt, or where the board ends."""
 
 NEARBY_CELLS = 3
 """Corners so near, in cells, say what is usual there."""
@@ -71,9 +74,13 @@ def relit(image: GreyImage, found: BoardDetection, board: Board | None = None) -
     """
     pixels = found.lattice()
     known = np.isfinite(pixels[..., 0])
-    suspect = _suspect(image, board, pixels, (cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
+    own = np.full(known.shape, np.nan)
+    own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
+    # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual are beside none.
+    doubtful = ~(own < TIMES_BETTER * upper_median(found.sigma_px))
+    suspect = _suspect(image, board, pixels, doubtful & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known))
     even = known & ~suspect
-    if not suspect.any() or np.count_nonzero(even) < MIN_EVEN:
+    if np.count_nonzero(suspect) < MIN_SHADED or np.count_nonzero(even) < MIN_EVEN:
         return found
     told = board or Board("found", found.columns, found.rows, 1.0, 1.0)
     usual = _usual(image, told, found, even, suspect)
@@ -84,12 +91,10 @@ def relit(image: GreyImage, found: BoardDetection, board: Board | None = None) -
     was = before.residual / np.maximum(before.contrast, 1e-6)
     tried = (shape.support >= MIN_FORETELLERS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * usual.relative)
     tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
-    if not tried.any():
+    if np.count_nonzero(tried) < MIN_SHADED:
         return found
     suspect[suspect] = tried
     placed, sigma, good = _in_even_light(image, told, suspect, _of(shape, tried), was[tried], usual)
-    own = np.full(known.shape, np.nan)
-    own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
     suspect[suspect] = good
     pixels[suspect], own[suspect] = placed[good], sigma[good]
     row, column = np.nonzero(np.isfinite(pixels[..., 0]))
@@ -126,6 +131,8 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
     out = cells.copy()
+    if not cells.any():
+        return out
     out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
     return out
 
@@ -142,6 +149,10 @@ def _usual(image: GreyImage, board: Board, found: BoardDetection, even: BoolArra
     reach = np.ones((2 * NEARBY_CELLS + 1, 2 * NEARBY_CELLS + 1), np.uint8)
     near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
     even = near if np.count_nonzero(near) >= MIN_EVEN else even
+    row, column = np.nonzero(even)
+    every = max(1, len(row) // MAX_EVEN)
+    even = np.zeros_like(even)
+    even[row[::every], column[::every]] = True
     shape, start = fit_cells(found.lattice(), even), found.lattice()[even]
     signs = np.where(np.add.outer(*(np.arange(count) for count in even.shape)) % 2 == 1, -1.0, 1.0)
     fit = fit_corners(image, board, even, shape, start, signs[even], START_BLUR_PX)
