@@ -242,7 +242,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
         return None
     cells = missing.copy()
     cells[missing] = usable
-    shape = _of(shape, usable)
+    shape = shape.of(usable)
     side = side[usable]
     blur = known_median(state.blur)
     signs = state.signs[cells]
@@ -252,10 +252,6 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     fit = fit_corners(image, guide.board, cells, shape, start, signs, blur)
     good = _confirmed(guide, state, cells, shape, side, fit)
     return state.with_fit(cells, fit, good) if good.any() else None
-
-
-def _of(shape: LocalFit, keep: BoolArray) -> LocalFit:
-    return LocalFit(*(getattr(shape, name)[keep] for name in LocalFit.__slots__))
 
 
 def _confirmed(
@@ -287,7 +283,7 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     if not seen.any():
         return state
     blur = known_median(state.blur)
-    fit = fit_corners(image, guide.board, cells, _of(shape, seen), state.pixels[cells], state.signs[cells], blur)
+    fit = fit_corners(image, guide.board, cells, shape.of(seen), state.pixels[cells], state.signs[cells], blur)
     fit = with_uneven(fit, shape.sides[seen], RADIUS_PX, marked=isinstance(guide.board.pattern, Charuco))
     return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)
 

@@ -94,7 +94,7 @@ def relit(image: GreyImage, found: BoardDetection, board: Board | None = None) -
     if np.count_nonzero(tried) < MIN_SHADED:
         return found
     suspect[suspect] = tried
-    placed, sigma, good = _in_even_light(image, told, suspect, _of(shape, tried), was[tried], usual)
+    placed, sigma, good = _in_even_light(image, told, suspect, shape.of(tried), was[tried], usual)
     suspect[suspect] = good
     pixels[suspect], own[suspect] = placed[good], sigma[good]
     row, column = np.nonzero(np.isfinite(pixels[..., 0]))
@@ -168,7 +168,3 @@ def _usual(image: GreyImage, board: Board, found: BoardDetection, even: BoolArra
     off = np.linalg.norm(start - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
     relative = upper_median(fit.residual[good] / fit.contrast[good])
     return _Usual(signs, upper_median(fit.blur[good]), relative, max(factor, 1.0), upper_median(off))
-
-
-def _of(shape: LocalFit, keep: BoolArray) -> LocalFit:
-    return LocalFit(*(getattr(shape, name)[keep] for name in LocalFit.__slots__))

@@ -64,6 +64,10 @@ class LocalFit:
     def bend_row(self) -> FloatArray:
         return self.bends[:, 1]
 
+    def of(self, chosen: BoolArray) -> LocalFit:
+        """Return the same of the cells chosen (M,)."""
+        return LocalFit(*(getattr(self, name)[chosen] for name in self.__slots__))
+
     def areas(self) -> FloatArray:
         """Return the areas (M,) of the cells, px^2, negative where they are folded over."""
         return _cross(*self.sides.transpose(1, 2, 0))
