@@ -154,13 +154,6 @@ def _leads(changes: Mapping[str, ViewChange], way: str, but: Collection[str] = (
     )
 
 
-def view_changes(calibration: Calibration) -> dict[str, ViewChange]:
-    """Return what each way to change explains; nothing where too few views have enough corners, or where the boards
-    are bent alike in all of them while the calibration has them flat."""
-    evidence = view_evidence(calibration)
-    return {} if evidence is None else evidence.changes()
-
-
 def _solved_for(
     way: str,
     evidence: ViewEvidence,

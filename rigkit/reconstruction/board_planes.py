@@ -44,7 +44,6 @@ class BoardPlanes(ABC):
     calibration_moves : (A, P) what one standard deviation along each principal axis of the calibrations' covariance
         changes in the parameters; A = 0 where that is not known.
     variance_factor : observed over stated variance of the corners, as used in `covariance`.
-    rms_sigmas : root mean square residual of the corners per axis, in their stated sigmas.
     count, gross : corners that take part, and that were left out as gross outliers.
     """
 
@@ -53,7 +52,6 @@ class BoardPlanes(ABC):
     covariance: FloatArray
     calibration_moves: FloatArray
     variance_factor: float
-    rms_sigmas: float
     count: int
     gross: int
 

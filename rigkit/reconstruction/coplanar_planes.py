@@ -219,7 +219,6 @@ def _result(
         covariance=by_state @ of_free @ by_state.T + scale.sigma**2 * np.outer(by_scale, by_scale),
         calibration_moves=np.concatenate(moves),
         variance_factor=factor,
-        rms_sigmas=float(np.sqrt(np.mean(residuals**2))),
         count=count,
         gross=total - count,
         normals=normals,

@@ -116,7 +116,6 @@ def lattice_planes(
         covariance=covariance,
         calibration_moves=moves,
         variance_factor=factor,
-        rms_sigmas=float(np.sqrt(np.mean(data**2))),
         count=problem.count,
         gross=total - problem.count,
     )

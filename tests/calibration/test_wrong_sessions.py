@@ -11,10 +11,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.changing import MIN_NEIGHBOUR_CORRELATION, changing, view_changes
+from rigkit.calibration.changing import MIN_NEIGHBOUR_CORRELATION, changing
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.view_evidence import view_evidence
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.pinhole import Pinhole
@@ -324,7 +325,9 @@ def test_what_changes_is_far_above_the_correlation_that_is_looked_at(way: str, r
     # Mere noise is not looked at: nothing would be found there.
     noise = calibrate(changed_views("nothing", rng), SIZE, model="brown", board="flat")
     assert neighbour_correlation(noise) < MIN_NEIGHBOUR_CORRELATION
-    assert max(change.share for change in view_changes(noise).values()) < 0.1
+    evidence = view_evidence(noise)
+    assert evidence is not None
+    assert max(change.share for change in evidence.changes().values()) < 0.1
 
 
 def test_what_is_wrong_in_all_images_alike_changes_in_none(rng: np.random.Generator) -> None:

@@ -31,7 +31,6 @@ def test_the_true_type_is_chosen(rng, kind, noise_px):
     assert evidence.types[0].probability > 0.9
     assert sum(entry.probability for entry in evidence.types) == pytest.approx(1.0)
     assert evidence.contradiction(kind) is None
-    assert evidence.noise_factor == pytest.approx(1.0, abs=0.3)
 
 
 @pytest.mark.parametrize("kind", ["planar", "standard", "forward"])
@@ -71,7 +70,6 @@ def test_wrong_sigmas_are_corrected_by_the_fit(rng):
     m, _ = board_pair(rng, pose, 0.1)
     one = np.ones(len(m))
     evidence = pose_type_evidence(replace(m, sigma1_px=one, sigma2_px=one))
-    assert evidence.noise_factor < 0.3
     assert evidence.contradiction("standard") is not None
 
 

@@ -244,7 +244,6 @@ def test_fitted_planes_stand_beside_the_free_ones_or_judge_in_their_place() -> N
         covariance=np.diag(np.full(24, 1e-6)),
         calibration_moves=np.zeros((0, 24)),
         variance_factor=1.0,
-        rms_sigmas=1.0,
         count=144,
         gross=0,
     )

@@ -76,10 +76,6 @@ class Level:
     scale: float
     offset: float
 
-    def to_level(self, pixels: FloatArray) -> FloatArray:
-        """Return full-resolution `pixels` in pixels of this level."""
-        return (pixels - self.offset) / self.scale
-
     def to_full(self, pixels: FloatArray) -> FloatArray:
         """Return pixels of this level in full-resolution pixels."""
         return pixels * self.scale + self.offset

@@ -66,12 +66,10 @@ class PoseTypeEvidence:
     ----------
     types : one entry a type, by falling evidence.
     level_sigma_rad : the level that was assumed.
-    noise_factor : factor of the stated corner sigmas that the general fit suggests.
     """
 
     types: tuple[TypeEvidence, ...]
     level_sigma_rad: float
-    noise_factor: float
 
     @property
     def choice(self) -> PoseType:
@@ -140,7 +138,7 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
             )
         )
     entries.sort(key=lambda entry: -entry.log_evidence)
-    return PoseTypeEvidence(tuple(entries), level, float(np.sqrt(noise2)))
+    return PoseTypeEvidence(tuple(entries), level)
 
 
 def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:

@@ -349,9 +349,14 @@ def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:
     return second.astype(np.int64) + 2 * backwards.astype(np.int64)
 
 
+def to_level(level: Level, pixels: FloatArray) -> FloatArray:
+    """Return full-resolution `pixels` in pixels of the level."""
+    return (pixels - level.offset) / level.scale
+
+
 def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:
     """Return whether the edge between the corners is there, with the polarity of the arm."""
-    first, last = level.to_level(corners.pixels[start]), level.to_level(corners.pixels[end])
+    first, last = to_level(level, corners.pixels[start]), to_level(level, corners.pixels[end])
     length = np.linalg.norm(last - first, axis=1)
     offset = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
     sign = np.where(arm % 2 == 0, 1.0, -1.0)

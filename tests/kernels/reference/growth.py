@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from kernels.reference.front import NO_THRESHOLDS, edge_contrast, quads, read_rings
+from kernels.reference.front import NO_THRESHOLDS, edge_contrast, quads, read_rings, to_level
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -149,7 +149,7 @@ def _added(lattice: Lattice, cell: IntArray, fit: LocalFit, saddles: FloatArray,
     """Fill those of the cells `cell` (M, 2) of `lattice`, foretold by `fit`, that can be; return which (R, C)."""
     added = np.zeros(lattice.known.shape, bool)
     height, width = level.smooth.shape
-    place = level.to_level(fit.pixels)
+    place = to_level(level, fit.pixels)
     usable = (
         (fit.support >= MIN_FORETELLING) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
     )
@@ -201,7 +201,7 @@ def _fits(
     lattice: Lattice, level: Level, fit: LocalFit, cell: IntArray, owner: IntArray, pixels: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the contrast at `pixels` and whether they can be the corners of the cells `owner`."""
-    local = level.to_level(pixels)
+    local = to_level(level, pixels)
     height = fit.areas()[owner] / np.maximum(_longest(fit)[owner], 1e-9) / level.scale
     rings = read_rings(level.smooth, local, np.clip(RING * height, MIN_RING_PX, MAX_RING_PX), ODD, CENTRE)
     sign = lattice.signs()[cell[owner, 0], cell[owner, 1]]
@@ -222,7 +222,7 @@ def _edges_seen(
     inside = ((beside >= 0) & (beside < lattice.known.shape)).all(axis=2)
     row, column = np.moveaxis(np.where(inside[..., None], beside, 0), 2, 0)
     which, direction = np.nonzero(inside & lattice.known[row, column])
-    end = level.to_level(lattice.pixels[row, column][which, direction])
+    end = to_level(level, lattice.pixels[row, column][which, direction])
     length = np.linalg.norm(end - local[which], axis=1)
     side = np.where(direction % 2 == 0, sign[which], -sign[which])
     aside = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
-from kernels.reference.front import NO_THRESHOLDS
+from kernels.reference.front import NO_THRESHOLDS, to_level
 
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import Lattice
@@ -44,7 +44,7 @@ def shifts_of_edges(
         Lattice(pixels, np.full(pixels.shape[:2], np.nan), rising),
         Level(image, NO_THRESHOLDS, scale, offset),
     )
-    pixels, signs = level.to_level(lattice.pixels), lattice.signs()
+    pixels, signs = to_level(level, lattice.pixels), lattice.signs()
     # The edges that squares start with, and how each square goes on from there: boards seen aslant are flat.
     first, right, below, last = pixels[:-1, :-1], pixels[:-1, 1:], pixels[1:, :-1], pixels[1:, 1:]
     edges = (
