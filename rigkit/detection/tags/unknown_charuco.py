@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
 from rigkit.core.patterns.charuco import Charuco
@@ -105,23 +106,25 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     # White squares touch at corners.
     near &= (squares.sum(axis=2) % 2 == 0) & (squares != 0).any(axis=2)
     near &= near.T
-    best: dict[int, tuple[int, int]] = {}
-    left = set(range(len(numbers)))
+    own, places = max(laid_out(near, squares), key=lambda group: len(group[0]))
+    return None if len(own) < MIN_MARKERS_READ else (numbers[own], places, 1.0 / step)
+
+
+def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield the groups of N things of which each is `near` (N, N) another one: which (M,), and their places (M, 2) from
+    the first, as the `steps` (N, N, 2) from one to the other add up."""
+    left = set(range(len(near)))
     while left:
         first = left.pop()
-        place, due = {first: (0, 0)}, [first]
+        places, due = {first: np.zeros(2, np.int64)}, [first]
         while due:
             k = due.pop()
             for other in np.flatnonzero(near[k]).tolist():
-                if other not in place:
-                    place[other] = (place[k][0] + int(squares[k, other, 0]), place[k][1] + int(squares[k, other, 1]))
+                if other not in places:
+                    places[other] = places[k] + steps[k, other]
                     due.append(other)
-        left -= set(place)
-        best = place if len(place) > len(best) else best
-    if len(best) < MIN_MARKERS_READ:
-        return None
-    own = np.array(list(best))
-    return numbers[own], np.array([best[k] for k in own.tolist()]), 1.0 / step
+        left -= set(places)
+        yield np.array(list(places)), np.array(list(places.values()))
 
 
 def guessed_charuco(seen: MarkerSightings) -> Board | None:

@@ -23,8 +23,9 @@ from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.placing import squares_of
 from rigkit.detection.tags.quads import quadrilaterals
-from rigkit.detection.tags.unknown_charuco import DICTIONARIES
+from rigkit.detection.tags.unknown_charuco import DICTIONARIES, laid_out
 
 WIDEST_RATIO = 8.0
 """A tag's side over the gap, or the other way round, at most."""
@@ -84,6 +85,10 @@ class _SeenTags:
         return step, line, np.flatnonzero(first == values[votes_of.argmax()])
 
 
+Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
+"""With what `_SeenTags.counted` says of them."""
+
+
 @dataclass(eq=False, slots=True)
 class TagSightings:
     """The tags of all images: indices of the `images` that show some, and the tags as `seen`; `kinds` has the sum of
@@ -105,10 +110,7 @@ class TagSightings:
         return any(found) or self.look_alone(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
-        corners = lattice.pixels
-        quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
-        row, column = np.nonzero(np.isfinite(quads).all(axis=(2, 3)) & (lattice.signs()[:-1, :-1] < 0.0))
-        quads = quads[row, column]
+        quads, squares = squares_of(lattice, dark=True)
         best = _best_read(image, quads, self.families)
         if best is None:
             return False
@@ -119,7 +121,7 @@ class TagSightings:
         if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_TAGS_READ:
             return False
         columns, rows = lattice.size
-        cells = grid_turned(np.stack([column, row], axis=-1)[own], (columns - 1, rows - 1), -turn)
+        cells = grid_turned(squares[own], (columns - 1, rows - 1), -turn)
         upright, places = np.roll(quads[own], -turn, axis=1), cells // 2
         kind = (family, border, False)
         self.kinds[kind] += total  # type: ignore[assignment]
@@ -207,19 +209,7 @@ def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]
         return
     place = np.rint(offset / step).astype(np.int64)
     near = (np.abs(offset / step - place) < OFF_TAG_PLACE).all(axis=2) & (np.abs(place).sum(axis=2) == 1)
-    left = set(range(len(quads)))
-    while left:
-        first = left.pop()
-        at, due = {first: (0, 0)}, [first]
-        while due:
-            k = due.pop()
-            for other in np.flatnonzero(near[k]).tolist():
-                if other not in at:
-                    at[other] = (at[k][0] + int(place[k, other, 0]), at[k][1] + int(place[k, other, 1]))
-                    due.append(other)
-        left -= set(at)
-        own = np.array(list(at))
-        yield own, np.array([at[k] for k in own.tolist()])
+    yield from laid_out(near, place)
 
 
 def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
@@ -228,7 +218,7 @@ def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
     if not seen.seen:
         return []
     kind = seen.kinds.most_common(1)[0][0]
-    groups: list[tuple[_SeenTags, int, int, IntArray]] = []
+    groups: list[Counted] = []
     for item in seen.seen:
         counted = item.counted() if item.kind == kind else None
         if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
@@ -240,9 +230,6 @@ def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
             tags = sum(len(own) for *_, own in cluster)
             out.append((tags, board, tuple(sorted({item.image for item, *_ in cluster}))))
     return [(board, images) for _, board, images in sorted(out, key=lambda found: -found[0])]
-
-
-Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
 
 
 def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
