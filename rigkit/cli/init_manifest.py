@@ -26,7 +26,7 @@ from rigkit.io.reading import usable_path
 def run_manifest(args: argparse.Namespace) -> int:
     from rigkit.io.files import ensure_writable
     from rigkit.io.manifest_writer import find_images
-    from rigkit.workflows.new_manifest import NewManifest, find_pairs, write_manifest
+    from rigkit.workflows.new_manifest import find_pairs, name_of_folder, write_manifest
 
     if args.model:
         raise InputError("init: --model goes with --session only; leave it out")
@@ -55,8 +55,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     cameras = cameras_of(names, calibrations, args.cameras)
     poses = {name: pose_type_of(poses_told, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
     new = NewManifest(
-        root=root,
-        name=args.name,
+        name=args.name or name_of_folder(root),
         pairs=found.pairs,
         told=told or squares_mm,
         calibrations=calibrations,

@@ -146,31 +146,35 @@ def _side(name: str, marks: Sequence[tuple[re.Pattern[str], int]]) -> tuple[str,
     return None
 
 
-def manifest_text(
-    name: str,
-    root: Path,
-    pairs: Sequence[FoundPair],
-    told: Sequence[ToldBoard] | float,
-    calibrations: Mapping[str, str],
-    cameras: Mapping[str, tuple[str, str]],
-    pose_types: Mapping[str, str],
-    baselines: Mapping[str, tuple[float, float]],
-    angles: Mapping[str, tuple[float, float]],
-) -> str:
-    """Return the manifest as text, with what was found as comments.
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class NewManifest:
+    """What a manifest says.
 
-    Parameters
+    Attributes
     ----------
     name : of the data set.
-    root : folder of the manifest; images are named relative to it.
     pairs : at least one.
-    told : the boards, or the side of a square of all chessboards that are found, as a person measured it.
-    calibrations : camera -> path of its calibration file, as it shall stand in the manifest.
+    told : the boards, or the side of a square of all chessboards that are found, mm, as a person measured it.
+    calibrations : camera -> path of its calibration file, absolute or from the folder of the manifest.
     cameras : pair -> the cameras of its two images.
     pose_types : pair -> pose type.
     baselines : pair -> (mm, sigma mm), where measured.
     angles : pair -> (deg, sigma deg) between every two boards, where measured.
     """
+
+    name: str
+    pairs: Sequence[FoundPair]
+    told: Sequence[ToldBoard] | float
+    calibrations: Mapping[str, str]
+    cameras: Mapping[str, tuple[str, str]]
+    pose_types: Mapping[str, str]
+    baselines: Mapping[str, tuple[float, float]]
+    angles: Mapping[str, tuple[float, float]]
+
+
+def manifest_text(new: NewManifest, root: Path) -> str:
+    """Return the manifest as text, with what was found as comments; images are named relative to its folder `root`."""
+    pairs, told = new.pairs, new.told
     if not pairs:
         raise InputError(
             "init: no two images look like a pair; name them ...left/...right, view1/view2 or NAME1/NAME2, put them "
@@ -181,7 +185,7 @@ def manifest_text(
         f'schema = "{DATASET_SCHEMA}"',
     ]
     most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
-    out += [f"name = {toml_text(name)}", ""]
+    out += [f"name = {toml_text(new.name)}", ""]
     if isinstance(told, float):
         counts = ", ".join(f"{n} of {c}x{r}" for (c, r), n in Counter(most).items())
         out.append(f"# Most boards in one image: {counts}.")
@@ -194,14 +198,14 @@ def manifest_text(
         ids = [board.board.board_id for board in told]
     size = pairs[0].first.size_px
     out.append(f"# Images are {size[0]}x{size[1]} px.")
-    if len(calibrations) == 1:
+    if len(new.calibrations) == 1:
         out += ["# All taken as those of one camera that was moved. Where there are two, add another [[cameras]]"]
         out += ["# with its own calibration, and name it in camera2 below."]
-    for camera, calibration in calibrations.items():
+    for camera, calibration in new.calibrations.items():
         out += ["[[cameras]]", f"id = {toml_text(camera)}", f"calibration = {toml_text(calibration)}", ""]
     for pair in pairs:
-        out += _pair_lines(pair, root, cameras[pair.name], pose_types[pair.name], ids)
-        out += _truth_lines(baselines.get(pair.name), angles.get(pair.name), ids)
+        out += _pair_lines(pair, root, new.cameras[pair.name], new.pose_types[pair.name], ids)
+        out += _truth_lines(new.baselines.get(pair.name), new.angles.get(pair.name), ids)
     return "\n".join(out)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.boards import Board
@@ -16,7 +16,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import FoundPair, ImageBoards, ToldBoard, board_sizes, group_pairs, manifest_text
+from rigkit.io.manifest_writer import FoundPair, ImageBoards, NewManifest, board_sizes, group_pairs, manifest_text
 from rigkit.workflows.identify_board import suggested_words
 
 
@@ -26,27 +26,6 @@ class FoundPairs:
 
     pairs: tuple[FoundPair, ...]
     unreadable: tuple[InputError, ...]
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class NewManifest:
-    """What a manifest says.
-
-    `root` is the folder of the images; `name` defaults to its name. `told` are the boards, or the side of a square of
-    all chessboards found, mm. `calibrations` maps a camera to the path of its
-    file, absolute or from the folder of the manifest. `cameras`, `pose_types`, `baselines` (mm, sigma mm) and `angles`
-    between every two boards (deg, sigma deg) go by the names of the pairs.
-    """
-
-    root: Path
-    pairs: Sequence[FoundPair]
-    told: Sequence[ToldBoard] | float
-    calibrations: Mapping[str, str]
-    cameras: Mapping[str, tuple[str, str]]
-    pose_types: Mapping[str, str]
-    baselines: Mapping[str, tuple[float, float]]
-    angles: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    name: str | None = None
 
 
 def find_pairs(
@@ -81,18 +60,7 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
 
     Raises InputError where the file exists, unless `force`, or cannot be written.
     """
-    text = manifest_text(
-        new.name or _name_of(new.root),
-        path.parent.resolve(),
-        new.pairs,
-        new.told,
-        new.calibrations,
-        new.cameras,
-        new.pose_types,
-        new.baselines,
-        new.angles,
-    )
-    write_atomic(path, text, force=force)
+    write_atomic(path, manifest_text(new, path.parent.resolve()), force=force)
     try:
         load_dataset(path)
     except InputError as error:
@@ -100,6 +68,6 @@ def write_manifest(new: NewManifest, path: Path, *, force: bool = False) -> Inpu
     return None
 
 
-def _name_of(folder: Path) -> str:
+def name_of_folder(folder: Path) -> str:
     """Return the folder's name without the letters that no data set's name has."""
     return re.sub(r"[^\w .+()-]|^\W+|\.(?=\.)", "", folder.name)[:MAX_IDENTIFIER].strip() or "data"
