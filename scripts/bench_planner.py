@@ -37,8 +37,7 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.synthetic.placing import place_board, sees_paper
-from rigkit.synthetic.scene import PlacedBoard
+from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 
 SIZE = (1280, 960)
 BOARD = Board("b", 9, 6, 25.0, 25.0)

@@ -43,7 +43,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.departures import DISPLACEMENTS
-from rigkit.synthetic.placing import place_board
+from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task, instrument_of_rig
 from rigkit.validation.certificate.propagation import measured_points

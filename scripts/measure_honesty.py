@@ -46,9 +46,8 @@ from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
-from rigkit.synthetic.scene import PlacedBoard
+from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 from rigkit.validation.measure import Measured, measure
 
 SIZE_PX = (960, 720)

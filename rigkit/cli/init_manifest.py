@@ -25,7 +25,7 @@ from rigkit.io.reading import usable_path
 
 def run_manifest(args: argparse.Namespace) -> int:
     from rigkit.io.files import ensure_writable
-    from rigkit.io.manifest_writer import find_images
+    from rigkit.io.manifest_writer import NewManifest, find_images
     from rigkit.workflows.new_manifest import find_pairs, name_of_folder, write_manifest
 
     if args.model:

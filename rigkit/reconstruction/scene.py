@@ -26,13 +26,20 @@ from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at, oriented_cloud
-from rigkit.reconstruction.rectified_pair import RECTIFIED_NOTE, are_rectified, seen_as_rectified
 from rigkit.reconstruction.scene_pose import MIN_MATCHES, KnownPose, ScenePose, fit_scene_pose, known_scene_pose
+from rigkit.relative_pose.refinement.select import pose_type_evidence
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.weights import usable_affinities
 
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
+SAME_ROW = 1e-9
+"""Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
+PIXELS_A_SIDE = 9
+RECTIFIED_NOTE = (
+    "the cameras and the matches are those of a rectified pair, whose pose is exact; for one camera moved sideways by "
+    "hand declare the pose type 'general'"
+)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -239,3 +246,35 @@ def in_unit(pose: Rigid3, covariance: FloatArray, scale: float) -> tuple[Rigid3,
     """Return a pose of unit baseline, and its covariance (6, 6), with a baseline of `scale`."""
     by = np.repeat([1.0, scale], 3)
     return Rigid3(pose.rotation, scale * pose.translation_mm), np.asarray(by[:, None] * covariance * by)
+
+
+def are_rectified(camera1: Camera, camera2: Camera) -> bool:
+    """Say whether the cameras are perspective ones of one focal length, whose rows look the same way up and down.
+
+    Their principal points may differ along the row.
+    """
+    if camera1.size_px[1] != camera2.size_px[1]:
+        return False
+    tangents = []
+    for camera in (camera1, camera2):
+        width, height = camera.size_px
+        at = np.stack(
+            np.meshgrid(np.linspace(0, width - 1, PIXELS_A_SIDE), np.linspace(0, height - 1, PIXELS_A_SIDE)), axis=-1
+        )
+        rays, seen = camera.unproject(at)
+        if not (seen.all() and (rays[..., 2] > 0.0).all()):
+            return False
+        x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+        slope = np.diff(x, axis=1) / np.diff(at[..., 0], axis=1)
+        if np.ptp(slope) > SAME_ROW or np.ptp(y, axis=1).max() > SAME_ROW:
+            return False
+        tangents.append(np.append(y[:, 0], slope.mean()))
+    return bool(np.abs(tangents[0] - tangents[1]).max() < SAME_ROW)
+
+
+def seen_as_rectified(matches: Matches) -> bool:
+    """Say whether matches that agree with one pose speak for a baseline along the rows and no rotation."""
+    try:
+        return pose_type_evidence(matches).choice is PoseType.STANDARD
+    except (InputError, DegenerateError):
+        return False

@@ -20,7 +20,7 @@ from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.calibration_facts import IMAGES, LEFT_OUT, NEXT, camera_facts, next_words, rig_facts
-from rigkit.report.facts_page import told
+from rigkit.report.page_facts import told
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.scene_view import boards_scene, rig_scene

@@ -13,8 +13,7 @@ from rigkit.core.arrays import without_nan
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.goal import px_words
 from rigkit.report import svg
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 

@@ -12,8 +12,7 @@ from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
 from rigkit.report.check_page import DRAWN_WIDTH, STROKE
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 

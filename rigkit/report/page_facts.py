@@ -1,16 +1,19 @@
 """What a page says, apart from its pictures: for the page and for programs alike, so that neither lacks what the other
-has."""
+has; and the page of such facts in the one look of all."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from rigkit.core.tables import Table
+from rigkit.report.figures import drawn_dark
+from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.tables import tables_to_list
 
 PAGE_SCHEMA = "rigkit.page/1"
+BADGES = {None: "look", True: "pass", False: "fail"}
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -49,3 +52,45 @@ class PageFacts:
             "basis": self.basis,
             "tables": tables_to_list(self.tables),
         }
+
+
+def told(facts: PageFacts) -> dict[str, str]:
+    """Return the verdict that stands first: in a word or two, and the result in the user's units."""
+    return {"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline}
+
+
+def build_facts_page(
+    title: str,
+    facts: PageFacts,
+    provenance: Mapping[str, str],
+    *,
+    links: Sequence[tuple[str, str]] = (),
+    pictures: Sequence[tuple[str, Callable[[], bytes]]] = (),
+    drawings: Sequence[tuple[str, str]] = (),
+    signed: bool = False,
+) -> str:
+    """Return the page as text; everything it needs is inside it.
+
+    Parameters
+    ----------
+    title, facts, provenance : what every page has.
+    links : (words, page) below the sentences.
+    pictures : (words for those who cannot see them, what draws a figure as PNG), drawn for light and for dark screens.
+    drawings : (heading, SVG of rigkit itself).
+    signed : whether it ends in lines for date, name and signature.
+    """
+    return render(
+        "facts.html",
+        title=title,
+        lead="",
+        told=told(facts),
+        sentences=facts.sentences,
+        links=links,
+        pictures=[
+            (words, *(data_uri("image/png", data) for data in (draw(), drawn_dark(draw)))) for words, draw in pictures
+        ],
+        drawings=[(name, drawing(svg)) for name, svg in drawings],
+        tables=[shown_table(table) for table in facts.tables],
+        signed=signed,
+        provenance=provenance,
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from rigkit.core.tables import Table
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.validation.paper_claims import NOTHING_TO_COMPARE
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.core.tables import Cell, Column, Table, cells, columns
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.study_figure import study_figure
-from rigkit.report.study_tables import study_setup, study_tables
-from rigkit.study.table import StudyTable
+from rigkit.study.study import STUDY_PLANES, Study
+from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 
 def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
@@ -31,3 +31,57 @@ def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
         provenance,
         pictures=[(f"Normal errors: {found.study.title}", lambda: study_figure(found))],
     )
+
+
+def study_tables(found: StudyTable) -> tuple[Table, ...]:
+    """Return a table a pose type (rows: noise and plane, columns: methods; medians and quartiles) and the verdicts."""
+    study = found.study
+    tables = [_median_table(found, str(pose_type)) for pose_type in study.pose_types]
+    if found.verdicts:
+        rows = tuple(cells(v.text, Cell(v.words, best=True)) for v in found.verdicts)
+        tables.append(Table("statements", f"{study.title}: statements", columns("statement | verdict"), rows))
+    return tuple(tables)
+
+
+def cell_table(found: StudyTable) -> Table:
+    """Return every statistic of every cell, one cell a row."""
+    heads = columns(
+        f"pose type | noise [{found.study.unit}] | method | plane | estimates .0 | missing .0 | median [deg] | "
+        "lower quartile [deg] | upper quartile [deg] | lower whisker [deg] | upper whisker [deg] | mean [deg]"
+    )
+    rows = tuple(
+        cells(c.pose_type, c.sigma, c.method, _plane(c.plane), c.count, c.missing)
+        + cells(c.median_deg, c.q25_deg, c.q75_deg, c.whisker_low_deg, c.whisker_high_deg, c.mean_deg)
+        for c in found.cells
+    )
+    return Table("cells", found.study.title, heads, rows, study_setup(found.study))
+
+
+def _median_table(found: StudyTable, pose_type: str) -> Table:
+    study = found.study
+    rows, missing = [], 0
+    for sigma in study.sigmas:
+        for plane in (*range(1, STUDY_PLANES + 1), ALL_PLANES):
+            found_cells = [found.cell(pose_type=pose_type, sigma=sigma, method=m, plane=plane) for m in study.methods]
+            rows.append(cells(f"{sigma:g}", _plane(plane), *map(_quartiles, found_cells)))
+            missing += sum(cell.missing for cell in found_cells) if plane == ALL_PLANES else 0
+    heads = (Column("noise", study.unit), Column("plane"), *(Column(method, "deg") for method in study.methods))
+    note = f"Angle between estimated and true normal: median (quartiles); {study_setup(study)}."
+    if missing:
+        note += f" {missing} estimates are missing: their directions do not determine an affinity."
+    return Table(f"medians-{pose_type}", f"{study.title}: {pose_type} motion", heads, tuple(rows), note)
+
+
+def _quartiles(cell: StudyCell) -> str | None:
+    return f"{cell.median_deg:.2f} ({cell.q25_deg:.2f} to {cell.q75_deg:.2f})" if cell.count else None
+
+
+def _plane(plane: int) -> str:
+    return "all" if plane == ALL_PLANES else str(plane)
+
+
+def study_setup(study: Study) -> str:
+    """Return what was simulated, in words."""
+    images = {"1": "image 1", "2": "image 2", "both": "both images"}[str(study.images)]
+    corners = STUDY_PLANES * study.board.corner_count
+    return f"noise on {study.noise} of {images}; {study.trials} trials of {corners} corners"

@@ -25,9 +25,8 @@ from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
-from rigkit.synthetic.scene import PlacedBoard
+from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 
 SIZE_PX = (960, 720)
 FIELD_DEG = 180.0

@@ -12,9 +12,8 @@ from rigkit.calibration.compare import CameraVerdict
 from rigkit.calibration.rig.compare import RigDifference
 from rigkit.core.tables import Table, cells, columns
 from rigkit.io.files import write_atomic
-from rigkit.report.facts_page import build_facts_page
 from rigkit.report.figures import difference_png
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.provenance import digest_line, software_facts
 

@@ -23,8 +23,7 @@ from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
-from rigkit.report.study_page import study_page
-from rigkit.report.study_tables import cell_table, study_tables
+from rigkit.report.study_page import cell_table, study_page, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate

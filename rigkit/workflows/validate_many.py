@@ -14,8 +14,7 @@ from rigkit.core.errors import DegenerateError, ExitCode, InputError, RigkitErro
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.manifest import load_dataset
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files
 from rigkit.validation.tables import mean_normal_error
 from rigkit.workflows.provenance import software_facts

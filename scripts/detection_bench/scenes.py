@@ -25,9 +25,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry, Shadow, develop
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, radiance
-from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection
+from rigkit.synthetic.scene import Panel, PlacedBoard, exact_detection, place_board, sees_paper
 
 LENSES = ("regular", "fisheye")
 """A 6.1 mm lens without distortion and a 2.7 mm, 185 degree lens, both over a 1/1.8 inch sensor."""

@@ -21,8 +21,8 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.io.board_file import board_text
 from rigkit.io.calibration_file import save_camera
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import place_board, sees_paper
 from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
 
 X = Rigid3(exp_so3(np.array([0.3, -1.2, 0.4])), [30.0, -60.0, 90.0])

@@ -25,8 +25,8 @@ from rigkit.io.calibration_file import load_calibration
 from rigkit.io.corner_cache import CornerCache, FoundCorners
 from rigkit.io.session import load_session
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import place_board, sees_paper
 from rigkit.workflows.corners import first_camera
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"

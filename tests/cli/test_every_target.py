@@ -27,9 +27,8 @@ from rigkit.io.images import read_image, to_grey
 from rigkit.io.rig_file import load_board_rigs, load_saved_rig
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
-from rigkit.synthetic.scene import PlacedBoard
+from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 from rigkit.workflows.coach import CoachOptions, open_coach
 
 SIZE = (640, 480)

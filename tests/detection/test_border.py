@@ -16,9 +16,8 @@ from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.synthetic.placing import place_board
 from rigkit.synthetic.render import Optics
-from rigkit.synthetic.scene import Panel, PlacedBoard
+from rigkit.synthetic.scene import Panel, PlacedBoard, place_board
 
 SIZES = ((11, 8), (9, 6), (8, 6), (7, 7), (10, 7), (6, 5))
 SAME_PX = 2.0

@@ -10,8 +10,8 @@ from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board
 from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import place_board
 
 MOST_PX = 0.004
 """RMS without noise: what the models of edge and renderer have apart."""

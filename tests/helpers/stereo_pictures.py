@@ -13,8 +13,8 @@ from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.placing import place_board, sees_paper
 from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import place_board, sees_paper
 
 CAMERA = Brown((640, 480), np.array([520.0, 521.0, 322.3, 236.1, -0.21, 0.06, 4e-4, -3e-4, 0.0]))
 RIGHT_FROM_LEFT = Rigid3(exp_so3(np.array([0.01, -0.04, 0.02])), [-90.0, 1.0, 2.0])

@@ -9,8 +9,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.posetype import PoseType
-from rigkit.reconstruction.rectified_pair import RECTIFIED_NOTE, are_rectified
-from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+from rigkit.reconstruction.scene import RECTIFIED_NOTE, SceneReconstruction, are_rectified, reconstruct_scene
 
 SIZE = (1600, 1200)
 CAMERA = Pinhole(SIZE, np.array([1000.0, 1000.0, 800.0, 600.0]))

@@ -25,8 +25,7 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.calibration_charts import images_svg
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
-from rigkit.report.facts_page import build_facts_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.page_facts import PageFacts, build_facts_page
 
 SCHEMES = {"light": "--blink-settings=preferredColorScheme=1", "dark": "--blink-settings=preferredColorScheme=0"}
 RUN = """<script>%s</script><script>

@@ -57,7 +57,7 @@ ROUNDS = 40
 MAX_UNEXPLAINED, MAX_MISSHAPEN, MAX_DISPLACED = 0.2, 0.08, 0.04
 """Of `GridEvidence`, for a grid: real and rendered ones reach 0.064, 0.073 and 0.008 (47 of them, to a blur of 3 px or
 noise of 10 levels). Other lattices of blobs have a median of 0.28 of the first, and lie as evenly."""
-MAX_CORNERS = 0.05
+MAX_CORNERED = 0.05
 """Likewise: grids of circles reach 0.014, and what is none, mostly squares, has 0.061 or more (64 lattices in 54 real
 images and in pictures without circles)."""
 
@@ -117,7 +117,7 @@ class GridEvidence:
     @property
     def convincing(self) -> bool:
         smooth = self.misshapen < MAX_MISSHAPEN and self.displaced < MAX_DISPLACED
-        return smooth and self.unexplained < MAX_UNEXPLAINED and self.corners < MAX_CORNERS
+        return smooth and self.unexplained < MAX_UNEXPLAINED and self.corners < MAX_CORNERED
 
 
 def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES, *, quick: bool = False) -> list[CircleGrid]:
