@@ -49,14 +49,6 @@ class DirectionField:
     covariance: FloatArray
     shared: FloatArray
 
-    def sigma_rad(self) -> FloatArray:
-        """Return the predicted standard deviation of each direction's angle, (N, 3) radians."""
-        along = self.vectors
-        length2 = (along**2).sum(axis=-1)
-        across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-        variance = np.einsum("...i,...ij,...j->...", across, self.covariance, across)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)) / length2)
-
 
 def direction_field(
     detection: BoardDetection,

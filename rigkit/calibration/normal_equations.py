@@ -37,11 +37,6 @@ class Residuals:
     px: FloatArray
     valid: BoolArray
 
-    def norm(self, observations: Observations) -> FloatArray:
-        """Return |r| (V, C), infinite where the corner does not project, NaN where padded."""
-        length = np.where(self.valid, np.linalg.norm(self.px, axis=-1), np.inf)
-        return np.where(observations.present, length, np.nan)
-
     def weighted(self, observations: Observations) -> FloatArray:
         """Return |r| (V, C) times the weight, infinite where the corner does not project, zero where padded."""
         u, v = self.px[..., 0], self.px[..., 1]

@@ -53,13 +53,11 @@ class Alignment:
     rows : (V, 2, 3) r1 = (r11, r12, t1) and r2, t in mm for the board's own origin; r's of the right length.
     tilt : (V, 2) r31, r32 up to a common sign.
     weight : (V, C) in [0, 1], how far each corner takes part.
-    residual_px : (V, C) distance of each pixel from the line it should lie on.
     """
 
     rows: FloatArray
     tilt: FloatArray
     weight: FloatArray
-    residual_px: FloatArray
 
     def camera_xy(self, board: FloatArray) -> FloatArray:
         """Return (X, Y) in the camera frame (V, 2, C) of the corners (V, 2, C), mm."""
@@ -97,7 +95,7 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
     h *= np.where(agree < 0.0, -1.0, 1.0)[:, None]
     share = np.divide(robust, weight, out=np.zeros_like(weight), where=used)
     rows, tilt = _orthonormal(h, mean, size)
-    return Alignment(rows, tilt, share, np.where(used, residual, np.nan))
+    return Alignment(rows, tilt, share)
 
 
 def _normalised(board: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

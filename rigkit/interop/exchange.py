@@ -50,8 +50,8 @@ class Written:
     ----------
     text : the file.
     camera : the camera as the file describes it.
-    max_error_px, rms_error_px : its projection against the camera given, over the part of the image it covers, inside
-        the outline of what was seen where that is known; 0 where the format has the model.
+    max_error_px : its projection against the camera given, over the part of the image it covers, inside the outline of
+        what was seen where that is known; 0 where the format has the model.
     covered : that part, as a share of the image.
     note : in words, what a user of the file should know; empty where nothing was lost.
     """
@@ -59,7 +59,6 @@ class Written:
     text: str
     camera: Camera
     max_error_px: float
-    rms_error_px: float
     covered: float
     note: str
 
@@ -69,14 +68,12 @@ class Chosen:
     """The camera that goes into the file, with what `Written` says of it."""
 
     camera: Camera
-    accepted: Accepted
     max_error_px: float = 0.0
-    rms_error_px: float = 0.0
     covered: float = 1.0
     note: str = ""
 
     def written(self, text: str) -> Written:
-        return Written(text, self.camera, self.max_error_px, self.rms_error_px, self.covered, self.note)
+        return Written(text, self.camera, self.max_error_px, self.covered, self.note)
 
 
 def best_accepted(
@@ -92,7 +89,7 @@ def best_accepted(
     for same in (camera, *_without_zero_terms(camera)):
         for kind in accepted:
             if kind.holds(same):
-                return Chosen(same, kind)
+                return Chosen(same)
     found: list[tuple[float, Chosen]] = []
     for kind in accepted:
         try:
@@ -111,7 +108,7 @@ def best_accepted(
             degree = "" if kind.model != camera.model else f" and degree = {kind.order}"
             note += f'; with model = "{kind.model}"{degree} in the session nothing is lost'
         cost = max(c.max_px, OUTSIDE_WEIGHT * c.outside_px)
-        found.append((cost, Chosen(c.camera, kind, c.max_px, c.rms_px, c.covered, note)))
+        found.append((cost, Chosen(c.camera, c.max_px, c.covered, note)))
     if not found:
         raise InputError(
             f"{format_name}: none of its models can follow this {camera.model} camera; choose another format"

@@ -65,7 +65,7 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
     error = np.linalg.norm(projected - pixels, axis=-1)[inside]
     note = f"written as a spline of {(intrinsics.size - 4) // 2} knots, off by {error.max():.2g} px at most"
     text = _text(lens, intrinsics, camera.size_px, pose, outline)
-    return Written(text, camera, float(error.max()), float(np.sqrt(np.mean(error**2))), float(inside.mean()), note)
+    return Written(text, camera, float(error.max()), float(inside.mean()), note)
 
 
 def read_cameramodel(

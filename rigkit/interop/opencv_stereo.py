@@ -34,7 +34,7 @@ class OpenCVStereo:
     Attributes
     ----------
     cameras : the two as OpenCV has them, with what was lost.
-    R1, R2, P1, P2, Q : OpenCV's rectification; columns of P and Q that are lengths are in mm.
+    R1, R2, P1, P2 : OpenCV's rectification; columns of P that are lengths are in mm.
     text : the file.
     """
 
@@ -43,7 +43,6 @@ class OpenCVStereo:
     R2: Mat3
     P1: FloatArray
     P2: FloatArray
-    Q: FloatArray
     text: str
 
 
@@ -72,7 +71,7 @@ def opencv_stereo(
     width, height = camera1.size_px
     head = f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n" + ("fisheye_model: 1\n" if fisheye else "")
     text = head + "".join(f"{key}: {opencv_matrix(array)}" for key, array in arrays.items())
-    return OpenCVStereo(cameras=chosen, R1=R1, R2=R2, P1=P1, P2=P2, Q=Q, text=text)
+    return OpenCVStereo(cameras=chosen, R1=R1, R2=R2, P1=P1, P2=P2, text=text)
 
 
 def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Camera, Camera], Rigid3]:

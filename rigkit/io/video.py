@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -123,11 +123,6 @@ class Video:
                 "damaged: copy it again from the camera"
             )
             self.count = 0
-
-    def frames(self) -> Iterator[tuple[int, Image]]:
-        """Yield the number and the picture of every frame that is left."""
-        while (picture := self.frame(self.next_number)) is not None:
-            yield self.next_number - 1, picture
 
 
 def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str, int]]:

@@ -60,10 +60,6 @@ class BoardPlanes(ABC):
         """Return the unit normal (3,) of a board, facing camera 1."""
 
     @abstractmethod
-    def offset_mm(self, board_id: str) -> float:
-        """Return n . x of the board's points."""
-
-    @abstractmethod
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
         """Return which of the corners `grid` (N, 2) of a board `points` knows."""
 

@@ -42,13 +42,12 @@ class CoplanarPlanes(BoardPlanes):
 
     Attributes
     ----------
-    normals, offsets_mm : (K, 3), (K,), in the order of `board_ids`.
+    normals : (K, 3) in the order of `board_ids`.
     board_index, grid : (N,), (N, 2), which corners `points_mm` are.
     points_mm, points_covariance : (N, 3), (N, 3, 3) mm, on the planes, the calibrations' share included.
     """
 
     normals: FloatArray
-    offsets_mm: FloatArray
     board_index: IntArray
     grid: IntArray
     points_mm: Points
@@ -57,10 +56,6 @@ class CoplanarPlanes(BoardPlanes):
     def normal(self, board_id: str) -> FloatArray:
         """Return the unit normal (3,) of a board, facing camera 1."""
         return np.asarray(self.normals[self.board_ids.index(board_id)])
-
-    def offset_mm(self, board_id: str) -> float:
-        """Return n . x of the board's points."""
-        return float(self.offsets_mm[self.board_ids.index(board_id)])
 
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
         """Return which of the corners `grid` (N, 2) of a board take part."""
@@ -212,7 +207,7 @@ def _result(
     own = scale.value**2 * problem.turned_back(np.swapaxes(problem.turned_back(noise), 1, 2))
     own += (scale.sigma / scale.value) ** 2 * points_mm[:, :, None] * points_mm[:, None, :]
     shared = np.einsum("fni,fg,gnj->nij", by_point, of_free, by_point)
-    pose, normals, offsets = problem.in_camera(state)
+    pose, normals, _ = problem.in_camera(state)
     return CoplanarPlanes(
         board_ids=tuple(board.board_id for board in boards),
         cam2_from_cam1=Rigid3(pose.rotation, scale.value * pose.translation_mm),
@@ -222,7 +217,6 @@ def _result(
         count=count,
         gross=total - count,
         normals=normals,
-        offsets_mm=scale.value * offsets,
         board_index=problem.matches.board_index,
         grid=problem.matches.grid,
         points_mm=points_mm,

@@ -61,10 +61,6 @@ class LatticePlanes(BoardPlanes):
         normal = pose.rotation[:, 2]
         return np.asarray(-np.sign(normal @ pose.translation_mm) * normal)
 
-    def offset_mm(self, board_id: str) -> float:
-        """Return n . x of the board's points."""
-        return float(self.normal(board_id) @ self.cam1_from_board[board_id].translation_mm)
-
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
         """Return which of the corners `grid` (N, 2) of a board are known: all, or none of a board that is not."""
         return np.full(len(grid), board.board_id in self.board_ids)

@@ -13,7 +13,7 @@ from rigkit.affine.affinities import DirectionNoise
 from rigkit.affine.directions import Support, direction_field
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, common_corners
 from rigkit.core.errors import DegenerateError, InputError
@@ -260,19 +260,8 @@ def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardD
     """Return the detection in a perspective view; sigmas grow with the local magnification."""
     rays, _ = camera.unproject(detection.pixels)
     pixels, _, d_pixels_d_point, _ = view.project_with_jacobians(rays)
-    local = d_pixels_d_point @ camera.ray_jacobian(detection.pixels)
-    magnification = np.linalg.norm(local, axis=(1, 2)) / np.sqrt(2.0)
-    return BoardDetection(
-        detection.board_id,
-        detection.columns,
-        detection.rows,
-        detection.grid,
-        _whole(pixels),
-        detection.sigma_px * magnification,
-    )
-
-
-def _whole(pixels: Pixels) -> Pixels:
     if not np.isfinite(pixels).all():
         raise DegenerateError("a corner lies behind the perspective view; use the raw chain (--chain raw)")
-    return pixels
+    local = d_pixels_d_point @ camera.ray_jacobian(detection.pixels)
+    magnification = np.linalg.norm(local, axis=(1, 2)) / np.sqrt(2.0)
+    return replace(detection, pixels=pixels, sigma_px=detection.sigma_px * magnification)

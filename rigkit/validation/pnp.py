@@ -34,7 +34,6 @@ class PnpResult:
     variance_factor : observed over predicted variance of the corners. The residuals of a board of known shape show
         errors along epipolar lines too, which epipolar geometry cannot see: 1 where the corners' sigmas are honest.
     count : corners used.
-    boards : how many boards took part.
     """
 
     cam2_from_cam1: Rigid3
@@ -43,7 +42,6 @@ class PnpResult:
     rms_rad: float
     variance_factor: float
     count: int
-    boards: int
 
 
 def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
@@ -72,7 +70,6 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
         rms_rad=float(np.sqrt(square)),
         variance_factor=factor,
         count=total,
-        boards=len(poses),
     )
 
 

@@ -61,14 +61,6 @@ class VideoFrames:
     with_boards: int
     near_copies: int
 
-    def words(self) -> str:
-        """Return what was done, in a line."""
-        kept = max(map(len, self.images.values()))
-        return (
-            f"{self.folder}: {kept} of {self.looked_at} frames kept; {self.with_boards} show a board, "
-            f"{self.near_copies} of them where another one has it"
-        )
-
 
 def frames_folder(sources: Sequence[Path]) -> Path:
     """Return where the frames of videos go unless somebody says otherwise: beside the first."""
@@ -208,17 +200,8 @@ def _quick_look(picture: Image, boards: Sequence[Board]) -> list[BoardDetection]
         cut = picture[: height * factor, : width * factor]
         picture = cast(Image, cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA))
     found = detect_boards(picture, boards)
-    return [
-        BoardDetection(
-            item.board_id,
-            item.columns,
-            item.rows,
-            item.grid,
-            factor * item.pixels + 0.5 * (factor - 1.0),
-            factor * item.sigma_px,
-        )
-        for item in found
-    ]
+    shift = 0.5 * (factor - 1.0)
+    return [replace(one, pixels=factor * one.pixels + shift, sigma_px=factor * one.sigma_px) for one in found]
 
 
 def with_frames(session: Session | RigSession, progress: Progress = silent) -> Session | RigSession:

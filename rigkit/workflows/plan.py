@@ -75,12 +75,10 @@ class LensOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PlannedSession:
-    """The plan, tables of what its pictures would find, the corners (N, 2) taken so far, and the files that were
-    written."""
+    """The plan, tables of what its pictures would find, and the files that were written."""
 
     plan: Plan
     found: tuple[Table, ...]
-    taken: Pixels
     written: tuple[Path, ...]
 
 
@@ -107,19 +105,18 @@ def plan_session(
             f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, "
             "rig-CAMERA.json, or ask for pictures to check the rig with: --check"
         )
-    inputs: list[Path] = [source]
     if options.report is not None:
-        ensure_writable([options.report], force=options.force, inputs=inputs)
+        ensure_writable([options.report], force=options.force, inputs=[source])
     if rig:
         watched, boards = load_watched(source)
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
-        return _checked(watched, boards, options, source, inputs, np.zeros((0, 2)))
+        return _checked(watched, boards, options, source)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
-        inputs += session_inputs(session, calibrating)
         if options.report is not None:
+            inputs = [source, *session_inputs(session, calibrating)]
             ensure_writable([options.report], force=options.force, inputs=inputs)
         calibration = calibrate_session(session, calibrating, progress=progress).calibration
         boards = session.boards
@@ -129,22 +126,20 @@ def plan_session(
             boards = tuple(shape.board for shape in calibration.boards)
     taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
     if options.check:
-        return _checked(watched_camera(calibration, source.stem), boards, options, source, inputs, taken)
+        return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
-    written = _written(plan, options, f"Next pictures for {source.name}", source, inputs, taken)
-    return PlannedSession(plan=plan, found=(), taken=taken, written=written)
+    return _shown(plan, options, f"Next pictures for {source.name}", source, taken)
 
 
 def _checked(
-    watched: Watched, boards: Sequence[Board], options: PlanOptions, source: Path, inputs: list[Path], taken: Pixels
+    watched: Watched, boards: Sequence[Board], options: PlanOptions, source: Path, taken: Pixels | None = None
 ) -> PlannedSession:
     """Return the pictures to check a camera or a rig with."""
     with about(source):
         plan, powers = views_that_tell(watched, boards, options.count, options.reach)
     found = (power_table(powers, "What these pictures would find"),)
-    written = _written(plan, options, f"Pictures to check {source.name} with", source, inputs, taken, found)
-    return PlannedSession(plan=plan, found=found, taken=taken, written=written)
+    return _shown(plan, options, f"Pictures to check {source.name} with", source, taken, found)
 
 
 def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
@@ -152,28 +147,27 @@ def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
 
     Raises as `plan_session`.
     """
+    if options.report is not None:
+        ensure_writable([options.report], force=options.force)
     camera = guessed_camera(lens.hfov_deg, lens.size_px, lens.model)
     knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, USUAL_RHO))
     plan = plan_views(
         knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
     )
-    title = f"{options.count} pictures for a lens of {lens.hfov_deg:g} degrees"
-    written = _written(plan, options, title, None, [], None)
-    return PlannedSession(plan=plan, found=(), taken=np.zeros((0, 2)), written=written)
+    return _shown(plan, options, f"{options.count} pictures for a lens of {lens.hfov_deg:g} degrees")
 
 
-def _written(
+def _shown(
     plan: Plan,
     options: PlanOptions,
     title: str,
-    source: Path | None,
-    inputs: list[Path],
-    taken: Pixels | None,
+    source: Path | None = None,
+    taken: Pixels | None = None,
     found: tuple[Table, ...] = (),
-) -> tuple[Path, ...]:
-    if options.report is None:
-        return ()
-    ensure_writable([options.report], force=options.force, inputs=inputs)
-    facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
-    write_atomic(options.report, plan_page(plan, title, facts, taken, found), force=options.force)
-    return (options.report,)
+) -> PlannedSession:
+    """Return the plan, and write its page where one is asked for."""
+    if options.report is not None:
+        facts = software_facts() | ({source.name: digest_line(source)} if source is not None else {})
+        write_atomic(options.report, plan_page(plan, title, facts, taken, found), force=options.force)
+    written = () if options.report is None else (options.report,)
+    return PlannedSession(plan=plan, found=found, written=written)

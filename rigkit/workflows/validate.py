@@ -202,7 +202,6 @@ def _judge(
         files |= drawn
         section = _section(reconstructions, shown, reports, compared, drawn)
     return PairValidation(
-        pair_id=pair.pair_id,
         reports=reports,
         best=best,
         crosscheck=compared,

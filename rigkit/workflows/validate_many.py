@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,7 +33,6 @@ class SetOutcome:
     error : why nothing came out, which pairs failed, or the probable cause of checks that did; empty where all is well.
     pairs, checks_failed : how many.
     worst_angle_deg, mean_normal_deg, worst_baseline_sigmas : over the pairs' best estimators; None where unknown.
-    seconds : how long it took.
     """
 
     name: str
@@ -45,7 +43,6 @@ class SetOutcome:
     worst_angle_deg: float | None = None
     mean_normal_deg: float | None = None
     worst_baseline_sigmas: float | None = None
-    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,12 +112,11 @@ def _name_of(path: str | Path) -> str:
 
 def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
     name, path = named
-    started = time.monotonic()
     assert options.output is not None
     try:
         done = validate_dataset(path, replace(options, output=options.output / name))
     except RigkitError as error:
-        return SetOutcome(name=name, code=error.exit_code, error=str(error), seconds=time.monotonic() - started)
+        return SetOutcome(name=name, code=error.exit_code, error=str(error))
     best = [pair.best for pair in done.pairs]
     judged = [*(report.checks for report in best), *(other.checks for other in done.crosschecks)]
     angles = [a.error_deg for report in best for a in report.angles if a.error_deg is not None]
@@ -137,7 +133,6 @@ def _one(named: tuple[str, Path], *, options: ValidateOptions) -> SetOutcome:
         worst_angle_deg=max(angles, default=None),
         mean_normal_deg=mean_normal_error(best),
         worst_baseline_sigmas=max(map(float, np.abs(baselines)), default=None),
-        seconds=time.monotonic() - started,
     )
 
 

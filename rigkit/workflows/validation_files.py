@@ -29,7 +29,6 @@ class PairValidation:
 
     Attributes
     ----------
-    pair_id : its name.
     reports : one an estimator, in the order of the registry.
     best : that of the estimator shown.
     crosscheck : what independent methods say of that one, if they were asked.
@@ -38,7 +37,6 @@ class PairValidation:
     section : of the page, where there are pictures.
     """
 
-    pair_id: str
     reports: tuple[ValidationReport, ...]
     best: ValidationReport
     crosscheck: CrossCheckReport | None

@@ -191,7 +191,8 @@ def test_a_cloud_lies_on_its_planes(rng: np.random.Generator) -> None:
     made = on_planes(reconstruct_from(geometry), planes)
     for n, board in enumerate(made.boards):
         own = made.cloud.board_index == n
-        distances = made.cloud.points_mm[own] @ planes.normal(board.board_id) - planes.offset_mm(board.board_id)
+        middle = planes.points(board, made.cloud.grid[own])[0].mean(axis=0)
+        distances = (made.cloud.points_mm[own] - middle) @ planes.normal(board.board_id)
         assert own.sum() == board.corner_count
         assert np.abs(distances).max() < 1e-9
         assert angle_between(made.cloud.normals[own], planes.normal(board.board_id)).max() < 1e-7

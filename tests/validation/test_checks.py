@@ -221,9 +221,6 @@ class Askew(BoardPlanes):
         turn = exp_so3(np.radians(1.0) * _faces()["plane2"]) if board_id == "plane1" else np.eye(3)
         return np.asarray(turn @ _faces()[board_id])
 
-    def offset_mm(self, board_id: str) -> float:
-        raise NotImplementedError
-
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
         raise NotImplementedError
 

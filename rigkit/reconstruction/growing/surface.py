@@ -68,8 +68,6 @@ class GrownSurface:
     points : (R, C, 3) in the frame of camera 1, lengths in those of the translation.
     normals : (R, C, 3) unit, towards camera 1.
     plane : (R, C, 3) m of the plane m . X = 1; covariance : (R, C, 3, 3) of m.
-    support : (R, C) neighbours that agree, in sum of weights.
-    misfit : (R, C) how far the node's own range is from the plane, px along the epipolar line.
     at_end : (R, C) bool, no further than a patch reaches from where the surface ends.
     """
 
@@ -77,8 +75,6 @@ class GrownSurface:
     normals: Normals
     plane: FloatArray
     covariance: FloatArray
-    support: FloatArray
-    misfit: FloatArray
     at_end: BoolArray
 
     @property
@@ -210,6 +206,7 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         keep = (inverse > 0.0) & (support >= MIN_SUPPORT * (2 * reach + 1) ** 2)
         points = ray / inverse[..., None]
         normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
+        # How far the own range of a node is from the plane, px along the epipolar line.
         misfit = (measured.z[..., 0] - inverse) * measured.slope
     spread = np.full(normal.shape, np.nan)
     spread[keep] = _inverse(normal[keep])
@@ -227,8 +224,6 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         normals=_where(keep, normals),
         plane=_where(keep, plane),
         covariance=spread,
-        support=_where(keep, support),
-        misfit=_where(keep, misfit),
         at_end=at_end,
     )
 

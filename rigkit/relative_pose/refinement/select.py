@@ -42,20 +42,15 @@ class TypeEvidence:
     pose_type : which.
     log_evidence : log marginal likelihood, relative to the best type (so 0 for the best, negative for the others).
     probability : posterior probability if all four types were equally likely beforehand.
-    chi2, residuals : sum of squared residuals of the points in sigmas (stated ones) and their number.
     deviation_rad : largest angle of the general fit off the type, see `type_deviation_rad`. Zero for the general type.
     p_value : chance of deviations at least this large from noise and level, if the type were true.
-    refined : the pose under this type (soft level).
     """
 
     pose_type: PoseType
     log_evidence: float
     probability: float
-    chi2: float
-    residuals: int
     deviation_rad: float
     p_value: float
-    refined: RefinedPose
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,26 +110,21 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
         raise InputError(f"level sigma must be positive, got {level} rad")
     fits = _fits(matches, level)
     general = fits.get(PoseType.GENERAL)
-    n = len(matches)
-    noise2 = 1.0 if general is None else variance_factor(general.cost, n - POSE_FREEDOM)
+    noise2 = 1.0 if general is None else variance_factor(general.cost, len(matches) - POSE_FREEDOM)
     raw = {kind: _log_evidence(fit, kind, level, noise2) for kind, fit in fits.items()}
     top = max(raw.values())
     total = sum(np.exp(value - top) for value in raw.values())
     entries = []
-    for kind, fit in fits.items():
+    for kind in fits:
         deviation, p = _deviation(general, kind, level, noise2)
-        chi2 = fit.cost - _prior_cost(fit, kind, level)
         probability = float(np.exp(raw[kind] - top) / total)
         entries.append(
             TypeEvidence(
                 pose_type=kind,
                 log_evidence=raw[kind] - top,
                 probability=probability,
-                chi2=chi2,
-                residuals=n,
                 deviation_rad=deviation,
                 p_value=p,
-                refined=fit,
             )
         )
     entries.sort(key=lambda entry: -entry.log_evidence)
