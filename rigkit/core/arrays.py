@@ -114,11 +114,8 @@ def as_mask(value: ArrayLike, shape: tuple[int, ...], name: str) -> BoolArray:
 def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
     """Return a read-only copy of a covariance (`size`, `size`).
 
-    Raises
-    ------
-    InputError
-        Another shape, not finite, not symmetric, or with a negative variance in some direction: beyond what rounding
-        leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
+    Raises InputError: another shape, not finite, not symmetric, or with a negative variance in some direction: beyond
+    what rounding leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
     """
     covariance = as_array(value if size else np.zeros((0, 0)), (size, size), name)
     variance = np.diag(covariance)

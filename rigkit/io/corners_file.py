@@ -64,10 +64,7 @@ def read_corners(path: str | Path, boards: Sequence[Board] = ()) -> dict[str, tu
     The size of a named board is that of `boards`; where the name is not among them, the largest column and row read. A
     .vnl file needs its board: it names none.
 
-    Raises
-    ------
-    InputError
-        No such file, other columns, or a line that cannot be understood; names the line.
+    Raises InputError: no such file, other columns, or a line that cannot be understood; names the line.
     """
     source = Path(path)
     text = read_text(source, "corners file")

@@ -58,10 +58,7 @@ def read_correspondences(path: str | Path, images: Sequence[str] = ()) -> Corres
 
     `images` are the names of the two images' files: a database has matches of many.
 
-    Raises
-    ------
-    InputError
-        The file cannot be read or understood; says where and what was expected.
+    Raises InputError: the file cannot be read or understood; says where and what was expected.
     """
     source = Path(path)
     payload = read_bytes(source, "correspondences")

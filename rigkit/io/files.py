@@ -68,11 +68,8 @@ def write_atomic(path: str | Path, data: str | bytes, *, force: bool = False) ->
 
     A temporary file in the same folder is flushed to the disk and renamed. Missing folders are made.
 
-    Raises
-    ------
-    InputError
-        The file exists and `force` is not set, or it cannot be written (permission, full disk); what was there before
-        is still there.
+    Raises InputError: the file exists and `force` is not set, or it cannot be written (permission, full disk); what was
+    there before is still there.
     """
     write_together({Path(path): data}, force=force)
 

@@ -45,11 +45,8 @@ def read_image(path: str | Path) -> Image:
     Pixels come as the sensor wrote them: an orientation in the file (EXIF, TIFF) is not applied, because a calibration
     belongs to the sensor. An alpha channel is dropped.
 
-    Raises
-    ------
-    InputError
-        No such file, not an image, several in one file, cut off or damaged, of more than `MAX_PIXELS`, or a pixel type
-        other than 8 or 16 bit.
+    Raises InputError: no such file, not an image, several in one file, cut off or damaged, of more than `MAX_PIXELS`,
+    or a pixel type other than 8 or 16 bit.
     """
     source = Path(path)
     data = read_bytes(source, "image")

@@ -219,11 +219,8 @@ class Dataset:
 def load_dataset(path: str | Path) -> Dataset:
     """Read a manifest, given its folder or the file itself.
 
-    Raises
-    ------
-    InputError
-        No manifest, unknown keys, a missing fact (no square size, pose type or name has a default), a reference to
-        something that is not declared, two things of one name, a camera with neither calibration nor session.
+    Raises InputError: no manifest, unknown keys, a missing fact (no square size, pose type or name has a default), a
+    reference to something that is not declared, two things of one name, a camera with neither calibration nor session.
     """
     given = usable_path(path)
     source = given / MANIFEST if given.is_dir() else given

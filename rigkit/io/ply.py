@@ -146,10 +146,7 @@ def read_ply(path: str | Path) -> OrientedCloud:
 
     Properties beyond the coordinates and normals may be missing: then no board, grey, and NaN sigmas.
 
-    Raises
-    ------
-    InputError
-        No such file, not such a PLY, no normals, or cut off.
+    Raises InputError: no such file, not such a PLY, no normals, or cut off.
     """
     source = Path(path)
     data = read_bytes(source, "point cloud")

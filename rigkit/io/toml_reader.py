@@ -231,10 +231,8 @@ def _is_word(value: object) -> bool:
 def read_toml(path: str | Path, schema: Schema) -> TomlTable:
     """Return the file's outermost table, which fits the `schema` of a whole file.
 
-    Raises
-    ------
-    InputError
-        No such file, not TOML (with the line), no schema, another schema or another version, values of another kind.
+    Raises InputError: no such file, not TOML (with the line), no schema, another schema or another version, values of
+    another kind.
     """
     source = Path(path)
     text = read_text(source, max_bytes=MAX_TOML_BYTES)

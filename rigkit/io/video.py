@@ -131,10 +131,7 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
     A camera of the file, `cam_id`, is the one of `cameras` that is called so or has that number at its end. Frames are
     counted from the first that a camera has in the file: recorders count those before the recording, too.
 
-    Raises
-    ------
-    InputError
-        Columns are missing, a field is no number, or a camera has no rows.
+    Raises InputError: columns are missing, a field is no number, or a camera has no rows.
     """
     head, lines = csv_table(path, "timestamps")
     if not set(TIMESTAMPS) <= set(head):

@@ -19,7 +19,7 @@ from rigkit.affine.normal import estimate_normals
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, in_8_bits
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, in_8_bits
 from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
@@ -91,6 +91,11 @@ class Reconstruction:
 
     __repr__ = brief
     _repr_html_ = drawn
+
+    def sights(self) -> tuple[Rays, Rays, RayJacobians, RayJacobians]:
+        """Return the rays of `pixels1` and of `pixels2`, and their derivatives by the pixels."""
+        (rays1, _), (rays2, _) = self.camera1.unproject(self.pixels1), self.camera2.unproject(self.pixels2)
+        return rays1, rays2, self.camera1.ray_jacobian(self.pixels1), self.camera2.ray_jacobian(self.pixels2)
 
     def same_points(self, other: Reconstruction) -> bool:
         """Return whether both have the very same points: of one geometry, and the same corners."""
@@ -222,10 +227,7 @@ def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruc
     more certain than they are. `planes` says how certain the boards' planes are. Points that are not on `planes` are
     left out, and a note says so.
 
-    Raises
-    ------
-    DegenerateError
-        No point is on a board of `planes`.
+    Raises DegenerateError: no point is on a board of `planes`.
     """
     cloud = reconstruction.cloud
     placed = np.zeros(len(cloud), dtype=bool)

@@ -68,10 +68,7 @@ class KnownPose:
 def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
     """Return a measured pose, which is not estimated again, with the matches that agree and the noise they show.
 
-    Raises
-    ------
-    DegenerateError
-        Too few agree: it is not the pose of these images, or not of these cameras.
+    Raises DegenerateError: too few agree: it is not the pose of these images, or not of these cameras.
     """
     length = known.baseline_mm
     pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)

@@ -52,10 +52,7 @@ def demo_camera() -> Camera:
 def build_demo(directory: str | Path, rng: np.random.Generator, progress: Progress = silent) -> Path:
     """Write the demo capture into a new or empty folder, whole or not at all, and return its manifest.
 
-    Raises
-    ------
-    InputError
-        The folder has something in it, or cannot be written (permission, full disk).
+    Raises InputError: the folder has something in it, or cannot be written (permission, full disk).
     """
     root = Path(directory)
     if root.is_dir() and any(root.iterdir()):

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.interop.colmap import ColmapPair, ColmapResult
@@ -28,7 +27,8 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     known = (cloud.board_index[which], cloud.grid[which], reconstruction.boards)
     # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
     variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
-    spread, by_pose = _uncertainty(reconstruction, which, unit_points, result.adjusted)
+    sights = (each[which] for each in reconstruction.sights())
+    spread, by_pose = point_uncertainty(unit_points, result.adjusted, *sights)
     scale, scale_sigma, d_scale_d_points = scale_and_gradient(unit_points, *known, variance * spread)
     picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
     metric = replace(
@@ -48,13 +48,3 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     of_pose = variance * result.adjusted_covariance
     covariance = covariance_in_mm(result.adjusted.translation_mm, of_pose, scale, scale_sigma, slope)
     return replace(metric, pose_covariance=covariance)
-
-
-def _uncertainty(
-    reconstruction: Reconstruction, which: IntArray, points: Points, pose: Rigid3
-) -> tuple[FloatArray, FloatArray]:
-    """Return the `point_uncertainty` of triangulated points for corners of 1 px."""
-    camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    pixels1, pixels2 = reconstruction.pixels1[which], reconstruction.pixels2[which]
-    rays = (camera1.unproject(pixels1)[0], camera2.unproject(pixels2)[0])
-    return point_uncertainty(points, pose, *rays, camera1.ray_jacobian(pixels1), camera2.ray_jacobian(pixels2))

@@ -218,36 +218,16 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     # What the adjustment leaves in place is as certain as its end, but for a length that it never had.
     own_sigma = np.array(_pose_sigmas(adjusted.cam2_from_cam1, covariance)[:2])
     own = adjusted.cam2_from_cam1
-    moved = np.rad2deg(
-        [
-            rotation_angle(own.rotation @ two_view.rotation.T),
-            angle_between(own.translation_mm, two_view.translation_mm),
-        ]
-    )
+    turned, swung = own.rotation @ two_view.rotation.T, angle_between(own.translation_mm, two_view.translation_mm)
+    moved = np.rad2deg([rotation_angle(turned), swung])
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
     step = np.r_[log_so3(two_view.rotation @ own.rotation.T), two_view.translation_mm - own.translation_mm]
+    of_two_view = covariance + np.outer(step, step) if settled else unknown
+    counts = result.inliers, excluded
     return [
-        _method(
-            TWO_VIEW,
-            reconstruction,
-            two_view,
-            covariance + np.outer(step, step) if settled else unknown,
-            {},
-            np.nan,
-            result.inliers,
-            excluded,
-        ),
-        _method(
-            ADJUSTED,
-            reconstruction,
-            own,
-            covariance,
-            _angles(measure(adjusted)),
-            result.rms_px,
-            result.inliers,
-            excluded,
-        ),
+        _method(TWO_VIEW, reconstruction, two_view, of_two_view, {}, np.nan, *counts),
+        _method(ADJUSTED, reconstruction, own, covariance, _angles(measure(adjusted)), result.rms_px, *counts),
     ]
 
 

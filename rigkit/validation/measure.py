@@ -90,17 +90,8 @@ def measure(
     Raises DegenerateError where a board has too few points.
     """
     cloud = reconstruction.cloud
-    rays1, _ = reconstruction.camera1.unproject(reconstruction.pixels1)
-    rays2, _ = reconstruction.camera2.unproject(reconstruction.pixels2)
     # Only the ratios of these covariances count, as weights across the plane: one pixel is as good a sigma as any.
-    covariance, by_pose = point_uncertainty(
-        cloud.points_mm,
-        reconstruction.cam2_from_cam1,
-        rays1,
-        rays2,
-        reconstruction.camera1.ray_jacobian(reconstruction.pixels1),
-        reconstruction.camera2.ray_jacobian(reconstruction.pixels2),
-    )
+    covariance, by_pose = point_uncertainty(cloud.points_mm, reconstruction.cam2_from_cam1, *reconstruction.sights())
     usable = weighted and bool(np.isfinite(covariance).all())
     moves = [np.zeros((0, len(cloud), 3))]
     if reconstruction.pose_covariance is not None:

@@ -84,10 +84,8 @@ def frames_of_video(
 
     Frames that were kept before, of the same video for the same boards, are used again.
 
-    Raises
-    ------
-    InputError
-        The video cannot be read, no frame shows a board, or `folder` cannot be written to, or holds other files.
+    Raises InputError: the video cannot be read, no frame shows a board, or `folder` cannot be written to, or holds
+    other files.
     """
     return frames_of_videos({"": source}, folder, boards, most=most, progress=progress)
 

@@ -76,10 +76,7 @@ def set_folder(described: PublicSet, root: Path | None = None) -> Path:
 def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress: Progress = silent) -> FetchedSet:
     """Return a public capture with all its files that are here or can be fetched; each has the hash described.
 
-    Raises
-    ------
-    InputError
-        A file that is here has another hash, or cannot be downloaded.
+    Raises InputError: a file that is here has another hash, or cannot be downloaded.
     """
     folder = set_folder(described, root)
     if root is not None and root.exists() and not root.is_dir():

@@ -87,10 +87,7 @@ def grey_image(image: NDArray[np.generic]) -> GreyImage:
     16-bit images are scaled by their own brightest value (the 99.9 % quantile), because 10- and 12-bit sensors do not
     fill the range. Floating-point images are taken as 0..255 as they are, NaN as dark.
 
-    Raises
-    ------
-    InputError
-        Not an image of 1, 3 or 4 channels, or of another type, or smaller than 16x16.
+    Raises InputError: not an image of 1, 3 or 4 channels, or of another type, or smaller than 16x16.
     """
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] == 1:

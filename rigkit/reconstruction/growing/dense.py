@@ -113,10 +113,7 @@ def grow_scene(
     With `pose_is_known` its pose is not estimated again. With `calibrations`, the cameras as they are known,
     what these leave open is in the covariance of the pose and in the cloud's sigmas.
 
-    Raises
-    ------
-    DegenerateError
-        Nothing grows from the seeds.
+    Raises DegenerateError: nothing grows from the seeds.
     """
     r = sparse.reconstruction
     view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)

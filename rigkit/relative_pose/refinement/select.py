@@ -100,10 +100,7 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
     Affinities are not used: what matters here is far better known from the points. `level_sigma_rad` None stands for
     DEFAULT_LEVEL_RAD.
 
-    Raises
-    ------
-    DegenerateError, InputError
-        No type can be fitted (no baseline, too few matches).
+    Raises DegenerateError, InputError: no type can be fitted (no baseline, too few matches).
     """
     level = DEFAULT_LEVEL_RAD if level_sigma_rad is None else float(level_sigma_rad)
     if not level > 0.0:
