@@ -86,9 +86,14 @@ def unit_weights(directions: PlanarDirections) -> tuple[FloatArray, FloatArray]:
     return inverse_square(directions.x1, directions.y1), inverse_square(directions.x2, directions.y2)
 
 
-def smallest_singular(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
-    """Return the smaller singular value of a K x 2 system from its normal matrix, without cancellation."""
+def smaller_eigenvalue(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
+    """Return the smaller eigenvalue of symmetric, positive 2 x 2 matrices, without cancellation."""
     half = 0.5 * (m11 + m22)
-    root = np.sqrt((0.5 * (m11 - m22)) ** 2 + m12 * m12)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.sqrt(np.maximum(m11 * m22 - m12 * m12, 0.0) / (half + root)))
+        root = half + np.sqrt((0.5 * (m11 - m22)) ** 2 + m12 * m12)
+        return np.asarray(np.maximum(m11 * m22 - m12 * m12, 0.0) / root)
+
+
+def smallest_singular(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
+    """Return the smaller singular value of a K x 2 system from its normal matrix."""
+    return np.sqrt(smaller_eigenvalue(m11, m12, m22))

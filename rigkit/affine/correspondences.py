@@ -54,11 +54,7 @@ class Correspondences:
 
     def select(self, which: BoolArray | IntArray) -> Correspondences:
         """Return those picked by a mask or by indices."""
-        d = self.directions
-        if d is not None:
-            d = DirectionPairs(
-                image1=d.image1[which], image2=d.image2[which], valid=d.valid[which], scaled=d.scaled, kinds=d.kinds
-            )
+        d = None if self.directions is None else self.directions.select(which)
         A21, sigma_px, sigma_A = (None if v is None else v[which] for v in (self.A21, self.sigma_px, self.sigma_A))
         return Correspondences(self.pixels1[which], self.pixels2[which], A21, d, sigma_px, sigma_A)
 

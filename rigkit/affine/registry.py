@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rigkit.affine.affinities import Affinities, DirectionNoise, EpipolarNormals, propagated
@@ -124,13 +126,7 @@ def _covariance(
     """Propagate the noise of the directions in use to vec(A), (N, 4, 4), to first order; NaN where invalid."""
     lines = None if epipolar is None else EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])
     known = None if determinant is None else np.asarray(determinant, dtype=np.float64)[valid]
-    some = DirectionPairs(
-        image1=directions.image1[valid],
-        image2=directions.image2[valid],
-        valid=use[valid],
-        scaled=directions.scaled,
-        kinds=directions.kinds,
-    )
+    some = replace(directions, valid=use).select(valid)
 
     def solve(moved: DirectionPairs) -> Affines:
         return _solved(moved, method, lines, scale, known, 0.0)[0]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.affine.components import PlanarDirections, first_of, last_of, unit_weights
+from rigkit.affine.components import PlanarDirections, first_of, last_of, smaller_eigenvalue, unit_weights
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
@@ -79,7 +79,7 @@ def shape_block(directions: PlanarDirections) -> tuple[FloatArray, FloatArray, F
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # Three directions have an exact solution, mu = 0, where its determinant is positive.
         exact = (count == 3) & (_determinant(*_vector(f, np.zeros_like(f.p11))) > 0.0)
-        mu = np.where(exact, 0.0, _smaller_eigenvalue(f.p11, f.p12, f.p22))
+        mu = np.where(exact, 0.0, smaller_eigenvalue(f.p11, f.p12, f.p22))
         open_ = np.flatnonzero(~exact)
         for _ in range(MAX_NEWTON_STEPS):
             if not open_.size:
@@ -112,13 +112,6 @@ def _newton_step(f: _Form, mu: FloatArray) -> FloatArray:
 
 def _determinant(z1: FloatArray, z2: FloatArray, w1: FloatArray, w2: FloatArray) -> FloatArray:
     return z1 * z1 + z2 * z2 - w1 * w1 - w2 * w2
-
-
-def _smaller_eigenvalue(m11: FloatArray, m12: FloatArray, m22: FloatArray) -> FloatArray:
-    half = 0.5 * (m11 + m22)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        root = half + np.sqrt((0.5 * (m11 - m22)) ** 2 + m12 * m12)
-        return np.asarray(np.maximum(m11 * m22 - m12 * m12, 0.0) / root)
 
 
 def _vector(f: _Form, mu: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

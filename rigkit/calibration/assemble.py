@@ -9,13 +9,13 @@ import numpy as np
 from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal_equations import NormalEquations
+from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -39,8 +39,6 @@ def assemble(
     covariance, clustered = _covariance(observations, fit)
     p = state.camera.parameters.size
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:p]))
-    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
-    poses = Rigid3.stack(state.rotation, state.translation_mm)
     return Calibration(
         camera=state.camera,
         rms_px=fit.rms_px,
@@ -50,7 +48,7 @@ def assemble(
         overdispersion=clustered.overdispersion,
         freedom=clustered.freedom,
         sigma_px=sigma,
-        views=ViewResult.of_views(observations.views, poses, px, fit.kept),
+        views=view_results(observations, state, fit.residuals, fit.kept),
         dropped=dropped,
         outliers=outliers_of(observations, fit),
         candidates=candidates,
@@ -169,6 +167,14 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
             "calibration: the views leave the focal length open (all boards nearly parallel to the image, or too few "
             "corners); take views in which the board is tilted by 20 to 50 degrees in several directions"
         )
+
+
+def view_results(
+    observations: Observations, state: State, residuals: Residuals, kept: BoolArray
+) -> tuple[ViewResult, ...]:
+    """Return what is said of each view; residuals of corners that do not project are NaN."""
+    px = np.where(residuals.valid[..., None], residuals.px, np.nan)
+    return ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept)
 
 
 def board_shapes(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> tuple[BoardShape, ...]:

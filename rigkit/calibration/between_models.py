@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import Fit, fit_kept
+from rigkit.calibration.fit import Fit, fit_other_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.state import State
@@ -62,8 +62,7 @@ def rival_fits(
             continue
         start = replace(chosen.state.with_corners_held(), camera=camera)
         try:
-            # The scatter that priors are weighed by is known after the first round.
-            fit = fit_kept(observations, fit_kept(observations, start, chosen.kept).state, chosen.kept)
+            fit = fit_other_lens(observations, start, chosen.kept)
         except (InputError, DegenerateError):
             continue
         found.append(RivalFit(Rival(option.name, fit.state.camera, likely[option.name]), fit.state))

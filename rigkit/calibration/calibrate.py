@@ -35,7 +35,7 @@ from rigkit.calibration.verdicts import judge
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 
 FOLDS = 5
@@ -252,10 +252,9 @@ def _at_the_end(
     if not beyond or "model" in in_force or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
         return []
     return [
-        Finding(
-            severity=Severity.LOOK,
-            message=f"{beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, "
+        Finding.look(
+            f"{beyond[-1][0]} is the largest there is of its kind, and the best: the lens may ask for more, "
             "most towards its rim",
-            remedy='try model = "auto"',
+            'try model = "auto"',
         )
     ]

@@ -80,10 +80,6 @@ def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, 
     ]
 
 
-def _look(message: str, remedy: str) -> Finding:
-    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
-
-
 def _axes(c: Calibration, axis: int) -> FloatArray:
     """Return the axis of every board in the camera frame, (V, 3)."""
     return c.corners.rotation[:, :, axis]
@@ -95,11 +91,10 @@ def _tilts(c: Calibration) -> list[Finding]:
     if tilted >= min(TILTED_VIEWS, len(c.views)):
         return []
     return [
-        Finding(
-            severity=Severity.BAD,
-            message=f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
+        Finding.bad(
+            f"the board is tilted by more than {TILTED_DEG:.0f} degrees against the image in {tilted} of "
             f"{len(c.views)} views only",
-            remedy=f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
+            f"take at least {TILTED_VIEWS} with the board tilted by 20 to 50 degrees, about different axes",
         )
     ]
 
@@ -113,7 +108,7 @@ def _parallel(c: Calibration) -> list[Finding]:
     if len(c.views) < 2 or spread > PARALLEL_DEG:
         return []
     return [
-        _look(
+        Finding.look(
             f"all boards are nearly parallel to each other (within {spread:.1f} degrees, rms)",
             "tilt the board by 20 to 50 degrees, left and right, forward and back",
         )
@@ -129,7 +124,7 @@ def _upright(c: Calibration) -> list[Finding]:
     if len(c.views) < 2 or quantiles_of(turned, [NEARLY_ALL])[0] > UPRIGHT_DEG:
         return []
     return [
-        _look(
+        Finding.look(
             "the boards are the same way up in all images: squares that are longer one way than the other hide in fx "
             "against fy",
             "turn the board by a quarter of a turn in half of the images",
@@ -162,7 +157,7 @@ def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
     one, other = next(iter(again.items()))
     what = f"image '{one}' shows" if len(again) == 1 else f"{len(again)} images, '{one}' the first, show"
     return [
-        _look(
+        Finding.look(
             f"{what} the board where another one does ('{other}'): they count as one",
             "move the board from image to image",
         )
@@ -176,7 +171,7 @@ def _distances(c: Calibration) -> list[Finding]:
     near, far = quantiles_of(corner_ranges(c), [0.05, 0.95])
     if far > ONE_DISTANCE * near:
         return []
-    return [_look("all boards were at one distance", "hold some at half and some at double of it")]
+    return [Finding.look("all boards were at one distance", "hold some at half and some at double of it")]
 
 
 def _extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
@@ -189,7 +184,7 @@ def _extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Fi
     if usual <= MAX_TIMES_ERROR * max(error, SMALL_PX):
         return []
     return [
-        _look(
+        Finding.look(
             f"in the {100 - round(100.0 * extent.share)} % of the image where no boards were the lens is extrapolated, "
             f"and uncertain by {usual:.2g} px (one standard deviation, rms)",
             "hold the board there as well, up to the corners of the image",

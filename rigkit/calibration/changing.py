@@ -13,15 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes
+from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.solver import solve
 from rigkit.calibration.two_kinds import two_kinds
 from rigkit.calibration.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
-from rigkit.core.findings import Finding, Severity
-from rigkit.geometry.rigid3 import Rigid3
+from rigkit.core.findings import Finding
 
 MIN_VARIANCE_RATIO = 6.0
 """Variance along a way to change over that of the rest."""
@@ -139,7 +138,7 @@ def changing(
     if best in but:
         return []
     message = f"{way.message}: that explains {100.0 * changes[best].share:.0f} % of the squares of all residuals"
-    return [Finding(severity=Severity.LOOK, message=message, remedy=way.remedy)]
+    return [Finding.look(message, way.remedy)]
 
 
 def _leads(changes: Mapping[str, ViewChange], way: str, but: Collection[str] = ()) -> bool:
@@ -170,12 +169,10 @@ def _solved_for(
     _, directions, amounts = evidence.explained(columns)
     for rounds in range(LENS_ROUNDS):
         if rounds:
-            poses = Rigid3.stack(start.rotation, start.translation_mm)
-            px = np.where(residuals.valid[..., None], residuals.px, np.nan)
             solved = replace(
                 calibration,
                 camera=start.camera,
-                views=ViewResult.of_views(observations.views, poses, px, fit.kept),
+                views=view_results(observations, start, residuals, fit.kept),
                 boards=board_shapes(observations, start.shape, start.unknowns),
             )
             now = view_evidence(solved)

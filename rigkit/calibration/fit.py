@@ -194,6 +194,12 @@ def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settl
     return _settled(observations, state, norm, kept, SETTLE_ROUNDS if settle else 1)
 
 
+def fit_other_lens(observations: Observations, state: State, kept: BoolArray) -> Fit:
+    """Return the least-squares solution on the kept corners from a lens that was found with others."""
+    # The scatter that priors are weighed by is known after the first round.
+    return fit_kept(observations, fit_kept(observations, state, kept).state, kept)
+
+
 def _settled(
     observations: Observations,
     state: State,

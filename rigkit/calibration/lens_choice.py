@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, settled
-from rigkit.calibration.fit import fit_kept, heldout_squares
+from rigkit.calibration.fit import fit_other_lens, heldout_squares
 from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved
@@ -82,8 +82,7 @@ def lenses_on_boards(found: Solved, tried: Lenses, names: Sequence[str], how: Ho
         if option.name not in names:
             continue
         start = replace(state, camera=option.fit.state.camera)
-        # The scatter that priors are weighed by is known after the first round.
-        fit = fit_kept(observations, fit_kept(observations, start, kept).state, kept)
+        fit = fit_other_lens(observations, start, kept)
         options.append(replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None))
     # What does not even show the images that it was fitted to as well as another one predicts them is no better.
     options.sort(key=lambda o: o.fit.rms_px)

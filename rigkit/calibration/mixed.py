@@ -12,7 +12,7 @@ import numpy as np
 from rigkit.calibration.repeats import close_pairs
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray, IntArray
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 
 SAME_MOTION = 0.005
 """Boards that land within this part of their distance were moved alike."""
@@ -48,11 +48,10 @@ def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
     if alike < MIN_PARTNERS or not enough or len(chained) > MAX_SHARE_CHAINED * len(together):
         return []
     return [
-        Finding(
-            severity=Severity.BAD,
-            message=f"two cameras are mixed in these images: between '{images[start[0]]}' and '{images[end[0]]}', and "
+        Finding.bad(
+            f"two cameras are mixed in these images: between '{images[start[0]]}' and '{images[end[0]]}', and "
             f"{alike - 1} other pairs of images, the board has moved in one and the same way",
-            remedy="calibrate each camera from its own images, or both as a rig with [[cameras]]",
+            "calibrate each camera from its own images, or both as a rig with [[cameras]]",
         )
     ]
 

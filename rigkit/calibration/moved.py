@@ -17,7 +17,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.solver import solve
 from rigkit.calibration.state import State, evaluate
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 
 MIN_IMAGES_FOR_HALVES = 10
 MIN_HALF_SIGMAS = 3.0
@@ -50,7 +50,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
                 f"two cameras are mixed in these images: those called like '{one}' and those called like '{other}' are "
                 f"of different lenses ({distance:.0f} standard deviations)"
             )
-            return (_bad(message, "calibrate each camera from its own images"),)
+            return (Finding.bad(message, "calibrate each camera from its own images"),)
     distance = _surely_apart(observations, fit, state, number, later)
     if distance is None:
         return ()
@@ -59,11 +59,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
         f"'{images[len(images) // 2]}' on ({distance:.0f} standard deviations): another camera, or focus, zoom or "
         "mount moved"
     )
-    return (_bad(message, "calibrate the halves apart, or retake all"),)
-
-
-def _bad(message: str, remedy: str) -> Finding:
-    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
+    return (Finding.bad(message, "calibrate the halves apart, or retake all"),)
 
 
 def _named_alike(images: Sequence[str]) -> BoolArray | None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes, outliers_of
+from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choice import Option
 from rigkit.calibration.fit import (
@@ -25,7 +25,7 @@ from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import with_board_shape
 from rigkit.calibration.poses import find_poses, refine_poses
-from rigkit.calibration.result import Calibration, Candidate, Convergence, ViewResult
+from rigkit.calibration.result import Calibration, Candidate, Convergence
 from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
@@ -33,9 +33,8 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
-from rigkit.geometry.rigid3 import Rigid3
 
 START_MM = 1000.0
 MIN_KEPT_SHARE = 0.5
@@ -73,7 +72,6 @@ def posed_calibration(
     observations, fit, dropped = _on_flat_boards(views, camera)
     observations, fit, heldout_px, candidates = _shaped(observations, fit, board, folds)
     state, kept = fit.state, fit.kept
-    px = np.where(fit.residuals.valid[..., None], fit.residuals.px, np.nan)
     p = camera.parameters.size
     own = np.zeros((p, p)) if covariance is None else covariance
     frame = np.zeros((p + 6, p + 6))
@@ -85,7 +83,7 @@ def posed_calibration(
         covariance=own,
         frame_covariance=frame,
         sigma_px=fit.sigma_px,
-        views=ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept),
+        views=view_results(observations, state, fit.residuals, kept),
         dropped=dropped,
         outliers=outliers_of(observations, fit),
         candidates=candidates,
@@ -162,4 +160,4 @@ def _misfit(result: Calibration) -> tuple[Finding, ...]:
     if result.rms_px <= MAX_LENS_MISFIT_PX:
         return ()
     message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
-    return (Finding(severity=Severity.BAD, message=message, remedy="calibrate it anew"),)
+    return (Finding.bad(message, "calibrate it anew"),)

@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.view_evidence import COMMON, WAY_COLUMNS, ViewEvidence, columns_of
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 
 MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND = 3, 0.1
 """Fewer images that are unlike the others are named one by one."""
@@ -87,10 +87,8 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     views = [calibration.views[k] for k in evidence.views]
     sides = [[v.image for v, of in zip(views, best.second, strict=True) if of == kind] for kind in (False, True)]
     like = " and ".join(f"{len(set(images))} like '{images[0]}'" for images in sides)
-    return Finding(
-        severity=Severity.BAD,
-        message=f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}",
-        remedy=APART,
+    return Finding.bad(
+        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}", APART
     )
 
 

@@ -143,18 +143,10 @@ def with_headline(
     error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
     found = [*causes, *effects]
     if not found:
-        return [Finding(severity=Severity.GOOD, message=error + where)]
+        return [Finding.good(error + where)]
     first = next((cause for cause in causes if cause.severity is Severity.BAD), found[0])
     named = replace(first, severity=worst(found), message=f"{error}{where}, but {first.message}")
     return [named, *(finding for finding in found if finding is not first)]
-
-
-def _look(message: str, remedy: str | None = None, image: str | None = None) -> Finding:
-    return Finding(severity=Severity.LOOK, message=message, image=image, remedy=remedy)
-
-
-def _bad(message: str, remedy: str | None = None) -> Finding:
-    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
 
 
 def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
@@ -162,7 +154,7 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
         return []
     other = "" if "model" in in_force else 'try model = "auto", or '
     return [
-        _bad(
+        Finding.bad(
             f"the solver did not converge ({c.convergence.reason}): the model may not fit this lens",
             f"{other}add views with the board tilted",
         )
@@ -183,7 +175,7 @@ def _of_another_kind(c: Calibration) -> list[Finding]:
         return []
     total = len({view.image for view in c.views}) + len(images)
     what = f"{len(images)} of {total} images contradict the others and are left out, '{images[0]}' the first"
-    return [_look(what, APART, images[0])]
+    return [Finding.look(what, APART, images[0])]
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
@@ -193,19 +185,21 @@ def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -
     dropped = [(image, reason) for image, reason in dropped if image not in told]
     used = {view.image for view in views}
     parts = [(image, reason) for image, reason in dropped if image in used and reason != BESIDE]
-    found = [_look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts]
+    found = [
+        Finding.look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts
+    ]
     return [*_images_left_out([(image, reason) for image, reason in dropped if image not in used]), *found[:NAMED]]
 
 
 def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
     if len(dropped) <= NAMED:
-        return [_look(f"image '{image}' is left out: {reason}", image=image) for image, reason in dropped]
+        return [Finding.look(f"image '{image}' is left out: {reason}", image=image) for image, reason in dropped]
     reasons = Counter(reason for _, reason in dropped)
     first = {reason: image for image, reason in reversed(dropped)}
     return [
-        _look(f"{count} images are left out, '{first[reason]}' the first: {reason}")
+        Finding.look(f"{count} images are left out, '{first[reason]}' the first: {reason}")
         if count > 1
-        else _look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
+        else Finding.look(f"image '{first[reason]}' is left out: {reason}", image=first[reason])
         for reason, count in reasons.most_common(NAMED)
     ]
 
@@ -224,7 +218,7 @@ def _coverage(c: Calibration) -> list[Finding]:
     empty = (count < CELL_CORNERS) & valid & (np.where(valid, rays[..., 2], -1.0) > np.cos(np.radians(ASKED_DEG)))
     if not empty.any():
         return []
-    return [_look(f"no corners in the {_in_words(empty)} of the image", "hold the board there, tilted")]
+    return [Finding.look(f"no corners in the {_in_words(empty)} of the image", "hold the board there, tilted")]
 
 
 def _in_words(cells: BoolArray) -> str:
@@ -273,7 +267,7 @@ def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
         other = times[i] > UNLIKE and middle[i] > SMALL_PX
         remedy = "look whether the board or the camera moved" + (", or another camera took it" if other else "")
         (unlike if other else found).append(
-            _look(f"image '{view.image}' {what}", f"{remedy}, and retake it", view.image)
+            Finding.look(f"image '{view.image}' {what}", f"{remedy}, and retake it", view.image)
         )
     return unlike, found
 
@@ -294,18 +288,20 @@ def _pattern(c: Calibration, correlation: float, in_force: Collection[str]) -> l
     what = f"residuals of neighbouring corners agree (correlation {correlation:.2f}): "
     shapes = "board_shape" in in_force or any(board.kind == "released" for board in c.boards)
     if not shapes:
-        return [_look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]
+        return [Finding.look(what + "the board's shape or the lens model does not fit", 'try board_shape = "auto"')]
     if "model" not in in_force:
-        return [_look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
+        return [Finding.look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
     what += "neither the lens models nor the boards' shapes follow all of it, so that something differs between images"
-    return [_look(what, "fix focus and stabilisation, hold camera and board still, take a board that does not bend")]
+    return [
+        Finding.look(what, "fix focus and stabilisation, hold camera and board still, take a board that does not bend")
+    ]
 
 
 def _overfit(c: Calibration) -> list[Finding]:
     if c.heldout_rms_px is None or c.heldout_rms_px <= OVERFIT * c.rms_px:
         return []
     return [
-        _look(
+        Finding.look(
             f"held-out RMS is {c.heldout_rms_px / c.rms_px:.2f} times the training RMS: the images are too few for "
             "this model, or some image is unlike the others",
             "take more",
@@ -320,7 +316,7 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
         if usual <= max(error, SMALL_PX):
             return []
         return [
-            _look(
+            Finding.look(
                 f"the projection is uncertain by {usual:.2f} px (one standard deviation) where the boards were, more "
                 f"than the error of {error:.2f} px that the images show",
                 "take more views, with the board tilted",
@@ -328,11 +324,11 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
         ]
     what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
-        return [_bad(what, "take more views, with the board tilted")]
+        return [Finding.bad(what, "take more views, with the board tilted")]
     pixels = c.corners.pixels[c.corners.kept]
     place = pixels[np.linspace(0, len(pixels) - 1, len(inside)).astype(np.int64)[np.nanargmax(inside)]]
     what += f", most in the {_cell(c, place)} of the image"
-    return [_bad(what, "take more views there, with the board tilted")]
+    return [Finding.bad(what, "take more views there, with the board tilted")]
 
 
 def _boards(c: Calibration) -> list[Finding]:
@@ -344,7 +340,7 @@ def _boards(c: Calibration) -> list[Finding]:
         extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
         if board.bow_mm > 2e-3 * extent:
             out.append(
-                _look(
+                Finding.look(
                     f"board '{board.board_id}' departs from a plane by {board.bow_mm:.2f} mm",
                     "its shape is part of the solution, but glue it to something flat: it may bend otherwise next time",
                 )
@@ -352,7 +348,7 @@ def _boards(c: Calibration) -> list[Finding]:
         if abs(board.aspect) > ASPECT:
             longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
             out.append(
-                _look(
+                Finding.look(
                     f"board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
                     f"stated, compared with {other}",
                     "measure square_x_mm and square_y_mm again",
@@ -368,7 +364,7 @@ def _outliers(c: Calibration) -> list[Finding]:
         return []
     image, count = Counter(outlier.image for outlier in far).most_common(1)[0]
     return [
-        _look(
+        Finding.look(
             f"{100 * share:.1f} % of the corners are outliers, most of them ({count}) in '{image}'",
             "check exposure, focus and motion blur there",
         )

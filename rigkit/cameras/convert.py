@@ -81,7 +81,7 @@ def convert_camera(
     pixels, rays = pixels[valid], rays[valid]
     if len(pixels) < MIN_COVERED_SAMPLES:
         raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
-    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    theta = _off_axis_rad(rays)
     centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
     inside = np.ones(len(pixels), dtype=bool) if outline is None else _inside(outline, pixels)
     if not inside.any():
@@ -142,7 +142,7 @@ def fit_camera(
     Started from the radial curve around `centre_px`. Rays that the model cannot see are left out.
     Raises InputError where the model has no start for this lens.
     """
-    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    theta = _off_axis_rad(rays)
     start = _start(model, size_px, theta, pixels, centre_px, order)
     return refit_camera(start, rays, pixels)
 
@@ -156,11 +156,16 @@ def refit_camera(
     each error, None: all count alike.
     """
     weight = np.ones(len(rays)) if weight is None else weight
-    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    theta = _off_axis_rad(rays)
     used = theta < INSIDE * start.max_angle_rad
     used[used] &= start.project(rays[used])[1]
     stop = Stop(steps=MAX_CONVERT_STEPS, gain=CONVERT_SETTLED, cost=ROUNDING_PX**2 * 2 * int(used.sum()))
     return nearest_camera(start, rays[used], pixels[used], _free(start, fixed), stop, weight[used])[0]
+
+
+def _off_axis_rad(rays: Rays) -> FloatArray:
+    """Return the angles (N,) of rays (N, 3) from the optical axis."""
+    return np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
 
 
 def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:

@@ -26,7 +26,7 @@ class Finding:
     image : the image that it is about, if it is about one.
     remedy : what to do, if something can be done.
 
-    >>> str(Finding(severity=Severity.LOOK, message="5 images only", remedy="take at least 8"))
+    >>> str(Finding.look("5 images only", "take at least 8"))
     'look: 5 images only; take at least 8'
     """
 
@@ -34,6 +34,18 @@ class Finding:
     message: str
     image: str | None = None
     remedy: str | None = None
+
+    @classmethod
+    def good(cls, message: str) -> Finding:
+        return cls(severity=Severity.GOOD, message=message)
+
+    @classmethod
+    def look(cls, message: str, remedy: str | None = None, image: str | None = None) -> Finding:
+        return cls(severity=Severity.LOOK, message=message, image=image, remedy=remedy)
+
+    @classmethod
+    def bad(cls, message: str, remedy: str | None = None) -> Finding:
+        return cls(severity=Severity.BAD, message=message, remedy=remedy)
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.text}"

@@ -78,6 +78,17 @@ class DirectionPairs:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
 
+    def select(self, which: BoolArray | IntArray) -> DirectionPairs:
+        """Return those at the points picked by a mask or by indices, without the pixels."""
+        return replace(
+            self,
+            image1=self.image1[which],
+            image2=self.image2[which],
+            valid=self.valid[which],
+            pixels1=None,
+            pixels2=None,
+        )
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Matches:

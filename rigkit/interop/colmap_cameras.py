@@ -55,7 +55,7 @@ def write_colmap_cameras(
         ours["cx"] += HALF_PIXEL
         ours["cy"] += HALF_PIXEL
         values = " ".join(repr(ours.get(key, 0.0)) for key in LAYOUTS[name][1])
-        line = chosen.written(f"{camera_id} {name} {c.size_px[0]} {c.size_px[1]} {values}\n")
+        line = replace(chosen, text=f"{camera_id} {name} {c.size_px[0]} {c.size_px[1]} {values}\n")
         if c.model in ("kannala_brandt", "eucm") and _sees_behind(c):
             note = f"{line.note}; {BEHIND}" if line.note else BEHIND
             line = replace(line, note=note)

@@ -48,37 +48,24 @@ class Written:
 
     Attributes
     ----------
-    text : the file.
     camera : the camera as the file describes it.
     max_error_px : its projection against the camera given, over the part of the image it covers, inside the outline of
         what was seen where that is known; 0 where the format has the model.
     covered : that part, as a share of the image.
     note : in words, what a user of the file should know; empty where nothing was lost.
+    text : the file; empty until it is written.
     """
-
-    text: str
-    camera: Camera
-    max_error_px: float
-    covered: float
-    note: str
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Chosen:
-    """The camera that goes into the file, with what `Written` says of it."""
 
     camera: Camera
     max_error_px: float = 0.0
     covered: float = 1.0
     note: str = ""
-
-    def written(self, text: str) -> Written:
-        return Written(text, self.camera, self.max_error_px, self.covered, self.note)
+    text: str = ""
 
 
 def best_accepted(
     camera: Camera, accepted: Sequence[Accepted], format_name: str, outline: Pixels | None = None
-) -> Chosen:
+) -> Written:
     """Return the camera itself where the format has its model, else the nearest of those that it has.
 
     Nearest: the one that covers most of the image, then the one with the smallest largest error inside the `outline`
@@ -89,8 +76,8 @@ def best_accepted(
     for same in (camera, *_without_zero_terms(camera)):
         for kind in accepted:
             if kind.holds(same):
-                return Chosen(same)
-    found: list[tuple[float, Chosen]] = []
+                return Written(same)
+    found: list[tuple[float, Written]] = []
     for kind in accepted:
         try:
             c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero, outline=outline)
@@ -108,7 +95,7 @@ def best_accepted(
             degree = "" if kind.model != camera.model else f" and degree = {kind.order}"
             note += f'; with model = "{kind.model}"{degree} in the session nothing is lost'
         cost = max(c.max_px, OUTSIDE_WEIGHT * c.outside_px)
-        found.append((cost, Chosen(c.camera, c.max_px, c.covered, note)))
+        found.append((cost, Written(c.camera, c.max_px, c.covered, note)))
     if not found:
         raise InputError(
             f"{format_name}: none of its models can follow this {camera.model} camera; choose another format"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def write_kalibr(
             f"  resolution: {flow(list(camera.size_px))}",
             f"  rostopic: /cam{i}/image_raw",
         ]
-        parts.append(chosen.written("\n".join(lines) + "\n"))
+        parts.append(replace(chosen, text="\n".join(lines) + "\n"))
     return KalibrChain("".join(part.text for part in parts), tuple(parts))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -58,14 +59,14 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
     if chosen is not None and chosen.covered == 1.0 and chosen.max_error_px < CLOSE_ENOUGH_PX:
         p = chosen.camera.parameters
         lens = {4: "PINHOLE", 8: "OPENCV4", 9: "OPENCV5", 12: "OPENCV8"}[p.size]
-        return chosen.written(_text(f"LENSMODEL_{lens}", p, camera.size_px, pose, outline))
+        return replace(chosen, text=_text(f"LENSMODEL_{lens}", p, camera.size_px, pose, outline))
     lens, intrinsics = _spline_of(camera)
     pixels, rays = _samples(camera, CHECK_GRID)
     projected, inside = _spline_project(rays, lens, intrinsics)
     error = np.linalg.norm(projected - pixels, axis=-1)[inside]
     note = f"written as a spline of {(intrinsics.size - 4) // 2} knots, off by {error.max():.2g} px at most"
     text = _text(lens, intrinsics, camera.size_px, pose, outline)
-    return Written(text, camera, float(error.max()), float(inside.mean()), note)
+    return Written(camera, float(error.max()), float(inside.mean()), note, text)
 
 
 def read_cameramodel(

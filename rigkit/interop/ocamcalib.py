@@ -17,7 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.scaramuzza import DEGREES, Scaramuzza
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import Accepted, Chosen, Written, best_accepted, camera_of, image_size, numbers
+from rigkit.interop.exchange import Accepted, Written, best_accepted, camera_of, image_size, numbers
 
 ENOUGH_PX = 0.02
 """A polynomial of a higher degree is taken only where the lower one is off by more."""
@@ -57,9 +57,8 @@ def write_ocamcalib(camera: Camera, outline: Pixels | None = None) -> Written:
         f"{title}\n\n{' '.join(str(v) if isinstance(v, int) else repr(float(v)) for v in row)}\n\n"
         for title, row in zip(TITLES, values, strict=True)
     )
-    written = chosen.written(text)
     note = f"the inverse polynomial of {inverse.size} terms follows to {error_px:.2g} px"
-    return replace(written, note=f"{written.note}; {note}" if written.note else note)
+    return replace(chosen, text=text, note=f"{chosen.note}; {note}" if chosen.note else note)
 
 
 def read_ocamcalib(text: str, name: str = "calib_results.txt") -> tuple[Scaramuzza, Mat3]:
@@ -130,9 +129,9 @@ def _from_ocam(
     return cast(Scaramuzza, camera_of("scaramuzza", size_px, parameters, name)), cam_from_ocam
 
 
-def _scaramuzza(camera: Camera, outline: Pixels | None) -> Chosen:
+def _scaramuzza(camera: Camera, outline: Pixels | None) -> Written:
     """Return the camera itself, or the refit of the lowest degree that follows it."""
-    best: Chosen | None = None
+    best: Written | None = None
     for degree in (4, 6, 8, 10):
         chosen = best_accepted(camera, (Accepted("scaramuzza", degree),), "OCamCalib", outline)
         if best is None or chosen.max_error_px < 0.5 * best.max_error_px:

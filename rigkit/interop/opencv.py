@@ -5,6 +5,7 @@ The keys are those that OpenCV's own calibration samples write. Pixels as ours.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
         f"image_width: {c.size_px[0]}\nimage_height: {c.size_px[1]}\n{extra}"
         f"camera_matrix: {opencv_matrix(K)}distortion_coefficients: {opencv_matrix(distortion)}"
     )
-    return chosen.written(text)
+    return replace(chosen, text=text)
 
 
 def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:

@@ -18,7 +18,7 @@ from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
-from rigkit.interop.exchange import PERSPECTIVE, Accepted, Chosen, best_accepted, written_size
+from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, written_size
 from rigkit.interop.opencv import camera_from_arrays, opencv_arrays, opencv_matrix, read_opencv_matrix
 from rigkit.interop.yaml_text import parse_yaml
 
@@ -38,7 +38,7 @@ class OpenCVStereo:
     text : the file.
     """
 
-    cameras: tuple[Chosen, Chosen]
+    cameras: tuple[Written, Written]
     R1: Mat3
     R2: Mat3
     P1: FloatArray
@@ -92,7 +92,9 @@ def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Ca
         raise InputError(f"'{name}': R is no rotation; is the file whole?") from error
 
 
-def _family(camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]) -> tuple[tuple[Chosen, Chosen], bool]:
+def _family(
+    camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]
+) -> tuple[tuple[Written, Written], bool]:
     """Return both cameras in that family of models that covers more of them, then follows them better."""
     found = []
     for fisheye, accepted in enumerate(FAMILIES):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from rigkit.cameras.base import Camera
@@ -13,10 +13,10 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.colmap_cameras import write_colmap_cameras
 from rigkit.interop.colmap_model import quaternion_wxyz
-from rigkit.interop.exchange import MM_PER_M
+from rigkit.interop.exchange import MM_PER_M, Written
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
-from rigkit.interop.opencv_stereo import opencv_stereo
+from rigkit.interop.opencv_stereo import OpenCVStereo, opencv_stereo
 from rigkit.interop.ros import write_camera_info
 
 Rig = Mapping[str, tuple[Camera, Rigid3]]
@@ -79,23 +79,16 @@ def _mrcal(rig: Rig, outlines: Outlines) -> ForeignRig:
     written = {
         name: write_cameramodel(camera, pose, outline=outlines.get(name)) for name, (camera, pose) in rig.items()
     }
-    notes = tuple(f"'{name}': {one.note}" for name, one in written.items() if one.note)
-    return ForeignRig(
-        {name: one.text for name, one in written.items()}, max(one.max_error_px for one in written.values()), notes
-    )
+    return _foreign(rig, {name: one.text for name, one in written.items()}, written.values())
 
 
 def _opencv(rig: Rig, outlines: Outlines) -> ForeignRig:
-    (one, (camera1, pose1)), (two, (camera2, pose2)) = _two(rig, "OpenCV")
-    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse(), (outlines.get(one), outlines.get(two)))
-    notes = [f"1 is '{one}', 2 is '{two}'; lengths in mm"]
-    notes += [f"'{name}': {c.note}" for name, c in zip(rig, stereo.cameras, strict=True) if c.note]
-    return ForeignRig({"": stereo.text}, max(c.max_error_px for c in stereo.cameras), tuple(notes))
+    one, two, stereo = _stereo(rig, outlines, "OpenCV")
+    return _foreign(rig, {"": stereo.text}, stereo.cameras, f"1 is '{one}', 2 is '{two}'; lengths in mm")
 
 
 def _ros(rig: Rig, outlines: Outlines) -> ForeignRig:
-    (one, (camera1, pose1)), (two, (camera2, pose2)) = _two(rig, "ROS")
-    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse(), (outlines.get(one), outlines.get(two)))
+    one, two, stereo = _stereo(rig, outlines, "ROS")
     P2 = stereo.P2.copy()
     P2[:, 3] /= MM_PER_M
     views = {one: (stereo.R1, stereo.P1), two: (stereo.R2, P2)}
@@ -103,9 +96,8 @@ def _ros(rig: Rig, outlines: Outlines) -> ForeignRig:
         name: write_camera_info(c.camera, re.sub(r"\W", "_", name, flags=re.ASCII), rectification=views[name]).text
         for name, c in zip(rig, stereo.cameras, strict=True)
     }
-    notes = [f"left is '{one}', right '{two}'; rectified by OpenCV, lengths in metres"]
-    notes += [f"'{name}': {c.note}" for name, c in zip(rig, stereo.cameras, strict=True) if c.note]
-    return ForeignRig(files, max(c.max_error_px for c in stereo.cameras), tuple(notes))
+    what = f"left is '{one}', right '{two}'; rectified by OpenCV, lengths in metres"
+    return _foreign(rig, files, stereo.cameras, what)
 
 
 def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
@@ -125,17 +117,25 @@ def _colmap(rig: Rig, outlines: Outlines) -> ForeignRig:
         else:
             entry["ref_sensor"] = True
         cameras.append({**entry, "camera_model_name": model, "camera_params": [float(value) for value in values]})
-    notes = ["rig_config.json of COLMAP; one folder of images a camera, lengths in mm"]
-    notes += [f"'{name}': {line.note}" for name, line in zip(rig, written.values(), strict=True) if line.note]
     text = json.dumps([{"cameras": cameras}], indent=1, allow_nan=False) + "\n"
-    return ForeignRig({"": text}, max(line.max_error_px for line in written.values()), tuple(notes))
+    what = "rig_config.json of COLMAP; one folder of images a camera, lengths in mm"
+    return _foreign(rig, {"": text}, written.values(), what)
 
 
-def _two(rig: Rig, format_name: str) -> tuple[tuple[str, tuple[Camera, Rigid3]], tuple[str, tuple[Camera, Rigid3]]]:
+def _stereo(rig: Rig, outlines: Outlines, format_name: str) -> tuple[str, str, OpenCVStereo]:
+    """Return the names of the rig's two cameras, and both as OpenCV has them."""
     if len(rig) != 2:
         raise InputError(f"{format_name} has files of stereo pairs, this rig has {len(rig)} cameras; name two of them")
-    one, two = rig.items()
-    return one, two
+    (one, (camera1, pose1)), (two, (camera2, pose2)) = rig.items()
+    stereo = opencv_stereo(camera1, camera2, pose2 @ pose1.inverse(), (outlines.get(one), outlines.get(two)))
+    return one, two, stereo
+
+
+def _foreign(rig: Rig, files: Mapping[str, str], cameras: Iterable[Written], *about: str) -> ForeignRig:
+    """Return the rig in these files, which hold these cameras; `about` it, and of each of them, there are notes."""
+    written = list(cameras)
+    notes = [f"'{name}': {one.note}" for name, one in zip(rig, written, strict=True) if one.note]
+    return ForeignRig(files, max(one.max_error_px for one in written), (*about, *notes))
 
 
 RIG_FORMATS = {

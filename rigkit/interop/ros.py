@@ -6,6 +6,8 @@ matrix the camera matrix.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rigkit.cameras.base import Camera
@@ -63,7 +65,7 @@ def write_camera_info(
         f"rectification_matrix:\n{_matrix(R)}"
         f"projection_matrix:\n{_matrix(P)}"
     )
-    return chosen.written(text)
+    return replace(chosen, text=text)
 
 
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:

@@ -17,7 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import board_pose
@@ -304,10 +304,9 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
     """Return the file `source` with the change that explains the pictures, and a finding that says so."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
     fixed, own = check.fixed, check.watched.of_models
-    said = Finding(
-        severity=Severity.LOOK,
-        message=f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
-        remedy="calibrate anew when there is time",
+    said = Finding.look(
+        f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
+        "calibrate anew when there is time",
     )
     # What the lenses may do beyond their models the file says by itself.
     covariance = np.array(data["covariance"]) + (check.covariance - check.watched.covariance)[np.ix_(own, own)]

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes, motion_of_world
+from rigkit.calibration.assemble import board_shapes, motion_of_world, view_results
 from rigkit.calibration.clustered import Clustered, effective_freedom, with_block
-from rigkit.calibration.result import Calibration, ViewResult
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.clustered import clustered_by_frame
@@ -98,8 +98,6 @@ def _of_camera(
     residuals = joint.solution.normal.residuals[c]
     kept = observations.weights[c] > 0.0
     squared = (residuals.px**2).sum(axis=-1)[kept]
-    px = np.where(residuals.valid[..., None], residuals.px, np.nan)
-    poses = Rigid3.stack(alone.rotation, alone.translation_mm)
     p = alone.camera.parameters.size
     found = replace(
         single,
@@ -107,7 +105,7 @@ def _of_camera(
         rms_px=float(np.sqrt(squared.mean())),
         covariance=frame_covariance[:p, :p],
         frame_covariance=frame_covariance,
-        views=ViewResult.of_views(observations.cameras[c].views, poses, px, kept),
+        views=view_results(observations.cameras[c], alone, residuals, kept),
         convergence=joint.solution.convergence,
         boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
     )

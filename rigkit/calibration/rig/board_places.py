@@ -18,7 +18,7 @@ from rigkit.calibration.rig.observations import FrameObservations, Observation, 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 
@@ -94,10 +94,9 @@ def board_places(
         open_scenes = sum(r is None and len(s) > 1 for s, r in zip(scenes, readings, strict=True))
         if open_scenes:
             notes.append(
-                Finding(
-                    severity=Severity.LOOK,
-                    message=f"in {open_scenes} of {len(scenes)} images nothing tells which of the boards "
-                    f"{', '.join(group)} is which; there they count as boards of their own",
+                Finding.look(
+                    f"in {open_scenes} of {len(scenes)} images nothing tells which of the boards "
+                    f"{', '.join(group)} is which; there they count as boards of their own"
                 )
             )
     return out, places, tuple(notes)

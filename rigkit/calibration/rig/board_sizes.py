@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.calibration.rig.frames import target_poses
 from rigkit.calibration.rig.observations import FrameObservations, Places
 from rigkit.core.arrays import FloatArray
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_FRAMES_OF_BOARD = 3
@@ -58,9 +58,8 @@ def _error(values: FloatArray) -> float:
 
 
 def _finding(cameras: tuple[str, str], boards: tuple[str, str], usual_mm: tuple[float, float]) -> Finding:
-    return Finding(
-        severity=Severity.BAD,
-        message=f"boards '{boards[0]}' and '{boards[1]}' are not of the sizes that are stated: by the one cameras "
+    return Finding.bad(
+        f"boards '{boards[0]}' and '{boards[1]}' are not of the sizes that are stated: by the one cameras "
         f"'{cameras[0]}' and '{cameras[1]}' are {usual_mm[0]:.4g} mm apart, by the other {usual_mm[1]:.4g} mm",
-        remedy="measure the squares of both (are the two sizes swapped?), and calibrate again",
+        "measure the squares of both (are the two sizes swapped?), and calibrate again",
     )

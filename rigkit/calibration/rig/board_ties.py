@@ -12,7 +12,7 @@ from rigkit.calibration.rig.joint import solve_jointly
 from rigkit.calibration.rig.observations import FrameObservations, frame_observations
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
 MIN_IMAGES_OF_TIE = 3
@@ -52,10 +52,9 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     how = "give each a board file with an id of its own, and write" if alike else "write"
     listed = ", ".join(f'"{name}"' for name in group) if not alike else "..."
     return (
-        Finding(
-            severity=Severity.LOOK,
-            message=f"the {words} kept their places to each other in {joint.shared_count} images",
-            remedy=f"{how} [[rigid_boards]] with boards = [{listed}] in the session: the camera gets surer, and the "
+        Finding.look(
+            f"the {words} kept their places to each other in {joint.shared_count} images",
+            f"{how} [[rigid_boards]] with boards = [{listed}] in the session: the camera gets surer, and the "
             "boards' angles come out",
         ),
     )

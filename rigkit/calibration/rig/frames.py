@@ -17,7 +17,7 @@ from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
 from rigkit.core.errors import InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
@@ -116,13 +116,11 @@ def mounts_of(
         motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
         if rival is not None:
             notes.append(
-                Finding(
-                    severity=Severity.LOOK,
-                    message=f"cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same "
+                Finding.look(
+                    f"cameras '{names[i]}' and '{names[j]}' share {len(shared)} boards, which look the same "
                     f"turned: turned by {np.degrees(rotation_angle(rival.rotation @ motion.rotation.T)):.0f} deg the "
                     "one against the other would fit as well; the smaller turn is taken",
-                    remedy="tilt the board differently in more frames, or use one with an odd and an even number of "
-                    "corners",
+                    "tilt the board differently in more frames, or use one with an odd and an even number of corners",
                 )
             )
         mounts[j] = motion @ mounts[i]

@@ -11,7 +11,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.verdicts import UNSURE_PX, with_headline
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 
 FEW_SHARED = 5
 """A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
@@ -38,18 +38,10 @@ def judge_rig(
     return tuple(with_headline(rig, causes, _unsure(rig, far)))
 
 
-def _look(message: str, remedy: str | None = None) -> Finding:
-    return Finding(severity=Severity.LOOK, message=message, remedy=remedy)
-
-
-def _bad(message: str, remedy: str | None = None) -> Finding:
-    return Finding(severity=Severity.BAD, message=message, remedy=remedy)
-
-
 def _not_converged(rig: RigCalibration) -> list[Finding]:
     if rig.convergence.converged:
         return []
-    return [_bad(f"the joint solution did not converge ({rig.convergence.reason})")]
+    return [Finding.bad(f"the joint solution did not converge ({rig.convergence.reason})")]
 
 
 def _left_out(rig: RigCalibration) -> list[Finding]:
@@ -57,7 +49,7 @@ def _left_out(rig: RigCalibration) -> list[Finding]:
     if len(rig.left_out) <= MANY_LEFT_OUT * total:
         return []
     return [
-        _look(
+        Finding.look(
             f"{len(rig.left_out)} of {total} boards that several views share were left out because the views disagree "
             "on them",
             "fix rig and boards while the images are taken, and trigger the cameras together",
@@ -69,7 +61,7 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
     if len(rig.cameras) < 2 or rig.shared_count >= FEW_SHARED:
         return []
     return [
-        _look(
+        Finding.look(
             f"{rig.shared_count} boards are seen by several cameras at once",
             f"take at least {FEW_SHARED} frames in which they are",
         )
@@ -82,7 +74,7 @@ def _unsure(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
         worst = projection.worst_px
         if worst > UNSURE_PX:
             out.append(
-                _bad(
+                Finding.bad(
                     f"the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
                     "were",
                     "take more frames, the boards tilted",
@@ -92,7 +84,7 @@ def _unsure(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
         transfer = transfer_uncertainty(rig, a, b)
         if transfer is not None and transfer.median_px > UNSURE_PX:
             out.append(
-                _bad(
+                Finding.bad(
                     f"where points of camera '{a}' must appear in camera '{b}' is uncertain by "
                     f"{transfer.median_px:.1f} px",
                     "take more frames that both see, or that link them",
@@ -106,7 +98,7 @@ def _overdispersed(rig: RigCalibration, in_force: Collection[str]) -> list[Findi
         return []
     automatic = " and ".join(f'{name} = "auto"' for name in ("board_shape", "model") if name not in in_force)
     return [
-        _look(
+        Finding.look(
             f"the frames disagree by {rig.overdispersion:.1f} times what the corners' scatter explains; all sigmas "
             "count it in. Boards or lenses are not quite as the models say, or cameras not quite of one moment",
             (f"try {automatic}, or " if automatic else "take ") + "a flatter board",
@@ -124,7 +116,7 @@ def _worse(rig: RigCalibration) -> list[Finding]:
     if together <= WORSE * usual:
         return []
     return [
-        _look(
+        Finding.look(
             f"frames that took no part are off by {together / usual:.1f} times as much as for the cameras alone: "
             + (
                 "the cameras were not quite of one moment, or a mount gives way"

@@ -16,7 +16,7 @@ from scipy.special import ndtri, stdtrit
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import Finding, Severity
+from rigkit.core.findings import Finding
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import (
     CORNERS,
@@ -110,35 +110,22 @@ def _findings(certificate: Certificate) -> list[Finding]:
     if coarse > 0.0:
         share = "less than 1" if coarse < 0.01 else f"{100.0 * coarse:.0f}"
         found.append(
-            Finding(
-                severity=Severity.LOOK,
-                message=f"in {share} % of the view the bound is but a lower one: the lines of sight "
+            Finding.look(
+                f"in {share} % of the view the bound is but a lower one: the lines of sight "
                 "hardly cross there, and points are uncertain by more than a tenth of what is measured",
-                remedy="measure elsewhere in the image, nearer, or move the cameras apart",
+                "measure elsewhere in the image, nearer, or move the cameras apart",
             )
         )
     if instrument.is_rig and instrument.scale_sigma == 0.0 and SCALE in certificate.sigma:
         found.append(
-            Finding(
-                severity=Severity.LOOK,
-                message="nobody stated how well the boards' squares were measured, so their scale counts as exact",
-                remedy="give square_sigma_mm in the board's file and calibrate again",
+            Finding.look(
+                "nobody stated how well the boards' squares were measured, so their scale counts as exact",
+                "give square_sigma_mm in the board's file and calibrate again",
             )
         )
     if not instrument.is_rig and task.distance_sigma_mm == 0.0:
-        found.append(
-            Finding(
-                severity=Severity.LOOK,
-                message="the distance counts as exact",
-                remedy="say with --distance-sigma how well it is known",
-            )
-        )
-    found.append(
-        Finding(
-            severity=Severity.GOOD,
-            message=f"to halve the worst error: {_how_to_halve(certificate.shares(), certificate)}",
-        )
-    )
+        found.append(Finding.look("the distance counts as exact", "say with --distance-sigma how well it is known"))
+    found.append(Finding.good(f"to halve the worst error: {_how_to_halve(certificate.shares(), certificate)}"))
     return found
 
 
