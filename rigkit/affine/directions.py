@@ -60,6 +60,9 @@ def direction_field(
 ) -> DirectionField:
     """Return the directions at every corner of one detection.
 
+    Raises InputError: unknown support, a window below 1, or anything but patches on a board whose points are not one
+    square apart.
+
     Parameters
     ----------
     pattern : of the board, whose grid the detection has; None, and for chessboards: corners are one square apart.
@@ -72,11 +75,6 @@ def direction_field(
         "patch": a homography through the nearest (2 `window` + 1)^2 corners; the more corners, the less noise, the
         more it relies on a flat board and a true camera.
     window : half width in squares; None takes the whole line or board. Ignored by "chord" and "neighbours".
-
-    Raises
-    ------
-    InputError
-        Unknown support, a window below 1, or anything but patches on a board whose points are not one square apart.
 
     Notes
     -----

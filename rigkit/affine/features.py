@@ -59,6 +59,9 @@ def match_affine_features(
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
 
+    Raises InputError: not images, or too small; DegenerateError: no correspondences, as without texture, or between images
+    of different scenes.
+
     Parameters
     ----------
     image1, image2 : (H, W) or (H, W, 3) RGB, uint8 or uint16.
@@ -66,13 +69,6 @@ def match_affine_features(
     features_per_view : strongest SIFT features kept in each simulated view; None: by the area of the image.
     unique : features of the same image that look alike are rivals, too. What is repeated (tiles, keys, bricks) is
         easily matched a period off, and such a match may lie near its epipolar line all the same.
-
-    Raises
-    ------
-    InputError
-        Not images, or too small.
-    DegenerateError
-        No correspondences: no texture, or images of different scenes.
     """
     greys = grey_of(image1, "image1"), grey_of(image2, "image2")
     pyramid1, pyramid2 = (patch_pyramid(grey) for grey in greys)

@@ -55,19 +55,15 @@ def posed_calibration(
 
     With flat boards its held-out error is its training error: no image took part in the lens.
 
+    Raises InputError: no view can be used, or corners lie outside the camera's image; DegenerateError: no view fits the
+    lens.
+
     Parameters
     ----------
     views : boards as they were seen.
     camera : the lens, which stays as it is.
     covariance : (P, P) of its parameters; None: it is exact.
     board, folds : the boards' shape, and of the cross-validation that chooses it, as for `calibrate`.
-
-    Raises
-    ------
-    InputError
-        No view can be used, or corners lie outside the camera's image.
-    DegenerateError
-        No view fits the lens.
     """
     observations, fit, dropped = _on_flat_boards(views, camera)
     observations, fit, heldout_px, candidates = _shaped(observations, fit, board, folds)

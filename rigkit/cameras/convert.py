@@ -65,16 +65,13 @@ def convert_camera(
 ) -> Conversion:
     """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
 
+    Raises InputError: `model` or a name in `fixed` is unknown, or the model cannot follow the lens at all.
+
     Parameters
     ----------
     order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
     fixed : names of parameters that keep the values of the start, which has no tangential terms and no skew.
     outline : (N, 2) convex, of the part of the image where the camera is known, which then counts; None: all of it.
-
-    Raises
-    ------
-    InputError
-        `model` or a name in `fixed` is unknown, or the model cannot follow the lens at all.
     """
     pixels = grid_pixels(camera.size_px, CONVERT_GRID).reshape(-1, 2)
     rays, valid = camera.unproject(pixels)

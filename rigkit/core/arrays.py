@@ -41,6 +41,8 @@ Mat3 = Annotated[FloatArray, "(..., 3, 3)"]
 def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, finite: bool = True) -> FloatArray:
     """Return a read-only float64 copy of `value`, checked against `shape`.
 
+    Raises InputError: wrong shape, not numeric, or not finite.
+
     Parameters
     ----------
     value : array-like
@@ -51,11 +53,6 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
         How the error calls it.
     finite : bool
         Refuse NaN and infinity.
-
-    Raises
-    ------
-    InputError
-        Wrong shape, not numeric, or not finite.
     """
     try:
         raw = np.asarray(value)

@@ -48,12 +48,8 @@ class BoardPose:
 def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
     """Return the pose of a flat target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
 
-    Raises
-    ------
-    InputError
-        Shapes that do not fit, values that are not finite, points that do not lie in a plane.
-    DegenerateError
-        Fewer than four points, or points or rays that are (but for one) collinear.
+    Raises InputError: shapes that do not fit, values that are not finite, points that do not lie in a plane;
+    DegenerateError: fewer than four points, or points or rays that are (but for one) collinear.
     """
     return board_poses(rays, points_mm, sigma_rad)[0]
 

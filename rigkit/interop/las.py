@@ -22,12 +22,7 @@ NORMALS = ("NormalX", "NormalY", "NormalZ")
 def las_bytes(cloud: OrientedCloud) -> bytes:
     """Return the file's content, lengths as in the cloud, with the normals and `sigma_mm` as further columns.
 
-    Raises
-    ------
-    InputError
-        An empty cloud.
-    InstallationError
-        laspy is not installed.
+    Raises InputError: an empty cloud; InstallationError: laspy is not installed.
     """
     try:
         import laspy

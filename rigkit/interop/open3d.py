@@ -74,17 +74,14 @@ class Mesh(NamedTuple):
 def poisson_mesh(cloud: OrientedCloud, *, depth: int, cut: float) -> Mesh:
     """Return the screened Poisson surface of an oriented cloud (Kazhdan and Hoppe, TOG 2013).
 
+    Raises DegenerateError: the points with a normal are fewer than three, in one place, or beyond the single precision
+    of meshes; or nothing is left of the surface.
+
     Parameters
     ----------
     cloud : its normals say which side is outside.
     depth : of the octree: 2^depth cells along the longest side.
     cut : share of the vertices, those with the fewest points near, that is cut off: Poisson closes every surface.
-
-    Raises
-    ------
-    DegenerateError
-        The points with a normal are fewer than three, in one place, or beyond the single precision of meshes; or
-        nothing is left of the surface.
     """
     import open3d
 

@@ -171,16 +171,13 @@ def _baseline(entry: TomlTable, names: Sequence[str]) -> MeasuredBaseline:
 def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None) -> dict[str, dict[str, str]]:
     """Return camera -> image -> frame: images of one moment have the same frame.
 
+    Raises InputError: two images of a camera would be of one frame, the numbers of images differ ("order"), or no two
+    cameras share a frame.
+
     Parameters
     ----------
     images : camera -> names of its images, in their order.
     how : "name", "number" or "order" (see above); by default the first of name and number that two cameras share.
-
-    Raises
-    ------
-    InputError
-        Two images of a camera would be of one frame, the numbers of images differ ("order"), or no two cameras share a
-        frame.
     """
     if how == "order":
         counts = {name: len(own) for name, own in images.items()}

@@ -37,16 +37,13 @@ Units = dict[str, tuple[str, float]]
 def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> dict[str, PairTruth]:
     """Return what was measured of each pair that the table names.
 
+    Raises InputError with the line: a unit that is missing, unknown or mixed, an unknown column, pair, board or
+    quantity, a value or sigma that is no number or left out, a baseline stated twice.
+
     Parameters
     ----------
     path : the CSV file.
     boards : pair -> the boards that stand there; a row about any other pair is an error.
-
-    Raises
-    ------
-    InputError
-        With the line: a unit that is missing, unknown or mixed, an unknown column, pair, board or quantity, a value or
-        sigma that is no number or left out, a baseline stated twice.
     """
     source = Path(path)
     head, rows = _read(source)

@@ -122,12 +122,8 @@ def plan_views(
     """Return the next `count` views to take of `boards`, one board a view, the first near the pose `last` where several
     are (`nearly`, see `choose_views`) as good.
 
-    Raises
-    ------
-    InputError
-        No board, or no view asked for.
-    DegenerateError
-        No board fits into the image at the distances allowed.
+    Raises InputError: no board, or no view asked for; DegenerateError: no board fits into the image at the distances
+    allowed.
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one view are needed")

@@ -98,6 +98,9 @@ def pair_geometry(
 ) -> PairGeometry:
     """Return pose, scale and points of one pair.
 
+    Raises InputError: level frames of another motion than planar; DegenerateError: no baseline, or geometry that does
+    not determine the pose.
+
     Parameters
     ----------
     pair : matched corners, from `match_pair`.
@@ -106,13 +109,6 @@ def pair_geometry(
     level_sigma_rad : how well the spirit level held: the pose type is a soft prior in the refinement. None: as well as
         a carefully set level does (DEFAULT_LEVEL_RAD); 0: the pose type is exact.
     level_frames : of cameras that are not level themselves but whose mounting is known; planar motion only.
-
-    Raises
-    ------
-    InputError
-        Level frames of another motion than planar.
-    DegenerateError
-        No baseline, or geometry that does not determine the pose.
     """
     declared = PoseType(pose_type)
     if level_frames is not None and declared is not PoseType.PLANAR:

@@ -85,16 +85,13 @@ def lattice_planes(
 ) -> LatticePlanes:
     """Return the boards' planes of maximum likelihood with their lattices known.
 
+    Raises DegenerateError: no board has enough corners in both views, or they leave the poses open.
+
     Parameters
     ----------
     geometry : of the pair; boards need eight corners in each view.
     known1, known2 : the cameras as they are known, or None: the intrinsics are exact.
     one_camera : both images are of one camera, whose errors they share; `known2` is not used then.
-
-    Raises
-    ------
-    DegenerateError
-        No board has enough corners in both views, or they leave the poses open.
 
     Notes
     -----

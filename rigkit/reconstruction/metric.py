@@ -68,16 +68,13 @@ def metric_pose(
 ) -> MetricPose:
     """Return the pose in mm: rotation and direction stay, the length comes from the boards' squares.
 
+    Raises DegenerateError: no board has enough triangulated corners.
+
     Parameters
     ----------
     matches : `board_index` and `grid` say which corner each is.
     cam2_from_cam1, pose_covariance : of unit baseline, as from the refinement.
     boards : in the order of `board_index`.
-
-    Raises
-    ------
-    DegenerateError
-        No board has enough triangulated corners.
 
     Notes
     -----

@@ -49,20 +49,15 @@ def reconstruct_as_paper(
 ) -> Reconstruction:
     """Return what the paper's pipeline makes of a pair with one affine estimator.
 
+    Raises InputError: pose type AUTO; DegenerateError: the geometry does not determine the pose, or no corner has both
+    a point and a normal.
+
     Parameters
     ----------
     pair : matched corners; their directions are taken anew, as chords to the neighbours.
     pose_type : as declared; the paper has no way to choose one.
     affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
     motions : which solver re-estimates the epipolar geometry, by pose type.
-
-    Raises
-    ------
-    InputError
-        Pose type AUTO.
-    DegenerateError
-        The geometry does not determine the pose, or no corner has both a point and a normal.
-
     """
     kind = PoseType(pose_type)
     if kind not in motions:

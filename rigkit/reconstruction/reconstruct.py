@@ -135,17 +135,14 @@ def reconstruct_from(
 ) -> Reconstruction:
     """Return the oriented cloud of a pair by one affine estimator.
 
+    Raises DegenerateError: no corner has both a point and a normal.
+
     Parameters
     ----------
     geometry : pose and points, from `pair_geometry`.
     affine_method : see `rigkit.affine.registry.AFFINE_METHODS`.
     scale : of DET3UDIR, see `affines_from_directions`.
     image1 : image of camera 1, (H, W) or (H, W, 3) RGB, uint8 or uint16: colours of the cloud.
-
-    Raises
-    ------
-    DegenerateError
-        No corner has both a point and a normal.
     """
     pair, metric = geometry.pair, geometry.metric
     affinities = _affinities(pair, affine_method, geometry.E21, scale)
@@ -309,6 +306,8 @@ def oriented_cloud(
 ) -> tuple[OrientedCloud, BoolArray]:
     """Return the oriented cloud, and which (N,) of the matches are in it: those with a point and a normal.
 
+    Raises DegenerateError: no match has both a point and a normal.
+
     Parameters
     ----------
     triangulated : the points, with their covariances.
@@ -317,11 +316,6 @@ def oriented_cloud(
     affinities : of the points.
     affines : affinities for an epipolar geometry, where they follow from it and so move with it.
     colours : (N, 3) of the points.
-
-    Raises
-    ------
-    DegenerateError
-        No match has both a point and a normal.
     """
     points, covariance, seen = triangulated
     m = matches

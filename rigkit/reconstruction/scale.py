@@ -32,6 +32,8 @@ def metric_scale(
 ) -> tuple[float, float]:
     """Return the factor from the reconstruction's unit to mm and its standard deviation.
 
+    Raises DegenerateError: no board has enough corners.
+
     Parameters
     ----------
     points_unit : (N, 3) triangulated corners; NaN rows are ignored.
@@ -39,11 +41,6 @@ def metric_scale(
     grid : (N, 2) int, (column, row).
     boards : with their measured squares; a stated `square_sigma_mm` enters the standard deviation, and the weight.
     covariances : (N, 3, 3) of the points in the unit of the reconstruction; None: equal and estimated from the fit.
-
-    Raises
-    ------
-    DegenerateError
-        No board has enough corners.
 
     Notes
     -----

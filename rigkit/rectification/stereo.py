@@ -72,6 +72,9 @@ def rectify_pair(
 ) -> StereoRectification:
     """Return the rectification of a pair of cameras of any models.
 
+    Raises InputError: `projection` is unknown; DegenerateError: no baseline, or one along the view in a perspective
+    rectification, or no common field of view.
+
     Parameters
     ----------
     projection : "perspective" for ordinary lenses and side-by-side cameras; "cylindrical" and "equirectangular" around
@@ -80,13 +83,6 @@ def rectify_pair(
 
     The target covers the rows that both cameras see, and all columns that either sees, out to the reach of the
     projection.
-
-    Raises
-    ------
-    InputError
-        `projection` is unknown.
-    DegenerateError
-        No baseline; a baseline along the view in a perspective rectification; no common field of view.
     """
     if projection not in _TARGETS:
         raise InputError(f"projection '{projection}' is unknown; known: {', '.join(_TARGETS)}")

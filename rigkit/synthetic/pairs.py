@@ -129,6 +129,8 @@ def trihedral_pair(
 ) -> StereoScene:
     """Return a random pair that sees all corners of three boards in the corner of a room.
 
+    Raises DegenerateError: no such view was found: the lens is too narrow, or the baseline too long.
+
     Parameters
     ----------
     boards : three boards of any sizes.
@@ -137,11 +139,6 @@ def trihedral_pair(
     distance : range of the cameras' distance, as a multiple of the shortest at which the boards fill the image.
     level_sigma_deg : spirit-level error of all but general pairs.
     walls : whether walls and a floor stand behind the boards.
-
-    Raises
-    ------
-    DegenerateError
-        No such view was found: the lens is too narrow, or the baseline too long.
     """
     placed = trihedral(boards, angles_deg=angles_deg)
     return random_pair(

@@ -87,14 +87,11 @@ def general_pairs(
     Both cameras are 0.9 to 1.3 m from the corner, look at it within 8 degrees, roll by up to 30, and see every board
     corner at no more than 69 degrees from its normal.
 
+    Raises DegenerateError: no such pair exists, or next to none.
+
     Parameters
     ----------
     parallax_deg : range of the angle between the two cameras as seen from the corner.
-
-    Raises
-    ------
-    DegenerateError
-        No such pair exists, or next to none.
     """
     corners, facing = _corner_boards(board, margin_squares)
     n = board.corner_count

@@ -113,6 +113,8 @@ def fit_plane(
 ) -> Plane:
     """Return the plane through points (N, 3) in the frame of camera 1.
 
+    Raises DegenerateError: fewer than four points, or points on a line.
+
     Parameters
     ----------
     points_mm : (N, 3)
@@ -120,11 +122,6 @@ def fit_plane(
         ratios: how large the noise is, the observed scatter tells. Without it all points count, as far off as they are.
     common_mm : (K, N, 3) how the points move for one standard deviation of each of K independent errors that they share
         (pose, calibrations), or None: there are none. A point with NaN is left out: how far off it is, nobody knows.
-
-    Raises
-    ------
-    DegenerateError
-        Fewer than four points, or points on a line.
 
     Notes
     -----

@@ -88,12 +88,8 @@ def check_pictures(
     together in the order of their names; or the images themselves, moment by moment, each in the rig's order. An image
     that cannot be read does not end the rest; its error is raised where there is no other.
 
-    Raises
-    ------
-    InputError
-        No covariance, no images, none with a board, or a file that cannot be written.
-    DegenerateError
-        Pictures that say nothing of the camera.
+    Raises InputError: no covariance, no images, none with a board, or a file that cannot be written; DegenerateError:
+    pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
     watched, known = load_watched(source)

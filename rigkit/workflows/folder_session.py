@@ -69,6 +69,8 @@ def session_of_folders(
 ) -> FolderSession:
     """Return the session of one folder, or of several that hold a camera's images each, to be kept in the file `path`.
 
+    Raises InputError: no board, a folder without images, or names that a session cannot hold.
+
     Parameters
     ----------
     folders : of images; see `cameras_in`.
@@ -77,11 +79,6 @@ def session_of_folders(
     model : of all cameras.
     output : of the calibration, beside the session, if not where the session's name says.
     known : what stays as it is of several cameras.
-
-    Raises
-    ------
-    InputError
-        No board, a folder without images, or names that a session cannot hold.
     """
     if not boards:
         raise InputError(_untold(folders))

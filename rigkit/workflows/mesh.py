@@ -37,12 +37,8 @@ class MeshOptions:
 def mesh_cloud(cloud: str | Path, options: MeshOptions, *, progress: Progress = silent) -> Mesh:
     """Write the screened Poisson surface of the oriented cloud in a PLY file, and return it.
 
-    Raises
-    ------
-    InputError
-        The cloud cannot be read or has no normals, the file cannot be written, options without a meaning.
-    DegenerateError
-        Nothing is left of the surface.
+    Raises InputError: the cloud cannot be read or has no normals, the file cannot be written, options without a
+    meaning; DegenerateError: nothing is left of the surface.
     """
     if not 3 <= options.depth <= MAX_OCTREE_DEPTH:
         raise InputError(f"mesh: the depth of the octree must be 3 to {MAX_OCTREE_DEPTH}, got {options.depth}")

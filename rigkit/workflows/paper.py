@@ -79,12 +79,8 @@ def validate_as_paper(
 ) -> PaperValidation:
     """Repeat the paper's comparison on the pairs of a data set, and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        Nothing was measured, or something asked for cannot be: all said before the work.
-    RigkitError
-        No pair could be reconstructed; a pair that could not is else among the failures.
+    Raises InputError: nothing was measured, or something asked for cannot be, all said before the work; RigkitError: no
+    pair could be reconstructed (one that could not is else among the failures).
     """
     options = options or PaperOptions()
     known = ready_dataset(dataset, options, measured=True)

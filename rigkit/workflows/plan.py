@@ -88,13 +88,9 @@ def plan_session(
     """Return the views that would improve a calibration most, given its file or the session that it comes from; or
     those to check it with, of a rig, too.
 
-    Raises
-    ------
-    InputError
-        A rig that is to be improved (its cameras are planned one by one), a file that is neither, or a page that cannot
-        be written.
-    DegenerateError
-        The views so far do not determine the camera, or no board can be held in view.
+    Raises InputError: a rig that is to be improved (its cameras are planned one by one), a file that is neither, or a
+    page that cannot be written; DegenerateError: the views so far do not determine the camera, or no board can be held
+    in view.
     """
     options, source = options or PlanOptions(), Path(path)
     rig = is_rig_session(source) if source.suffix == ".toml" else is_rig_file(source)

@@ -101,12 +101,8 @@ class _View:
 def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = silent) -> RigScene:
     """Reconstruct every pair of views that lie near each other and fuse their clouds; write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        A file cannot be read or written, a camera is missing, an image is of another size than its camera's.
-    DegenerateError
-        No pair gives a cloud.
+    Raises InputError: a file cannot be read or written, a camera is missing, an image is of another size than its
+    camera's; DegenerateError: no pair gives a cloud.
     """
     if options.output is not None:
         require_folder(options.output, force=options.force)

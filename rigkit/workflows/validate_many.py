@@ -70,15 +70,13 @@ def validate_datasets(
     """Validate data sets as `validate_dataset` does each, into folders of their names in `options.output`, and write a
     summary there; one that fails does not end the rest.
 
+    Raises InputError: two data sets of one name, no folder for results, or one that cannot be written; a cluster that
+    does not answer.
+
     Parameters
     ----------
     jobs : data sets at a time, in processes of this machine.
     cluster : address of a Dask scheduler to use instead; it must see the same files.
-
-    Raises
-    ------
-    InputError
-        Two data sets of one name, no folder for results, or one that cannot be written; a cluster that does not answer.
     """
     if options.output is None:
         raise InputError("several data sets need a folder for their results")

@@ -56,16 +56,13 @@ def board_places(
     """Return the views with the boards of every group identified, oriented alike and given the key of their target,
     the places of the boards, and what could not be tied.
 
+    Raises InputError: a board of a group is never seen together with the others, or they cannot be identified.
+
     Parameters
     ----------
     groups : ids of the boards that are mounted to each other.
     seen : of every camera.
     boards : all boards by id.
-
-    Raises
-    ------
-    InputError
-        A board of a group is never seen together with the others, or they cannot be identified.
     """
     out = [dict(own) for own in seen]
     places: dict[str, tuple[str, Rigid3]] = {}

@@ -74,6 +74,9 @@ def refine_pose(
 ) -> RefinedPose:
     """Return the pose of maximum likelihood near `start`.
 
+    Raises InputError: fewer residuals than degrees of freedom, or a pose type that cannot be refined ("auto");
+    DegenerateError: the start has no baseline, or the pose is not determined.
+
     Parameters
     ----------
     matches : affinities take part where they have a sigma_A: leave it out for affinities that were computed from the
@@ -84,13 +87,6 @@ def refine_pose(
     robust : weight function for contaminated matches, `cauchy_weights` for example.
     point_weights : (N,) fixed factors of the squared residuals of each match.
     level_frames : in which the pose type is meant to hold; None: those of the cameras.
-
-    Raises
-    ------
-    InputError
-        Fewer residuals than degrees of freedom; a pose type that cannot be refined ("auto").
-    DegenerateError
-        The start has no baseline, or the pose is not determined.
     """
     if str(pose_type) not in ("general", "planar", "standard", "forward"):
         raise InputError(

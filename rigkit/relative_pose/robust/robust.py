@@ -92,18 +92,15 @@ def robust_pose(
 ) -> RobustPose:
     """Return the pose that most matches agree with.
 
+    Raises InputError: too few matches or affinities for a sample, or a noise level that is not above the sigmas;
+    DegenerateError: no sample gave a pose, or the matches that fit leave another one open, all on one plane, or have no
+    baseline.
+
     Parameters
     ----------
     matches : contaminated; their sigmas are the smallest noise expected.
     pose_type : general or planar are sampled; standard and forward have nothing to sample and are only refined.
     max_noise : highest noise level considered, in sigmas of the matches.
-
-    Raises
-    ------
-    InputError
-        Too few matches or affinities for a sample; a noise level that is not above the sigmas.
-    DegenerateError
-        No sample gave a pose; the matches that fit leave another one open, all on one plane, or have no baseline.
     """
     if not (np.isfinite(max_noise) and max_noise > 1.0):
         raise InputError(f"robust estimation: max_noise is in sigmas of the matches and above 1, got {max_noise}")

@@ -41,12 +41,8 @@ AS_NORMAL = 1e6
 def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_CELLS) -> Certificate:
     """Return the bound on the error of `task` over the image of the first camera.
 
-    Raises
-    ------
-    InputError
-        A depth, plane or angle with one camera.
-    DegenerateError
-        Nowhere do all cameras see what is measured.
+    Raises InputError: a depth, plane or angle with one camera; DegenerateError: nowhere do all cameras see what is
+    measured.
     """
     if not instrument.is_rig and task.quantity is not Quantity.LENGTH:
         raise InputError(

@@ -204,17 +204,14 @@ def instrument_of_rig(
 ) -> Instrument:
     """Return two cameras of a rig of N.
 
+    Raises InputError: a name that no camera has, or the same twice.
+
     Parameters
     ----------
     names, cameras, cam_from_rig : of all cameras of the rig, the first is its frame.
     covariance : of all intrinsics, then of the mounts of all cameras but the first, as a rig file has it.
     pair : names of the two cameras, the one whose image the certificate is drawn over first.
     sigma_px, scale_sigma, freedom : see `Instrument`.
-
-    Raises
-    ------
-    InputError
-        A name that no camera has, or the same twice.
     """
     unknown = [name for name in pair if name not in names]
     if unknown or pair[0] == pair[1]:

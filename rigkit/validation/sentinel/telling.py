@@ -156,12 +156,8 @@ def views_that_tell(
     """Return the pictures to check a camera or a rig with, and how well they would find what changed. Of a rig a
     picture is one of every camera at one moment, of one board.
 
-    Raises
-    ------
-    InputError
-        No board, or no picture asked for.
-    DegenerateError
-        No board fits into any image at the distances allowed, or nothing can be told of the calibration.
+    Raises InputError: no board, or no picture asked for; DegenerateError: no board fits into any image at the distances
+    allowed, or nothing can be told of the calibration.
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
