@@ -59,8 +59,8 @@ def match_affine_features(
 ) -> Correspondences:
     """Return affine correspondences of two images; contaminated by some wrong ones, as matches are.
 
-    Raises InputError: not images, or too small; DegenerateError: no correspondences, as without texture, or between images
-    of different scenes.
+    Raises InputError: not images, or too small; DegenerateError: no correspondences (no texture, or images of
+    different scenes).
 
     Parameters
     ----------

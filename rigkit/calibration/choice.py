@@ -122,7 +122,7 @@ class HeldOut:
         k = self.names.index(name)
         return bool(more[k] > CLEARLY * chance[k])
 
-    def likely(self, seed: int = 0) -> dict[str, float]:
+    def likely(self) -> dict[str, float]:
         """Return how likely each option is the best one: how often it has the smallest held-out error where images
         count by chance more or less (the Bayesian bootstrap). Where others with about as many numbers err as little but
         for rounding, images do not decide between them, sure as the order may be: they share.
@@ -133,7 +133,7 @@ class HeldOut:
         """
         if not self.names:
             return {}
-        drawn = np.random.default_rng(seed).dirichlet(np.ones(self.heldout.shape[1]), BOOTSTRAP_DRAWS)
+        drawn = np.random.default_rng(0).dirichlet(np.ones(self.heldout.shape[1]), BOOTSTRAP_DRAWS)
         error = drawn @ self.heldout.T
         least = error.min(axis=1, keepdims=True)
         few = np.array(self.counts) <= self.counts[self.names.index(self.chosen())] + MORE_NUMBERS

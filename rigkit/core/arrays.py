@@ -39,20 +39,9 @@ Mat3 = Annotated[FloatArray, "(..., 3, 3)"]
 
 
 def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, finite: bool = True) -> FloatArray:
-    """Return a read-only float64 copy of `value`, checked against `shape`.
+    """Return a read-only float64 copy of `value`, checked against `shape`, in which None stands for any length.
 
-    Raises InputError: wrong shape, not numeric, or not finite.
-
-    Parameters
-    ----------
-    value : array-like
-    shape : tuple of int or None
-        Expected shape; None stands for any length. A leading Ellipsis is not needed: batched functions check only
-        what they store.
-    name : str
-        How the error calls it.
-    finite : bool
-        Refuse NaN and infinity.
+    Raises InputError, which calls it `name`, for another shape, what is no number, or, where `finite`, not finite.
     """
     try:
         raw = np.asarray(value)

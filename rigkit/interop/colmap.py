@@ -25,6 +25,8 @@ STAND_IN = "SIMPLE_FISHEYE"
 """For models that COLMAP lacks: the same rays in the pixels of an equidistant lens of the same focal length."""
 MAX_ANGLE_RAD = np.deg2rad(88.0)
 """COLMAP divides by z: rays further from the axis than this are left out, and counted."""
+MAX_ERROR_PX = 4.0
+"""COLMAP's own: matches that miss their epipolar lines by more take no part."""
 GRADIENT_TOLERANCE = 1e-10
 """COLMAP stops at 1e-4 by default, which leaves the pose 1e-5 rad short of the optimum."""
 
@@ -80,7 +82,7 @@ def colmap_pair(camera1: Camera, camera2: Camera, pixels1: Pixels, pixels2: Pixe
     return ColmapPair((one, two), first, second, used)
 
 
-def solve_pair(pair: ColmapPair, *, max_error_px: float = 4.0, seed: int = 0) -> ColmapResult:
+def solve_pair(pair: ColmapPair, *, seed: int = 0) -> ColmapResult:
     """Return COLMAP's two-view geometry, triangulation and bundle adjustment of the pair; the same for one seed.
 
     Raises DegenerateError where COLMAP finds no relative pose.
@@ -91,7 +93,7 @@ def solve_pair(pair: ColmapPair, *, max_error_px: float = 4.0, seed: int = 0) ->
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
     options.ransac.random_seed = seed
-    options.ransac.max_error = max_error_px
+    options.ransac.max_error = MAX_ERROR_PX
     count = len(pair.pixels1)
     matches = np.repeat(np.arange(count, dtype=np.uint32)[:, None], 2, axis=1)
     geometry = pycolmap.estimate_calibrated_two_view_geometry(

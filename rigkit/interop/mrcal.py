@@ -69,11 +69,9 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
     return Written(camera, float(error.max()), float(inside.mean()), note, text)
 
 
-def read_cameramodel(
-    text: str, name: str = "cameramodel", *, spline_as: str | None = None
-) -> tuple[Camera, Rigid3, float]:
-    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted, as `spline_as` or
-    else as the model that follows it best: a lens that was written as a spline comes back as what it was.
+def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigid3, float]:
+    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted, as the model that
+    follows it best: a lens that was written as a spline comes back as what it was.
 
     Raises InputError for damaged files and for lens models that are not here (CAHVOR, panoramas).
     """
@@ -101,7 +99,7 @@ def read_cameramodel(
         return camera_of("brown", size, intrinsics, name), pose, 0.0
     if SPLINED.match(lens) is None:
         raise InputError(f"'{name}': lens model '{lens}' is not supported; known: {', '.join(counts)}, splined (cubic)")
-    camera, error_px = _from_spline(lens, intrinsics, size, spline_as, name)
+    camera, error_px = _from_spline(lens, intrinsics, size, name)
     return camera, pose, error_px
 
 
@@ -210,10 +208,8 @@ def _basis(u: FloatArray, lens: str) -> tuple[Any, BoolArray]:
     return sparse.csr_array((values.reshape(-1), (rows, columns.reshape(-1))), shape=shape), inside
 
 
-def _from_spline(
-    lens: str, intrinsics: FloatArray, size_px: tuple[int, int], model: str | None, name: str
-) -> tuple[Camera, float]:
-    """Return the camera of `model` (None: of any) nearest to the spline over the image, and its largest error, px."""
+def _from_spline(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
+    """Return the camera nearest to the spline over the image, and its largest error, px."""
     match = SPLINED.match(lens)
     assert match is not None
     if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):
@@ -224,7 +220,7 @@ def _from_spline(
     centre = _spline_project(np.array([[0.0, 0.0, 1.0]]), lens, intrinsics)[0][0]
     checked = _spline_samples(lens, intrinsics, size_px, 3 * SPLINE_GRID[0])
     best: tuple[Camera, float] | None = None
-    for kind in (model,) if model else SPLINE_MODELS:
+    for kind in SPLINE_MODELS:
         try:
             order = SPLINE_DEGREE if kind == "scaramuzza" else None
             camera = fit_camera(camera_model(kind), size_px, rays, pixels, centre, order=order)

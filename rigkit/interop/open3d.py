@@ -34,17 +34,17 @@ def mean_and_covariance(points: Points) -> tuple[FloatArray, Mat3]:
     return np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
 
 
-def plane_inliers(points: Points, distance_mm: float, *, iterations: int = 1000, seed: int = 0) -> BoolArray:
+def plane_inliers(points: Points, distance_mm: float, *, iterations: int = 1000) -> BoolArray:
     """Return the mask of the points (N, 3) within `distance_mm` of the plane that most of them share (RANSAC).
 
-    Deterministic for one seed. Raises DegenerateError for fewer than three points.
+    Always the same ones. Raises DegenerateError for fewer than three points.
     """
     import open3d
 
     array = as_array(points, (None, 3), "points")
     if len(array) < 3:
         raise DegenerateError(f"plane: {len(array)} points do not fix one; at least 3 are needed")
-    open3d.utility.random.seed(seed)
+    open3d.utility.random.seed(0)
     _, inliers = _point_cloud(array).segment_plane(distance_mm, 3, iterations)
     mask = np.zeros(len(array), dtype=bool)
     mask[np.asarray(inliers, dtype=np.int64)] = True

@@ -54,11 +54,10 @@ def outline_mm(board: Board) -> Points:
     return np.stack([corners, between], axis=1).reshape(8, 3)
 
 
-def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | None = None) -> HeldBoards:
+def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     """Return poses of `board` that a person can hold before `camera`, spread evenly; always the same ones.
 
-    `points_mm` are its corners (N, 3) as they are known to be, by default as stated. Raises DegenerateError where the
-    board fits nowhere into the image.
+    Raises DegenerateError where the board fits nowhere into the image.
     """
     u, v, size, tilt, way, upright = _even(DRAWN, 6).T
     width, height = camera.size_px
@@ -85,9 +84,8 @@ def held_boards(camera: Camera, board: Board, reach: Reach, points_mm: Points | 
             f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) can be held nowhere wholly in view "
             "at the distances allowed; take a smaller board, or allow other distances"
         )
-    points = board.points() if points_mm is None else points_mm
     chosen = np.flatnonzero(good)[:KEPT]
-    return HeldBoards(points, rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
+    return HeldBoards(board.points(), rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
 
 
 def sees_held(camera: Camera, board: Board, rotation: FloatArray, translation_mm: Points, reach: Reach) -> BoolArray:

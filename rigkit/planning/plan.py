@@ -69,7 +69,6 @@ def choose_views(
     count: int,
     *,
     effort: Callable[[int], FloatArray] | None = None,
-    nearly: float = NEARLY,
 ) -> tuple[list[int], list[float]]:
     """Return which `count` of C views to take, in order, and the error of the goal after each.
 
@@ -78,8 +77,7 @@ def choose_views(
     information : (P, P) what is known before.
     views : (C, P, P) what each view adds; each is taken once.
     effort : returns how far all views (C,) are from view j, or (-1) from the last one taken before: of views nearly as
-        good the nearest is taken. None: the best is.
-    nearly : so good are those whose gain and whose error are within this part of the best one's.
+        good (NEARLY) the nearest is taken. None: the best is.
 
     Raises DegenerateError where numbers are no real ones.
     """
@@ -99,7 +97,7 @@ def choose_views(
         else:
             # Rounding may make the error grow a little: then the best view alone is as good as the best.
             gain = max(before - best, 0.0)
-            good = np.flatnonzero(after <= best + nearly * min(gain, best))
+            good = np.flatnonzero(after <= best + NEARLY * min(gain, best))
             pick = int(good[np.argmin(effort(last)[left[good]])])
         last = int(left[pick])
         information = information + views[last]
@@ -117,10 +115,9 @@ def plan_views(
     *,
     reach: Reach | None = None,
     last: Rigid3 | None = None,
-    nearly: float = NEARLY,
 ) -> Plan:
     """Return the next `count` views to take of `boards`, one board a view, the first near the pose `last` where several
-    are (`nearly`, see `choose_views`) as good.
+    are nearly as good.
 
     Raises InputError: no board, or no view asked for; DegenerateError: no board fits into the image at the distances
     allowed.
@@ -137,7 +134,7 @@ def plan_views(
         rows = (rotation[view], middle[view]) if view >= 0 else (start.rotation, start.translation_mm)
         return _effort(rotation, middle, *rows)
 
-    taken, errors = choose_views(knowledge.information, views, goal, count, effort=effort, nearly=nearly)
+    taken, errors = choose_views(knowledge.information, views, goal, count, effort=effort)
     owner = np.repeat(np.arange(len(boards)), [len(h) for h in held])
     translation = np.concatenate([h.translation_mm for h in held])
     proposals = [

@@ -93,17 +93,15 @@ class RectifyMap:
         bands = self._sampled_bands(self._supersampling() if antialias else 1)
         return self._resampled(np.asarray(image), interpolation, bands, fill)
 
-    def resampler(
-        self, *, interpolation: Interpolation = "spline", antialias: bool = True, fill: float = 0.0
-    ) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    def resampler(self, interpolation: Interpolation) -> Callable[[NDArray[Any]], NDArray[Any]]:
         """Return a function that does what `image` does; where it fits in memory, the map is computed once for all."""
-        samples = self._supersampling() if antialias else 1
+        samples = self._supersampling()
         keeps = samples * samples * self.target.size_px[0] * self.target.size_px[1] <= MAX_KEPT_SAMPLES
         kept = list(self._sampled_bands(samples)) if keeps else None
 
         def resample(image: NDArray[Any]) -> NDArray[Any]:
             bands = self._sampled_bands(samples) if kept is None else kept
-            return self._resampled(np.asarray(image), interpolation, bands, fill)
+            return self._resampled(np.asarray(image), interpolation, bands, 0.0)
 
         return resample
 

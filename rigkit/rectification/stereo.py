@@ -68,7 +68,6 @@ def rectify_pair(
     cam2_from_cam1: Rigid3,
     *,
     projection: StereoProjection = "perspective",
-    focal_px: float | None = None,
 ) -> StereoRectification:
     """Return the rectification of a pair of cameras of any models.
 
@@ -79,10 +78,9 @@ def rectify_pair(
     ----------
     projection : "perspective" for ordinary lenses and side-by-side cameras; "cylindrical" and "equirectangular" around
         the baseline for wide ones, the latter for every direction of the baseline.
-    focal_px : px per radian at the target's centre; by default that which keeps the sources' resolution in the median.
 
     The target covers the rows that both cameras see, and all columns that either sees, out to the reach of the
-    projection.
+    projection, at the sources' resolution in the median.
     """
     if projection not in _TARGETS:
         raise InputError(f"projection '{projection}' is unknown; known: {', '.join(_TARGETS)}")
@@ -95,10 +93,8 @@ def rectify_pair(
         for camera, rotation in ((camera1, rect_from_cam1), (camera2, rect_from_cam2))
     ]
     low, high, scale = _extent(maps, np.array(_REACH[projection]))
-    focal = float(1.0 / scale) if focal_px is None else float(focal_px)
     largest = MAX_ENLARGEMENT * max(*camera1.size_px, *camera2.size_px)
-    if focal_px is None:
-        focal = min(focal, largest / float((high - low).max()))
+    focal = min(float(1.0 / scale), largest / float((high - low).max()))
     size = np.ceil(focal * (high - low)).astype(int) + 1
     target = model((int(size[0]), int(size[1])), np.array([focal, focal, *(-focal * low)]))
     return StereoRectification(

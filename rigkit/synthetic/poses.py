@@ -22,6 +22,8 @@ MIN_INCIDENCE = 0.35
 """Smallest |cosine| between a viewing ray and a board's normal."""
 ROLL_DEG = 30.0
 AIM_JITTER_DEG = 8.0
+MARGIN_SQUARES = 0.5
+"""Of white round the squares of a board."""
 DRAWS = 4000
 """Candidates drawn at a time by rejection sampling."""
 MAX_DRAWS = 200
@@ -80,7 +82,6 @@ def general_pairs(
     rng: np.random.Generator,
     *,
     parallax_deg: tuple[float, float] = (40.0, 70.0),
-    margin_squares: float = 0.5,
 ) -> PairBatch:
     """Return pairs of free views of three boards in the corner of a room.
 
@@ -93,7 +94,7 @@ def general_pairs(
     ----------
     parallax_deg : range of the angle between the two cameras as seen from the corner.
     """
-    corners, facing = _corner_boards(board, margin_squares)
+    corners, facing = _corner_boards(board)
     n = board.corner_count
     kept: list[tuple[FloatArray, FloatArray]] = []
     found = 0
@@ -168,14 +169,14 @@ def special_pairs(
     )
 
 
-def _corner_boards(board: Board, margin_squares: float) -> tuple[Points, Normals]:
+def _corner_boards(board: Board) -> tuple[Points, Normals]:
     """Return the corners of three boards (3 N, 3) whose first corners lie nearest to the origin, and their normals.
 
     Rows and columns lead away from the corner of the room on all three, so that their diagonals do, too: the estimators
     that use the diagonal then treat the planes alike.
     """
     away = -np.eye(3)
-    flat = board.points()[:, :2] + (1.0 + margin_squares) * np.array([board.square_x_mm, board.square_y_mm])
+    flat = board.points()[:, :2] + (1.0 + MARGIN_SQUARES) * np.array([board.square_x_mm, board.square_y_mm])
     corners = [flat @ away[[i, j]] for i, j in ((0, 1), (0, 2), (2, 1))]
     return np.concatenate(corners), away[[2, 1, 0]]
 

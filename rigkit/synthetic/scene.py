@@ -20,6 +20,8 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 
+WALLS = (0.34, 0.42, 0.28)
+"""Reflectances of the walls and the floor of a room."""
 BOARD_CLEARANCE_MM = 3.0
 """Gap between the paper's edge and the edge where two walls meet: boards that touch would hide each other's edge."""
 SEAM_ROUNDING_MM = 1e-6
@@ -137,7 +139,6 @@ def trihedral(
     angles_deg: tuple[float, float, float] = (90.0, 90.0, 90.0),
     margin_squares: float = 0.5,
     clearance_mm: float = BOARD_CLEARANCE_MM,
-    first_black: bool = True,
 ) -> tuple[PlacedBoard, PlacedBoard, PlacedBoard]:
     """Return three boards pushed into the corner of a room: front wall, floor, right wall.
 
@@ -162,7 +163,7 @@ def trihedral(
         low, high = board.pattern.outline(*board.size)
         far, near = (side * board.squares_mm + clearance_mm for side in (high + margin_squares, margin_squares - low))
         origin = np.where(np.array(side) > 0, -far, near)
-        placed = PlacedBoard(board, Rigid3(axes, axes[:, :2] @ origin), margin_squares, first_black=first_black)
+        placed = PlacedBoard(board, Rigid3(axes, axes[:, :2] @ origin), margin_squares)
         facing = walls[end][:, 2]
         beyond = float((placed.outline() @ facing).max()) + clearance_mm
         if beyond > SEAM_ROUNDING_MM:
@@ -174,17 +175,14 @@ def trihedral(
 
 
 def room_walls(
-    size_mm: float = 2500.0,
-    *,
-    angles_deg: tuple[float, float, float] = (90.0, 90.0, 90.0),
-    reflectance: tuple[float, float, float] = (0.34, 0.42, 0.28),
+    size_mm: float = 2500.0, *, angles_deg: tuple[float, float, float] = (90.0, 90.0, 90.0)
 ) -> tuple[Panel, ...]:
     """Return the two walls and the floor behind a trihedral capture, a millimetre behind the boards."""
     half = size_mm / 2.0
     sides = ((-half, -half), (-half, half), (half, -half))
     return tuple(
         Panel(Rigid3(axes, axes @ np.array([*side, 1.0])), size_mm, size_mm, rho)
-        for axes, side, rho in zip(wall_axes(angles_deg), sides, reflectance, strict=True)
+        for axes, side, rho in zip(wall_axes(angles_deg), sides, WALLS, strict=True)
     )
 
 

@@ -289,7 +289,7 @@ def _write(
 ) -> tuple[tuple[RectifiedImage, ...], dict[str, InputError]]:
     """Resample and write the images of each map, one after the other; two images of a pair come together or not."""
     total, done, failures = len(jobs[0][0]), [], {}
-    resamplers = [remap.resampler(interpolation=options.interpolation) for _, remap in jobs]
+    resamplers = [remap.resampler(options.interpolation) for _, remap in jobs]
     for i in range(total):
         files: dict[Path, str | bytes] = {}
         for (job, remap), resample in zip(jobs, resamplers, strict=True):
