@@ -79,11 +79,6 @@ def corners_figure(reconstruction: Reconstruction, image1: NDArray[Any], image2:
     return figure
 
 
-def corners_png(reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any]) -> bytes:
-    """Return `corners_figure` as PNG."""
-    return as_png(corners_figure(reconstruction, image1, image2))
-
-
 def epipolar_figure(
     reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
 ) -> Figure:
@@ -118,13 +113,6 @@ def epipolar_figure(
     passed = "corner" if reconstruction.boards else "point"
     axes[1].set_title(f"view 2 (each curve passes through its {passed})", fontsize=9, y=1.0)
     return figure
-
-
-def epipolar_png(
-    reconstruction: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, every: int = 7
-) -> bytes:
-    """Return `epipolar_figure` as PNG."""
-    return as_png(epipolar_figure(reconstruction, image1, image2, every=every))
 
 
 def epipolar_curves(camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, pixels1: Pixels) -> FloatArray:
@@ -190,9 +178,21 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
     return figure
 
 
-def cloud_png(reconstruction: Reconstruction, *, unit: str = "mm") -> bytes:
-    """Return `cloud_figure` as PNG."""
-    return as_png(cloud_figure(reconstruction, unit=unit))
+def pair_pictures(
+    r: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, pdf: bool = False
+) -> dict[str, bytes]:
+    """Return the pictures of a pair by relative path, as vectors too with `pdf`."""
+    figures = {
+        "corners": corners_figure(r, image1, image2),
+        "epipolar": epipolar_figure(r, image1, image2),
+        "cloud": cloud_figure(r),
+    }
+    files: dict[str, bytes] = {}
+    for name, figure in figures.items():
+        files[f"{r.pair_id}/{name}.png"] = as_png(figure)
+        if pdf:
+            files[f"{r.pair_id}/{name}.pdf"] = as_pdf(figure)
+    return files
 
 
 def difference_png(difference: CameraDifference) -> bytes:

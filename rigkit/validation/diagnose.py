@@ -182,7 +182,8 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
     if unit is not None:
         names = ", ".join(dict.fromkeys(f"pair '{pair}': {check.name}" for pair, check in failed))
         return [f"{names}: written in {unit}? Lengths are in mm; or the squares are {squares}"]
-    if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * _ratio_sigma(failed):
+    sigma = max(check.combined_sigma / check.measured for _, check in failed)
+    if len(lengths) > 1 and all(agree) and np.ptp(ratios) < SAME_RATIO + 4.0 * sigma:
         return [f"square size: all {len(lengths)} lengths come out {percent:+.1f} %; {squares} would explain them"]
     if len(lengths) == 1:
         return [
@@ -194,10 +195,6 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
         "lengths hold: it was probably misread"
         for pair, check in failed
     ]
-
-
-def _ratio_sigma(failed: Sequence[tuple[str, Check]]) -> float:
-    return float(max(check.combined_sigma / check.measured for _, check in failed))
 
 
 def _diagnose_angles(report: ValidationReport) -> list[str]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.opencv_stereo import read_opencv_stereo
-from rigkit.io.calibration_file import load_camera
+from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
 from rigkit.workflows.formats import READ_FORMATS
@@ -47,9 +48,10 @@ def camera_format(text: str) -> str | None:
     return "rigkit" if OURS.search(text) and found not in ("mrcal", "py-ocamcalib") else found
 
 
-def is_ours(path: str | Path) -> bool:
-    """Say whether the file is of rigkit's own format; raises InputError for one that cannot be read."""
-    return camera_format(read_text(path, "camera file")) == "rigkit"
+def own_calibration(path: str | Path) -> Calibration | None:
+    """Return a calibration of rigkit's, None for another file; raises InputError for one that cannot be read."""
+    ours = camera_format(read_text(path, "camera file")) == "rigkit"
+    return load_calibration(path) if ours and is_calibration(path) else None
 
 
 def is_rig(path: str | Path) -> bool:

@@ -11,12 +11,11 @@ from rigkit.calibration.rig.compare import Mounted, RigDifference, compare_board
 from rigkit.cameras.compare import CameraDifference, compare_cameras
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.report.figures import difference_png
-from rigkit.workflows.camera_files import import_camera, is_ours, is_rig, saved_rig
+from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,9 +126,10 @@ def _boards(a: Path, b: Path) -> BoardsPair:
 
 def _cameras(a: Path, b: Path) -> CameraPair:
     cameras = import_camera(a), import_camera(b)
-    if not all(is_ours(path) and is_calibration(path) for path in (a, b)):
+    first, second = own_calibration(a), own_calibration(b)
+    if first is None or second is None:
         return CameraPair(compare_cameras(*cameras), None)
-    judged = compare_calibrations(load_calibration(a), load_calibration(b))
+    judged = compare_calibrations(first, second)
     return CameraPair(judged.difference, judged)
 
 

@@ -16,11 +16,11 @@ from rigkit.core.printing import brief
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.exchange import Written
 from rigkit.interop.rigs import RIG_FORMATS, Outlines, Rig, write_rig
-from rigkit.io.calibration_file import is_calibration, load_calibration, save_camera
+from rigkit.io.calibration_file import save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
-from rigkit.workflows.camera_files import import_camera, import_rig, is_ours
+from rigkit.workflows.camera_files import import_camera, import_rig, own_calibration
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 RIG_ENDINGS = {"colmap": ".json"}
@@ -82,7 +82,8 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
         save_camera(options.output, camera, force=options.force)
         return ExportedCamera(camera=camera, kind=kind, max_error_px=0.0)
     with about(source):
-        outline = outline_of_corners(load_calibration(source)) if _is_calibration(source) else None
+        known = own_calibration(source)
+        outline = None if known is None else outline_of_corners(known)
         done = _foreign(camera, kind, outline)
     write_atomic(options.output, done.text, force=options.force)
     if done.note:
@@ -174,10 +175,6 @@ def foreign_paths(beside: Path, kinds: Sequence[str]) -> list[Path]:
     if unknown:
         raise InputError(f"export: '{unknown[0]}' is none of the known formats {', '.join(FOREIGN_ENDINGS)}")
     return [beside.with_name(f"{beside.stem}-{kind}{FOREIGN_ENDINGS[kind]}") for kind in kinds]
-
-
-def _is_calibration(source: str | Path) -> bool:
-    return is_ours(source) and is_calibration(source)
 
 
 def _foreign(camera: Camera, kind: str, outline: Pixels | None) -> Written:

@@ -109,7 +109,7 @@ def calibrate_hand_eye(
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
-            view = _view(path, board, camera, options.camera)
+            view = _view_of(path, _boards_in(path, board, camera, options.camera), board)
         except InputError as error:
             if len(paths) == 1:
                 raise
@@ -185,10 +185,6 @@ def _one_way_up(board: Board) -> Board:
             "with markers"
         )
     return board
-
-
-def _view(path: Path, board: Board, camera: Camera, calibration: str | Path) -> BoardView | None:
-    return _view_of(path, _boards_in(path, board, camera, calibration), board)
 
 
 def _boards_in(path: Path, board: Board, camera: Camera, calibration: str | Path) -> Sequence[BoardDetection]:

@@ -14,10 +14,9 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.rig_file import SavedRig, is_rig_file
 from rigkit.io.rig_session import RigSession
-from rigkit.workflows.camera_files import import_camera, is_ours, is_rig, saved_rig
+from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig
 from rigkit.workflows.folder_session import Known
 
 _log = logging.getLogger(__name__)
@@ -139,7 +138,6 @@ def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArr
             raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
         own = _places_in(rig, [name])
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
-    if is_ours(path) and is_calibration(path):
-        calibration = load_calibration(path)
+    if (calibration := own_calibration(path)) is not None:
         return calibration.camera, np.asarray(calibration.covariance)
     return import_camera(path), None

@@ -13,7 +13,7 @@ from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.calibration_shifts import with_calibrations
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.report.figures import cloud_png, corners_png, epipolar_png
+from rigkit.report.figures import pair_pictures
 from rigkit.workflows.datasets import (
     DatasetOptions,
     PairFailure,
@@ -100,7 +100,5 @@ def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:
-        files[f"{pair.pair_id}/corners.png"] = corners_png(r, image1, image2)
-        files[f"{pair.pair_id}/epipolar.png"] = epipolar_png(r, image1, image2)
-        files[f"{pair.pair_id}/cloud.png"] = cloud_png(r)
+        files |= pair_pictures(r, image1, image2)
     return PairReconstruction(r, ply, files)

@@ -24,7 +24,7 @@ from rigkit.reconstruction.growing.fuse import FusedCloud, PosedCloud, fuse_clou
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
-from rigkit.report.figures import cloud_png
+from rigkit.report.figures import as_png, cloud_figure
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE
@@ -213,6 +213,7 @@ def _files(options: RigSceneOptions, fused: FusedCloud, first: DenseScene | None
         )
     }
     if options.pictures and first is not None:
-        files["cloud.png"] = cloud_png(replace(first.scene.reconstruction, pair_id=options.rig.stem, cloud=fused.cloud))
+        shown = replace(first.scene.reconstruction, pair_id=options.rig.stem, cloud=fused.cloud)
+        files["cloud.png"] = as_png(cloud_figure(shown))
         files[SCENE_PAGE] = build_cloud_page(f"Scene of {options.rig.stem}", fused.cloud, software_facts(), unit="mm")
     return files

@@ -22,7 +22,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import is_calibration, load_calibration
 from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.files import npz_bytes
 from rigkit.io.images import read_image_of
@@ -33,9 +32,9 @@ from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
-from rigkit.report.figures import cloud_png, epipolar_png
+from rigkit.report.figures import as_png, cloud_figure, epipolar_figure
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera, import_pair, is_ours
+from rigkit.workflows.camera_files import import_camera, import_pair, own_calibration
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
@@ -206,9 +205,7 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
 def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Calibrations | None:
     """Return the cameras as their files know them, exact where one does not say; None where none does."""
     found = [
-        uncertain_camera(load_calibration(path))
-        if path is not None and is_ours(path) and is_calibration(path)
-        else None
+        None if path is None or (known := own_calibration(path)) is None else uncertain_camera(known)
         for path in (options.camera, options.camera2)
     ]
     if all(known is None for known in found):
@@ -314,9 +311,9 @@ def _files(
         files["correspondences.csv"] = correspondences_text(found)
     if not options.pictures:
         return files
-    files["cloud.png"] = cloud_png(r, unit=unit)
+    files["cloud.png"] = as_png(cloud_figure(r, unit=unit))
     files[SCENE_PAGE] = build_cloud_page(f"Scene {r.pair_id}", r.cloud, software_facts(), unit=unit)
     if images:
-        files["epipolar.png"] = epipolar_png(r, *images, every=max(1, len(r.cloud) // 40))
+        files["epipolar.png"] = as_png(epipolar_figure(r, *images, every=max(1, len(r.cloud) // 40)))
         files["normals.png"] = normals_png(scene, found, *images)
     return files

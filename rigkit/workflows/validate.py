@@ -24,7 +24,7 @@ from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
 from rigkit.report.drawings import normal_errors_svg, residuals_svg
-from rigkit.report.figures import as_pdf, as_png, cloud_figure, corners_figure, epipolar_figure, pair_jpeg
+from rigkit.report.figures import pair_jpeg, pair_pictures
 from rigkit.report.page import PairSection
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.validation_page import crosscheck_table, pair_section
@@ -198,7 +198,7 @@ def _judge(
         compared = crosscheck(shown, other_chain=other, shifts=shifts[best.affine_method])
     section = None
     if job.options.pictures:
-        drawn = _pictures(shown, image1, image2, pdf=job.options.pdf)
+        drawn = pair_pictures(shown, image1, image2, pdf=job.options.pdf)
         files |= drawn
         section = _section(reconstructions, shown, reports, compared, drawn)
     return PairValidation(
@@ -245,21 +245,6 @@ def _shifts(
         if not same:
             known.append((reconstruction, out[method]))
     return out
-
-
-def _pictures(r: Reconstruction, image1: NDArray[Any], image2: NDArray[Any], *, pdf: bool) -> dict[str, bytes]:
-    """Return the pictures of a pair by relative path, as vectors too with `pdf`."""
-    figures = {
-        "corners": corners_figure(r, image1, image2),
-        "epipolar": epipolar_figure(r, image1, image2),
-        "cloud": cloud_figure(r),
-    }
-    files: dict[str, bytes] = {}
-    for name, figure in figures.items():
-        files[f"{r.pair_id}/{name}.png"] = as_png(figure)
-        if pdf:
-            files[f"{r.pair_id}/{name}.pdf"] = as_pdf(figure)
-    return files
 
 
 def _section(

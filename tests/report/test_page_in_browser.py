@@ -11,7 +11,7 @@ from helpers.browser import probed
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.truth import MeasuredAngle, PairTruth
-from rigkit.report.figures import cloud_png
+from rigkit.report.figures import as_png, cloud_figure
 from rigkit.report.page import build_page
 from rigkit.report.validation_page import pair_section, summary_table
 from rigkit.report.validation_verdict import verdict_of
@@ -33,7 +33,7 @@ def test_the_page_works_without_network(tmp_path: Path) -> None:
     reconstruction = make_reconstruction()
     truth = PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set <square>"),))
     report = validate(reconstruction, truth)
-    picture = ("The cloud", "image/png", cloud_png(reconstruction))
+    picture = ("The cloud", "image/png", as_png(cloud_figure(reconstruction)))
     section = pair_section(reconstruction, [report], [picture])
     page = build_page(
         "A & B", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x"}
@@ -87,7 +87,7 @@ def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
 def test_the_page_fits_a_phone_a_tablet_and_a_screen(tmp_path: Path) -> None:
     reconstruction = make_reconstruction()
     report = validate(reconstruction, PairTruth(angles=(MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set square"),)))
-    picture = ("The cloud", "image/png", cloud_png(reconstruction))
+    picture = ("The cloud", "image/png", as_png(cloud_figure(reconstruction)))
     section = pair_section(reconstruction, [report], [picture])
     page = build_page(
         "title", "lead", verdict_of([report], [report]), [summary_table([report])], [section], {"rigkit": "x" * 200}
