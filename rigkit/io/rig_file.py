@@ -16,6 +16,7 @@ import numpy as np
 from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance
@@ -133,7 +134,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
                 outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
-        size = sum(camera.parameters.size for camera, _ in cameras.values()) + 6 * (len(cameras) - 1)
+        size = Layout.of_cameras(camera for camera, _ in cameras.values()).count
         beyond = tuple(_modes(departures.get(name, _NO_MODES), size) for name in cameras) if departures else ()
         covariance = None
         if "covariance" in data:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from rigkit.calibration.rig.known import KnownCameras
+from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.rig_file import SavedRig, is_rig_file
@@ -93,33 +94,25 @@ def _covariance(
     alone: dict[str, FloatArray | None],
 ) -> FloatArray:
     """Return the covariance of all that is known, in the order that `KnownCameras` has; exact where no file says."""
-    sizes = [camera.parameters.size for camera, _ in cameras.values()]
-    ends = dict(zip(cameras, np.cumsum(sizes), strict=True))
-    lenses = {name: slice(ends[name] - size, ends[name]) for name, size in zip(cameras, sizes, strict=True)}
-    total = int(sum(sizes))
-    out = np.zeros((total + 6 * max(len(mounted) - 1, 0),) * 2)
+    layout = Layout.of_cameras(camera for camera, _ in cameras.values())
+    lenses = dict(zip(cameras, layout.cameras, strict=True))
+    total = layout.cameras[-1].stop + 6 * max(len(mounted) - 1, 0)
+    out = np.zeros((total, total))
     if rig.covariance is not None:
-        here = [np.arange(lenses[name].start, lenses[name].stop) for name in mounted]
-        here += [np.arange(total + 6 * k, total + 6 * k + 6) for k in range(len(mounted) - 1)]
-        there = _places_in(rig, mounted)
-        out[np.ix_(np.concatenate(here), np.concatenate(here))] = rig.covariance[np.ix_(there, there)]
+        here, there = _places_in(cameras, mounted), _places_in(rig.cameras, mounted)
+        out[np.ix_(here, here)] = rig.covariance[np.ix_(there, there)]
     for name, covariance in alone.items():
         if covariance is not None:
             out[lenses[name], lenses[name]] = covariance
     return out
 
 
-def _places_in(rig: SavedRig, mounted: Sequence[str]) -> np.ndarray:
-    """Return where the lenses and mounts of some cameras stand in the covariance of their rig."""
-    lenses, mounts = {}, {}
-    start = 0
-    for name, (camera, _) in rig.cameras.items():
-        lenses[name] = np.arange(start, start + camera.parameters.size)
-        start += camera.parameters.size
-    for name in list(rig.cameras)[1:]:
-        mounts[name] = np.arange(start, start + 6)
-        start += 6
-    return np.concatenate([*(lenses[name] for name in mounted), *(mounts[name] for name in mounted[1:])])
+def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[str]) -> IntArray:
+    """Return where the lenses and mounts of some cameras stand in the covariance of all `cameras`."""
+    layout = Layout.of_cameras(camera for camera, _ in cameras.values())
+    chosen = [list(cameras).index(name) for name in mounted]
+    runs = [layout.cameras[k] for k in chosen] + [layout.mount(k) for k in chosen[1:]]
+    return np.concatenate([np.arange(run.start, run.stop) for run in runs])
 
 
 def _saved(path: Path, names: Sequence[str]) -> SavedRig:
@@ -136,7 +129,7 @@ def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArr
         rig = _saved(path, names)
         if name not in rig.cameras:
             raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
-        own = _places_in(rig, [name])
+        own = _places_in(rig.cameras, [name])
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
     if (calibration := own_calibration(path)) is not None:
         return calibration.camera, np.asarray(calibration.covariance)

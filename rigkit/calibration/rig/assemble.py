@@ -16,10 +16,11 @@ from rigkit.calibration.rig.clustered import clustered_by_frame
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import pose_jacobians
-from rigkit.calibration.rig.state import Layout, RigObservations
+from rigkit.calibration.rig.state import RigObservations
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from rigkit.calibration.clustered import drawn_errors
 from rigkit.calibration.compare import SAME_CHANCE
 from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
@@ -47,10 +47,9 @@ class Mounted:
     freedom: float = float("inf")
 
     @property
-    def runs(self) -> list[slice]:
-        """Where the parameters of each camera stand in the covariance."""
-        ends = np.cumsum([0, *(camera.parameters.size for camera, _ in self.cameras.values())]).tolist()
-        return [slice(a, b) for a, b in pairwise(ends)]
+    def layout(self) -> Layout:
+        """Where lenses and mounts stand in the covariance."""
+        return Layout.of_cameras(camera for camera, _ in self.cameras.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +155,8 @@ def _weights(rig: Mounted, k: int) -> FloatArray:
     rays, valid = camera.unproject(pixels)
     p = camera.parameters.size
     design = projection_design(camera, rays[valid])[:, :p]
-    own = rig.covariance[rig.runs[k], rig.runs[k]]
-    variance = np.einsum("ipm,pq,iqm->m", design, own, design)
+    own = rig.layout.cameras[k]
+    variance = np.einsum("ipm,pq,iqm->m", design, rig.covariance[own, own], design)
     out[valid] = 1.0 / np.maximum(np.sqrt(np.maximum(variance, 0.0)), WEIGHT_FLOOR_PX)
     return np.asarray(out / out.max())
 
@@ -177,17 +176,16 @@ def _design(rig: Mounted, weights: Sequence[FloatArray]) -> FloatArray:
         both = projection_design(camera, rays[valid]) * np.sqrt(weight[valid])
         rows = both.transpose(1, 0, 2).reshape(p + 3, -1)
         turns.append(-np.linalg.lstsq(rows[p:].T, rows[:p].T, rcond=None)[0])
-    runs, first = rig.runs, rig.runs[-1].stop
-    out = np.zeros((6 * (len(turns) - 1), first + 6 * (len(turns) - 1)))
-    for k, (_, mount) in enumerate(rig.cameras.values()):
-        if k == 0:
-            continue
-        turn, shift = slice(6 * k - 6, 6 * k - 3), slice(6 * k - 3, 6 * k)
-        out[turn, runs[0]] += mount.rotation @ turns[0]
-        out[turn, runs[k]] -= turns[k]
-        out[shift, runs[k]] += skew(mount.translation_mm) @ turns[k]
-        out[6 * k - 6 : 6 * k, first + 6 * k - 6 : first + 6 * k] = np.eye(6)
-    return out
+    layout = rig.layout
+    out = np.zeros((layout.count, layout.count))
+    for k, (_, mount) in list(enumerate(rig.cameras.values()))[1:]:
+        own, lens = layout.mount(k), layout.cameras[k]
+        turn, shift = out[own][:3], out[own][3:]
+        turn[:, layout.cameras[0]] += mount.rotation @ turns[0]
+        turn[:, lens] -= turns[k]
+        shift[:, lens] += skew(mount.translation_mm) @ turns[k]
+        out[own, own] = np.eye(6)
+    return out[layout.cameras[-1].stop :]
 
 
 def _chance(off: FloatArray, covariance: FloatArray, errors: FloatArray) -> float:

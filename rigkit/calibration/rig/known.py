@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.solver import rig_normal
-from rigkit.calibration.rig.state import Layout, RigObservations, RigState
+from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
@@ -51,13 +52,11 @@ class KnownCameras:
         """Return the covariance of one camera's parameters; None: exact."""
         if self.covariance is None:
             return None
-        start = 0
-        for other, (camera, _) in self.cameras.items():
-            end = start + camera.parameters.size
-            if other == name:
-                return self.covariance[start:end, start:end]
-            start = end
-        raise InputError(f"known cameras: none is called '{name}'")
+        if name not in self.cameras:
+            raise InputError(f"known cameras: none is called '{name}'")
+        layout = Layout.of_cameras(camera for camera, _ in self.cameras.values())
+        own = layout.cameras[list(self.cameras).index(name)]
+        return self.covariance[own, own]
 
     def index(self, names: Sequence[str], layout: Layout) -> IntArray:
         """Return where what is known stands among the globals of a rig with the cameras `names`."""

@@ -11,6 +11,7 @@ from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, as_array
 from rigkit.core.errors import InputError
@@ -89,7 +90,7 @@ class RigCalibration:
     _repr_html_ = drawn
 
     def __post_init__(self) -> None:
-        count = sum(c.camera.parameters.size for c in self.cameras) + 6 * (len(self.cameras) - 1)
+        count = Layout.of_cameras(c.camera for c in self.cameras).count
         object.__setattr__(self, "covariance", as_array(self.covariance, (count, count), "covariance"))
 
     def __repr__(self) -> str:
@@ -165,8 +166,7 @@ class RigCalibration:
 
     def mount(self, k: int) -> slice:
         """Return where the mount of camera `k` > 0 stands in the covariance."""
-        first = sum(c.camera.parameters.size for c in self.cameras) + 6 * (k - 1)
-        return slice(first, first + 6)
+        return Layout.of_cameras(c.camera for c in self.cameras).mount(k)
 
     def _centre(self, k: int) -> FloatArray:
         return self.cameras[k].cam_from_rig.inverse().translation_mm

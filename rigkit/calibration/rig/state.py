@@ -15,6 +15,7 @@ import numpy as np
 
 from rigkit.calibration.normal_equations import SchurStep
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
@@ -25,32 +26,6 @@ from rigkit.geometry.rotation import exp_so3
 
 Key = tuple[str, str]
 """(frame, target): views that have a key in common see the same target in the same place."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Layout:
-    """Where each kind of unknown stands among the globals: intrinsics of all cameras, mounts of all but the first, the
-    boards that have a place of their own on their target, the boards' shape."""
-
-    cameras: tuple[slice, ...]
-    mounts: tuple[slice | None, ...]
-    boards: tuple[slice | None, ...]
-    shape: slice
-
-    @classmethod
-    def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int) -> Layout:
-        """Lay out cameras of so many parameters each, boards that have a place to find or not, and the shape."""
-        ends = np.cumsum([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape]).tolist()
-        runs = iter([slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)])
-        cameras = tuple(next(runs) for _ in sizes)
-        mounts = (None, *(next(runs) for _ in sizes[1:]))
-        boards = tuple(next(runs) if place else None for place in places)
-        return cls(cameras, mounts, boards, next(runs))
-
-    @property
-    def count(self) -> int:
-        """Number of globals."""
-        return int(self.shape.stop)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

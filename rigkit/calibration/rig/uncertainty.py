@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import worst_direction
 from rigkit.core.arrays import BoolArray, FloatArray, Points
@@ -71,16 +72,16 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
         [-d_pixels1_d_parameters, np.zeros((len(points), 1, d_pixels1_d_parameters.shape[-1]))], axis=1
     )
     by_own = np.linalg.solve(system, held)
-    ends = np.cumsum([0, *(camera.parameters.size for camera in cameras)])
+    layout = Layout.of_cameras(cameras)
     design = np.zeros((len(points), 2, len(known)))
     turned = d_pixels2_d_point @ motion.rotation
-    design[:, :, ends[i] : ends[i + 1]] += turned @ by_own
-    design[:, :, ends[j] : ends[j + 1]] += d_pixels2_d_parameters
+    design[:, :, layout.cameras[i]] += turned @ by_own
+    design[:, :, layout.cameras[j]] += d_pixels2_d_parameters
     for k, x, by_x, sign in ((i, points, turned, -1.0), (j, there, d_pixels2_d_point, 1.0)):
         if k > 0:
             lever = skew(x - rig.cameras[k].cam_from_rig.translation_mm)
-            run = int(ends[-1]) + 6 * (k - 1)
-            design[:, :, run : run + 3] += sign * by_x @ -lever
-            design[:, :, run + 3 : run + 6] += sign * by_x
+            run = design[:, :, layout.mount(k)]
+            run[..., :3] += sign * by_x @ -lever
+            run[..., 3:] += sign * by_x
     covariance = design @ known @ np.swapaxes(design, -1, -2)
     return covariance, seen1 & seen2 & second.on_image(pixels)

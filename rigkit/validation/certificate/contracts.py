@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
@@ -219,15 +220,13 @@ def instrument_of_rig(
             f"certificate: two different cameras of {', '.join(names)} are needed, got {' and '.join(pair)}"
         )
     order = [list(names).index(name) for name in pair]
-    ends = np.cumsum([0, *(camera.parameters.size for camera in cameras)])
-    rows = [index for k in order for index in range(ends[k], ends[k + 1])]
-    kept: list[int | None] = list(rows)
-    for k in order:
-        kept += [None] * 6 if k == 0 else list(range(int(ends[-1]) + 6 * (k - 1), int(ends[-1]) + 6 * k))
-    known = np.array([k for k, index in enumerate(kept) if index is not None])
-    taken = np.array([index for index in kept if index is not None])
+    layout = Layout.of_cameras(cameras)
+    place, absent = np.arange(layout.count), np.full(6, -1)
+    rows = [place[layout.cameras[k]] for k in order] + [place[layout.mount(k)] if k else absent for k in order]
+    kept = np.concatenate(rows)
+    known = np.flatnonzero(kept >= 0)
     joint = np.zeros((len(kept), len(kept)))
-    joint[np.ix_(known, known)] = covariance[np.ix_(taken, taken)]
+    joint[np.ix_(known, known)] = covariance[np.ix_(kept[known], kept[known])]
     return Instrument(
         names=tuple(pair),
         cameras=tuple(cameras[k] for k in order),

@@ -1,0 +1,47 @@
+"""Where the numbers of a rig stand: in a solution, in the covariance of its result, and in its file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Layout:
+    """Where each kind of unknown stands among the globals: intrinsics of all cameras, mounts of all but the first, the
+    boards that have a place of their own on their target, the boards' shape."""
+
+    cameras: tuple[slice, ...]
+    mounts: tuple[slice | None, ...]
+    boards: tuple[slice | None, ...]
+    shape: slice
+
+    @classmethod
+    def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int) -> Layout:
+        """Lay out cameras of so many parameters each, boards that have a place to find or not, and the shape."""
+        ends = np.cumsum([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape]).tolist()
+        runs = iter([slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)])
+        cameras = tuple(next(runs) for _ in sizes)
+        mounts = (None, *(next(runs) for _ in sizes[1:]))
+        boards = tuple(next(runs) if place else None for place in places)
+        return cls(cameras, mounts, boards, next(runs))
+
+    @classmethod
+    def of_cameras(cls, cameras: Iterable[Camera]) -> Layout:
+        """Lay out cameras and their mounts alone, as the covariance of a rig has them."""
+        return cls.of([camera.parameters.size for camera in cameras], (), 0)
+
+    def mount(self, k: int) -> slice:
+        """Return where the mount of camera `k` > 0 stands."""
+        run = self.mounts[k]
+        assert run is not None
+        return run
+
+    @property
+    def count(self) -> int:
+        """Number of globals."""
+        return int(self.shape.stop)
