@@ -27,7 +27,7 @@ from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.provenance import software_facts
-from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE
+from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 from rigkit.workflows.results import require_folder, write_results
 
 PARTNERS = 3
@@ -37,7 +37,7 @@ MAX_AXES_DEG = 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RigSceneOptions:
+class RigSceneOptions(CloudOptions):
     """What is there of a scene, and how to reconstruct it."""
 
     rig: Path
@@ -46,16 +46,6 @@ class RigSceneOptions:
     """One for each camera."""
     names: tuple[str, ...] | None = None
     """Cameras of the images; None: the rig's first ones in its order."""
-    output: Path | None = None
-    """Folder for the results; None: nothing is written."""
-    force: bool = False
-    """Replace results that are there; what was read is never replaced."""
-    single_precision: bool = False
-    """Write the cloud in 32 bits, for programs that know no other."""
-    confidence: bool = False
-    """Let the length of the cloud's normals say how sure they are."""
-    pictures: bool = True
-    """Draw the cloud."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -48,7 +48,23 @@ Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SceneOptions:
+class CloudOptions:
+    """Where a cloud goes, and how it is written."""
+
+    output: Path | None = None
+    """Folder for the results; None: nothing is written."""
+    force: bool = False
+    """Replace results that are there; what was read is never replaced."""
+    single_precision: bool = False
+    """Write the cloud in 32 bits, for programs that know no other."""
+    confidence: bool = False
+    """Let the length of the cloud's normals say how sure they are."""
+    pictures: bool = True
+    """Draw the cloud, and what it comes from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions(CloudOptions):
     """What is there of a scene, and how to reconstruct it."""
 
     camera: Path | None = None
@@ -75,16 +91,6 @@ class SceneOptions:
     """How well that pose type holds."""
     grow: bool = True
     """Where there are images: let the correspondences grow over the surfaces, into a dense cloud."""
-    output: Path | None = None
-    """Folder for the results; None: nothing is written."""
-    force: bool = False
-    """Replace results that are there; what was read is never replaced."""
-    single_precision: bool = False
-    """Write the cloud in 32 bits, for programs that know no other."""
-    confidence: bool = False
-    """Let the length of the cloud's normals say how sure they are."""
-    pictures: bool = True
-    """Draw the cloud, the epipolar curves and the normals."""
 
     @property
     def name(self) -> str:
