@@ -9,6 +9,6 @@
 - what to think of it: `captured`, `coverage`, `neighbours`, `moved`, `changing`, `mixed`, `verdicts`
 - what comes out: `assemble`, `result`
 
-`compare` tells two calibrations apart; `posed`, `held_lens` and `hand_eye` are for a camera that is known. `rig` does
+`compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known. `rig` does
 the same for several cameras, under the same names of files, on top of what is here.
 """

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
@@ -20,7 +22,6 @@ from rigkit.calibration.fit import (
     inliers,
     sigma_of,
 )
-from rigkit.calibration.held_lens import HeldLens
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import with_board_shape
@@ -29,10 +30,10 @@ from rigkit.calibration.result import Calibration, Candidate, Convergence
 from rigkit.calibration.state import State, evaluate
 from rigkit.calibration.usable import usable_views
 from rigkit.calibration.verdicts import judge
-from rigkit.cameras.base import Camera
+from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
@@ -157,3 +158,47 @@ def _misfit(result: Calibration) -> tuple[Finding, ...]:
         return ()
     message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
     return (Finding.bad(message, "calibrate it anew"),)
+
+
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class HeldLens(Camera):
+    """The camera `lens`, without a parameter."""
+
+    lens: Camera
+
+    model: ClassVar[str] = "held"
+
+    @classmethod
+    def of(cls, lens: Camera) -> HeldLens:
+        """Return the lens, held."""
+        return cls(lens.size_px, np.zeros(0), lens)
+
+    @classmethod
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        raise InputError("a held lens is not made of a curve; it is one that is known")
+
+    def parameter_names(self) -> tuple[str, ...]:
+        return ()
+
+    def with_parameters(self, parameters: ArrayLike) -> Self:
+        return self
+
+    @property
+    def max_angle_rad(self) -> float:
+        return self.lens.max_angle_rad
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        return self.lens._project(x, y, z)
+
+    def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        return self.lens._unproject(u, v)
+
+    def _derivatives(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        return self.lens._derivatives(x, y, z, d_pixels_d_point, None)
