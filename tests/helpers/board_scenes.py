@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3, cam_from_world_look_at
 from rigkit.geometry.rotation import exp_so3
+from rigkit.reconstruction.pairing import MatchedPair, match_pair
+from rigkit.synthetic.pairs import StereoScene
 
 SIZE_PX = (1624, 1240)
 LAB_PAIRS = tuple(
@@ -169,3 +172,22 @@ def true_corners(found: BoardDetection, pixels: dict[str, np.ndarray]) -> tuple[
     distance = {i: np.linalg.norm(p[:, None] - found.pixels[None], axis=-1) for i, p in pixels.items()}
     board_id = min(distance, key=lambda i: np.nanmax(np.nanmin(distance[i], axis=0)))
     return board_id, np.nanargmin(distance[board_id], axis=0)
+
+
+def noisy_pair(
+    scene: StereoScene,
+    boards: Sequence[Board],
+    rng: np.random.Generator,
+    sigma_px: float,
+    *,
+    known_as: Camera | None = None,
+    declared: Sequence[Board] | None = None,
+) -> MatchedPair:
+    """Match the boards of a scene from corners with noise, as one camera `known_as` sees them, or the scene's own, and
+    as other boards where those are `declared`."""
+    one, two = (
+        [detection(b, np.array(d.pixels), rng, sigma_px) for b, d in zip(boards, exact, strict=True)]
+        for exact in scene.detections()
+    )
+    camera1, camera2 = known_as or scene.camera1, known_as or scene.camera2
+    return match_pair("made", camera1, camera2, one, two, declared or boards)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.board_scenes import detection, fisheye_camera, regular_camera
+from helpers.board_scenes import fisheye_camera, noisy_pair, regular_camera
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import Pinhole
@@ -38,12 +38,7 @@ WITHIN_TWO_OF_BASELINES = 0.85
 def geometry_of(
     scene: StereoScene, rng: np.random.Generator, pose_type: PoseType = PoseType.GENERAL, level: float | None = None
 ) -> PairGeometry:
-    one, two = (
-        [detection(b, np.array(d.pixels), rng, SIGMA_PX) for b, d in zip(BOARDS, exact, strict=True)]
-        for exact in scene.detections()
-    )
-    pair = match_pair("made", scene.camera1, scene.camera2, one, two, BOARDS)
-    return pair_geometry(pair, pose_type=pose_type, level_sigma_rad=level)
+    return pair_geometry(noisy_pair(scene, BOARDS, rng, SIGMA_PX), pose_type=pose_type, level_sigma_rad=level)
 
 
 def scene_of(camera: Camera, rng: np.random.Generator, pose_type: PoseType = PoseType.GENERAL) -> StereoScene:

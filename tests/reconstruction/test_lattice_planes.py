@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.board_scenes import detection, fisheye_camera, regular_camera
+from helpers.board_scenes import fisheye_camera, noisy_pair, regular_camera
 from helpers.reconstructions import BOARDS
 
 from rigkit.cameras.base import Camera
@@ -20,7 +20,6 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.io.ply import read_ply, write_ply
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.lattice_planes import LatticePlanes, lattice_planes
-from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import on_planes, reconstruct_from
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
@@ -42,12 +41,7 @@ def geometry_of(
     scene: StereoScene, rng: np.random.Generator, sigma_px: float = SIGMA_PX, boards: Sequence[Board] = BOARDS
 ) -> PairGeometry:
     """Return the geometry of a scene from noisy corners."""
-    one, two = (
-        [detection(b, np.array(d.pixels), rng, sigma_px) for b, d in zip(boards, exact, strict=True)]
-        for exact in scene.detections()
-    )
-    pair = match_pair("made", scene.camera1, scene.camera2, one, two, boards)
-    return pair_geometry(pair, pose_type=PoseType.GENERAL)
+    return pair_geometry(noisy_pair(scene, boards, rng, sigma_px), pose_type=PoseType.GENERAL)
 
 
 def scene_of(camera: Camera, pose_type: PoseType, rng: np.random.Generator) -> StereoScene:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.board_scenes import detection
+from helpers.board_scenes import noisy_pair
 from helpers.calibration_scenes import REACH_DEG, lens
 from helpers.reconstructions import BOARDS
 from recovery.test_honest_sigmas import SIGMA_PX, random_scene, recalibration
@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.posetype import PoseType
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
-from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene
 
@@ -52,11 +51,7 @@ def test_sigmas_of_free_clouds_include_the_calibration(rng: np.random.Generator,
     for k in range(DRAWS):
         scene = scenes[k % SCENES]
         calibrated, covariance = calibrate()
-        one, two = (
-            [detection(b, np.array(d.pixels), rng, SIGMA_PX) for b, d in zip(BOARDS, exact, strict=True)]
-            for exact in scene.detections()
-        )
-        matched = match_pair("made", calibrated, calibrated, one, two, BOARDS)
+        matched = noisy_pair(scene, BOARDS, rng, SIGMA_PX, known_as=calibrated)
         given = reconstruct_pair(matched, pose_type=scene.pose_type, affine_method=method)
         known = UncertainCamera(calibrated, covariance)
         whole = with_calibrations(given, calibration_shifts(given, known))

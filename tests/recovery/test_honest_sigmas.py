@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.board_scenes import detection, fisheye_camera, regular_camera
+from helpers.board_scenes import fisheye_camera, noisy_pair, regular_camera
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from helpers.reconstructions import BOARDS
 
@@ -27,7 +27,6 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
-from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.validation.checks import ValidationReport, validate
@@ -59,11 +58,7 @@ def report_of(scene: StereoScene, rng: np.random.Generator, calibrate: Calibrate
         tuple(MeasuredAngle(a, b, 90.0, 1e-9, "made") for a, b in PAIRS),
     )
     camera, covariance = (scene.camera1, None) if calibrate is None else calibrate()
-    one, two = (
-        [detection(b, np.array(d.pixels), rng, SIGMA_PX) for b, d in zip(BOARDS, exact, strict=True)]
-        for exact in scene.detections()
-    )
-    matched = match_pair("made", camera, camera, one, two, BOARDS)
+    matched = noisy_pair(scene, BOARDS, rng, SIGMA_PX, known_as=camera)
     reconstruction = reconstruct_pair(matched, pose_type=scene.pose_type)
     shifts = None
     if covariance is not None:

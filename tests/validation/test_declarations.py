@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.board_scenes import detection, regular_camera
+from helpers.board_scenes import noisy_pair, regular_camera
 from helpers.reconstructions import BOARDS
 
 from rigkit.core.boards import Board
@@ -15,7 +15,6 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.validation.checks import validate, validate_each
@@ -35,11 +34,7 @@ def declared(
     scene = trihedral_pair(
         BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
     )
-    first, second = (
-        [detection(b, np.array(d.pixels), rng, 0.03) for b, d in zip(BOARDS, exact, strict=True)]
-        for exact in scene.detections()
-    )
-    pair = match_pair("made", scene.camera1, scene.camera2, first, second, boards)
+    pair = noisy_pair(scene, BOARDS, rng, 0.03, declared=boards)
     return reconstruct_pair(pair, pose_type=said, level_sigma_rad=np.deg2rad(0.2))
 
 
