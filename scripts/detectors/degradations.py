@@ -94,6 +94,15 @@ def inverted(values: Values, _: float, rng: np.random.Generator) -> Values:
     return np.float32(255.0) - values
 
 
+def shadowed(grey: Grey, through: FloatArray, angle: float, width_px: float, left: float) -> Grey:
+    """Return the image under a shadow with a straight edge `through` a pixel, towards `angle`, that leaves the part
+    `left` of the light."""
+    row, column = np.mgrid[: grey.shape[0], : grey.shape[1]]
+    beyond = np.cos(angle) * (column - through[0]) + np.sin(angle) * (row - through[1])
+    light = left + (1.0 - left) * 0.5 * (1.0 - np.tanh(2.0 * beyond / width_px))
+    return np.asarray(np.clip(np.rint(grey * light), 0, 255), np.uint8)
+
+
 LIGHT: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
     "noise": noisy,
     "faint": faint,

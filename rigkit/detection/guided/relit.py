@@ -66,19 +66,26 @@ class _Usual:
     off_px: float
 
 
-def relit(image: GreyImage, found: BoardDetection, board: Board | None = None) -> BoardDetection:
+def relit(
+    image: GreyImage, found: BoardDetection, relative: FloatArray, board: Board | None = None
+) -> BoardDetection:
     """Return `found` with its corners beside the edge of a shadow placed as if that were not there, and with those that
     were missed for it.
 
+    `relative` (R, C) : what the fit of the corners left, relative to their contrast, NaN where that is not known.
     `board` : which it is, if it is a ChArUco board.
     """
     pixels = found.lattice()
     known = np.isfinite(pixels[..., 0])
     own = np.full(known.shape, np.nan)
     own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
-    # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual are beside none.
-    doubtful = ~(own < TIMES_BETTER * upper_median(found.sigma_px))
-    suspect = _suspect(image, board, pixels, doubtful & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known))
+    # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual, or fitted as well, are beside none.
+    plain = own < TIMES_BETTER * upper_median(found.sigma_px)
+    plain |= relative < TIMES_BETTER * upper_median(relative[np.isfinite(relative)])
+    doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
+    if np.count_nonzero(doubtful) < MIN_SHADED:
+        return found
+    suspect = _suspect(image, board, pixels, doubtful)
     even = known & ~suspect
     if np.count_nonzero(suspect) < MIN_SHADED or np.count_nonzero(even) < MIN_EVEN:
         return found
@@ -131,8 +138,6 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
     out = cells.copy()
-    if not cells.any():
-        return out
     out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
     return out
 

@@ -41,6 +41,12 @@ class RefinedLattice:
         worst: FloatArray = self.sigma_px * np.maximum(self.residual / self.noise, 1.0)
         return worst
 
+    @property
+    def relative_residual(self) -> FloatArray:
+        """(R, C) residual in parts of the contrast."""
+        relative: FloatArray = self.residual / self.lattice.contrast
+        return relative
+
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
         rest = (np.where(drop, np.nan, values) for values in self._values())

@@ -115,6 +115,7 @@ def beside_shadows(
                 # What is mirrored at the corner has the same colour.
                 places[k, :, line, half, 0] = pixels + along + side * across
                 places[k, :, line, half, 1] = pixels - along - side * across
+    seen &= ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=(0, 2, 3, 4, 5))
     values = sample(image, places)
     contrast = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
     apart = np.abs(values[..., 1] - values[..., 0]).max(axis=(2, 3))

@@ -59,15 +59,17 @@ class CharucoFinder(Finder):
         found, rest = _charuco_boards(search, lattices, boards)
         finest = pyramid(search.grey)[0] if rest else None
         search.leave([item for item in rest if finest and not has_edge_offset(item.lattice, finest)])
-        named: dict[str | None, Board] = {board.board_id: board for board in boards}
-        every = [completed(search.grey, item, boards, search.camera) for item in found]
-        return every if search.quick else [relit(search.grey, item, named.get(item.board_id)) for item in every]
+        every = [completed(search.grey, _detection(*item), boards, search.camera) for item in found]
+        if search.quick:
+            return every
+        pairs = zip(every, found, strict=True)
+        return [relit(search.grey, item, refined.relative_residual, board) for item, (refined, board) in pairs]
 
 
 def _charuco_boards(
     search: Search, found: Sequence[RefinedLattice], boards: Sequence[Board]
-) -> tuple[list[BoardDetection], list[RefinedLattice]]:
-    """Return the ChArUco boards in an image, named and on their own grids, and the lattices that are none.
+) -> tuple[list[tuple[RefinedLattice, Board]], list[RefinedLattice]]:
+    """Return the ChArUco boards in an image on their own grids, and the lattices that are none.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ def _charuco_boards(
         (refined,) = refine(image, [whole])
         refined = _beside_markers(image, refined, board)
         if refined.lattice.count >= search.min_corners:
-            out.append(_detection(refined, board))
+            out.append((refined, board))
             rest = left
     return out, rest
 

@@ -31,9 +31,12 @@ class ChessboardFinder(Finder):
         sizes = tuple(dict.fromkeys(board.size for board in boards))
         lattices = [known_part(item, sizes) for item in search.lattices]
         placed = _placed(search.grey, lattices, boards, search.camera)
-        found = [_detection(item, sizes) for item in placed]
-        every = [completed(search.grey, item, boards, search.camera) for item in found]
-        return every if search.quick else [relit(search.grey, item) for item in every]
+        turned = [item.turned(quarter_turns(item.lattice, sizes)) for item in placed]
+        every = [completed(search.grey, _detection(item), boards, search.camera) for item in turned]
+        if search.quick:
+            return every
+        pairs = zip(every, turned, strict=True)
+        return [relit(search.grey, item, refined.relative_residual) for item, refined in pairs]
 
 
 def _placed(
@@ -63,7 +66,7 @@ def _beside_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[
             for before in (0, 1):
                 rows, columns = ((before * more, more - before * more) for more in (down, across))
                 placed = item.padded(rows, columns)
-                start = _detection(placed, [board.size])
+                start = _detection(placed.turned(quarter_turns(placed.lattice, [board.size])))
                 added = len(completed(grey, start, [board], None).grid) - len(start.grid)
                 ways.append((added / (size[1] if across else size[0]), placed))
     shares = sorted(share for share, _ in ways)
@@ -72,8 +75,7 @@ def _beside_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[
     return max(ways, key=lambda way: way[0])[1]
 
 
-def _detection(refined: RefinedLattice, sizes: Sequence[tuple[int, int]]) -> BoardDetection:
-    found = refined.turned(quarter_turns(refined.lattice, sizes))
+def _detection(found: RefinedLattice) -> BoardDetection:
     known = found.lattice.known
     grid = np.argwhere(known)[:, ::-1]
     return BoardDetection(None, *found.lattice.size, grid, found.lattice.pixels[known], found.sigma_px[known])
