@@ -62,7 +62,9 @@ def measured(paths: Sequence[Path], board: Board, left: float, count: int) -> tu
             at = apart.argmin(axis=1)
             seen = apart.min(axis=1) < SAME_PX
             ratios.append(((pixels[at] - truth) / sigma_px[at, None])[seen & edge])
-        counts = [a + int(np.count_nonzero(b)) for a, b in zip(counts, (seen, seen | True, seen & edge, edge), strict=True)]
+        counts = [
+            a + int(np.count_nonzero(b)) for a, b in zip(counts, (seen, seen | True, seen & edge, edge), strict=True)
+        ]
     return counts, float(np.sqrt(np.mean(np.concatenate(ratios) ** 2)))
 
 

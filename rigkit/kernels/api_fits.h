@@ -168,4 +168,24 @@ EXPORT void fit_circles(
     ARRAY(const double, blur, count), ARRAY(const double, reach, count), const circle_rules_t *rules, int64_t most,
     ARRAY(double, scratch, SPOT, most), ARRAY(double, out, count, CIRCLE_OUTCOMES));
 
+/* light.c */
+
+/* What comes out of a step of the light: u, v of the corner, its standard deviation, direction, place and width of the step,
+ * the light left, whether there is one. What is unknown of both, how far from a corner a step is sought, px,
+ * and how many pixels are taken at once: so much room there must be beyond the last. */
+enum { LIGHT_OUTCOMES = 8, LIGHT_UNKNOWNS = 11, LIGHT_ASIDE = 11, LIGHT_BLOCK = 32 };
+
+/* The constants of detection.subpixel.shadows, under their names there. */
+typedef struct {
+    double radius_px, reach_cells, least_left, most_left, most_light, fewest;
+    double line_sigma, log_edge_sigma, log_width_sigma, first_width, least_width, most_width;
+    int64_t angles, iterations;
+} light_rules_t;
+
+EXPORT void fit_light_steps(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, curvature, count, 2),
+    ARRAY(const double, aside, count), double blur, ARRAY(const double, most_step, LIGHT_UNKNOWNS), const light_rules_t *rules,
+    int64_t most, ARRAY(double, scratch, 4, most), ARRAY(double, out, count, LIGHT_OUTCOMES));
+
 #endif

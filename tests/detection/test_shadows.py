@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from detection_bench.scenes import one_board
@@ -10,12 +12,13 @@ from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.detect import detect_boards
-from rigkit.detection.subpixel.shadows import _UNKNOWNS, _picture, beside_shadows
+from rigkit.detection.guided.relit import relit
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.shadows import beside_shadows
 
 SIZE_PX = (800, 600)
 NEAR_PX = 12.0
-JACOBIAN_REL = 1e-3
-"""The edge function is an approximation, its derivative that of the approximation."""
 
 
 def in_shadow(image: np.ndarray, through: np.ndarray, angle: float, left: float) -> tuple[np.ndarray, np.ndarray]:
@@ -54,19 +57,6 @@ def test_corners_under_the_edge_of_a_shadow_are_seen(pattern: Chessboard | Charu
     assert np.sqrt(np.mean(np.concatenate(ratios) ** 2) / 2.0) < 1.5
 
 
-def test_derivatives_of_a_window_are_true(rng: np.random.Generator) -> None:
-    unknowns = np.array([[0.3, -0.2, 0.2, 1.7, 0.1, 90.0, -60.0, 0.7, 1.3, 0.2, 0.4]])
-    curvature = np.array([[0.003, -0.002]])
-    jacobian = _picture(unknowns, curvature)[1]
-    step = 1e-5
-    for k in range(_UNKNOWNS):
-        more, less = unknowns.copy(), unknowns.copy()
-        more[:, k] += step
-        less[:, k] -= step
-        difference = (_picture(more, curvature)[0] - _picture(less, curvature)[0]) / (2.0 * step)
-        assert np.abs(jacobian[:, k] - difference).max() < JACOBIAN_REL * np.abs(difference).max()
-
-
 def test_slopes_of_the_light_are_no_shadows() -> None:
     row, column = np.mgrid[:120, :160]
     squares = np.where((row // 20 + column // 20) % 2 == 1, 200.0, 30.0)
@@ -77,3 +67,24 @@ def test_slopes_of_the_light_are_no_shadows() -> None:
     assert not beside_shadows(sloping, pixels, sides, aside, inner).any()
     shaded = (squares * np.where(column > 81, 0.25, 1.0)).astype(np.float32)
     assert beside_shadows(shaded, pixels, sides, aside, inner).tolist() == [True, False]
+    # Beyond the image there is nothing to see.
+    assert not beside_shadows(shaded[:, :84], pixels, sides, aside, inner).any()
+
+
+def test_corners_fitted_as_well_as_usual_are_not_looked_at(rng: np.random.Generator) -> None:
+    board = Board("b", 9, 6, 28.0, 28.0)
+    scene = one_board(rng, lens="regular", board=board, size_px=SIZE_PX)
+    image = scene.render(blur_px=0.8, noise_levels=1.0, rng=rng)
+    (found,) = detect_boards(image, [board])
+    through = found.lattice()[2, 4] + 1.0
+    shaded, _ = in_shadow(image.astype(np.float64), through, 0.7, 0.3)
+    crossed = np.abs((found.pixels - through) @ (np.cos(0.7), np.sin(0.7))) < NEAR_PX
+    assert np.count_nonzero(crossed) > 3
+    unsure = replace(found, sigma_px=np.where(crossed, 5.0, 1.0) * found.sigma_px)
+    residual, sigma = np.full((6, 9), 3.0), found.sigma_px.reshape(6, 9)
+    contrast = np.full((6, 9), 100.0)
+    fits = RefinedLattice(Lattice(found.lattice(), contrast, False), sigma, np.full((6, 9), 0.8), residual, residual)
+    assert relit(shaded, unsure, fits) is unsure
+    residual[found.grid[crossed, 1], found.grid[crossed, 0]] = 30.0
+    again = relit(shaded, unsure, fits)
+    assert np.median(again.sigma_px[crossed]) < 0.5 * np.median(unsure.sigma_px[crossed])

@@ -16,6 +16,7 @@ from rigkit.detection.guided.board_guide import CROSS
 from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners, gap_to_markers
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.shadows import beside_shadows, in_even_light, light_steps
 
 MIN_EVEN, MAX_EVEN = 9, 32
@@ -40,7 +41,7 @@ MIN_SHADED_CELL_PX = 10.0
 """In smaller cells there are too few pixels to tell a step of the light from a corner."""
 
 START_BLUR_PX = 1.0
-"""s that the fit of the corners in even light starts from, px."""
+"""s that fits in the image of a ChArUco board start from, px."""
 
 MAX_SIGMA_CELLS = 0.03
 """Largest standard deviation, in sides of the cell."""
@@ -51,6 +52,9 @@ MOVED_SIGMAS = 5.0
 TIMES_BETTER, MAX_RELIT_RESIDUAL = 1.5, 2.0
 """In even light a corner leaves so many times less, relative to its contrast, than before, if it was a shadow; and at
 most so many times what is usual on the board."""
+
+TIMES_WORSE = 1.25
+"""A corner whose fit left not so many times more than is usual on the board as a whole is not looked at."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,21 +71,20 @@ class _Usual:
 
 
 def relit(
-    image: GreyImage, found: BoardDetection, relative: FloatArray, board: Board | None = None
+    image: GreyImage, found: BoardDetection, refined: RefinedLattice, board: Board | None = None
 ) -> BoardDetection:
     """Return `found` with its corners beside the edge of a shadow placed as if that were not there, and with those that
     were missed for it.
 
-    `relative` (R, C) : what the fit of the corners left, relative to their contrast, NaN where that is not known.
-    `board` : which it is, if it is a ChArUco board.
+    `refined` : the fits of the corners, on the same grid. `board` : which it is, if it is a ChArUco board.
     """
-    pixels = found.lattice()
+    pixels, relative = found.lattice(), refined.relative_residual
     known = np.isfinite(pixels[..., 0])
     own = np.full(known.shape, np.nan)
     own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
     # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual, or fitted as well, are beside none.
     plain = own < TIMES_BETTER * upper_median(found.sigma_px)
-    plain |= relative < TIMES_BETTER * upper_median(relative[np.isfinite(relative)])
+    plain |= relative < TIMES_WORSE * upper_median(relative[np.isfinite(relative)])
     doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
     if np.count_nonzero(doubtful) < MIN_SHADED:
         return found
@@ -90,12 +93,13 @@ def relit(
     if np.count_nonzero(suspect) < MIN_SHADED or np.count_nonzero(even) < MIN_EVEN:
         return found
     told = board or Board("found", found.columns, found.rows, 1.0, 1.0)
-    usual = _usual(image, told, found, even, suspect)
-    if usual is None:
+    fits = refined if board is None else _as_it_is(image, board, found, refined, _near(even, suspect))
+    told_by = _near(even & np.isfinite(fits.blur_px), suspect)
+    if np.count_nonzero(told_by) < MIN_EVEN:
         return found
+    usual = _usual(pixels, fits, told_by)
     shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **FORETOLD)
-    before = fit_corners(image, told, suspect, shape, shape.pixels, usual.signs[suspect], usual.blur)
-    was = before.residual / np.maximum(before.contrast, 1e-6)
+    was = _left(image, told, suspect, shape, fits.relative_residual, usual)
     tried = (shape.support >= MIN_FORETELLERS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * usual.relative)
     tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
     if np.count_nonzero(tried) < MIN_SHADED:
@@ -107,6 +111,20 @@ def relit(
     row, column = np.nonzero(np.isfinite(pixels[..., 0]))
     grid = np.stack([column, row], axis=-1)
     return replace(found, grid=grid, pixels=pixels[row, column], sigma_px=own[row, column])
+
+
+def _left(
+    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, relative: FloatArray, usual: _Usual
+) -> FloatArray:
+    """Return what fits of the corners at `cells` leave (M,), in parts of their contrast: `relative` (R, C) where that
+    is known, else of corners where `shape` has them."""
+    left, missed = relative[cells], cells & ~np.isfinite(relative)
+    unknown = missed[cells]
+    if unknown.any():
+        part = shape.of(unknown)
+        fit = fit_corners(image, board, missed, part, part.pixels, usual.signs[missed], usual.blur)
+        left[unknown] = fit.residual / np.maximum(fit.contrast, 1e-6)
+    return left
 
 
 def _in_even_light(
@@ -137,8 +155,12 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
     ends = np.ones_like(cells)
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
+    inside = ((at >= 0.0) & (at <= np.array(image.shape[::-1]) - 1.0)).all(axis=1)
+    suspect = np.zeros(len(at), bool)
+    sides = shape.sides[inside]
+    suspect[inside] = beside_shadows(image, at[inside], sides, _aside(board, sides), ends[cells][inside])
     out = cells.copy()
-    out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
+    out[cells] = suspect
     return out
 
 
@@ -149,27 +171,47 @@ def _aside(board: Board | None, sides: FloatArray) -> FloatArray:
     return 0.5 * gap_to_markers(board, sides)
 
 
-def _usual(image: GreyImage, board: Board, found: BoardDetection, even: BoolArray, suspect: BoolArray) -> _Usual | None:
-    """Return what the corners `even` (R, C) near the `suspect` ones are like, None where too few of them are seen."""
+def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
+    """Return those of the cells `even` (R, C) that are near the `suspect` ones, all of them where few are."""
     reach = np.ones((2 * NEARBY_CELLS + 1, 2 * NEARBY_CELLS + 1), np.uint8)
     near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
-    even = near if np.count_nonzero(near) >= MIN_EVEN else even
-    row, column = np.nonzero(even)
+    return near if np.count_nonzero(near) >= MIN_EVEN else even
+
+
+def _as_it_is(
+    image: GreyImage, board: Board, found: BoardDetection, refined: RefinedLattice, cells: BoolArray
+) -> RefinedLattice:
+    """Return `refined` with fits in the image as it is, of about MAX_EVEN of the `cells` (R, C) and of no others.
+
+    What was fitted after markers were wiped out says little of windows that see them.
+    """
+    row, column = np.nonzero(cells)
     every = max(1, len(row) // MAX_EVEN)
-    even = np.zeros_like(even)
-    even[row[::every], column[::every]] = True
-    shape, start = fit_cells(found.lattice(), even), found.lattice()[even]
-    signs = np.where(np.add.outer(*(np.arange(count) for count in even.shape)) % 2 == 1, -1.0, 1.0)
-    fit = fit_corners(image, board, even, shape, start, signs[even], START_BLUR_PX)
-    signs = signs if np.median(fit.contrast) > 0.0 else -signs
-    fit = fit_corners(image, board, even, shape, start, signs[even], float(np.median(fit.blur)))
+    row, column = row[::every], column[::every]
+    chosen = np.zeros_like(cells)
+    chosen[row, column] = True
+    pixels, signs = found.lattice(), refined.lattice.signs()
+    shape, blur = fit_cells(pixels, chosen), START_BLUR_PX
+    # How wide windows are goes by the blur that a fit starts from.
+    for _ in range(2):
+        fit = fit_corners(image, board, chosen, shape, pixels[chosen], signs[chosen], blur)
+        blur = upper_median(fit.blur)
     good = fit.valid & (fit.contrast > 0.0)
-    if np.count_nonzero(good) < MIN_EVEN:
-        return None
-    sigma = np.full(even.shape, np.nan)
+    row, column = row[good], column[good]
+    sigma, blurs, residual, contrast = np.full((4, *cells.shape), np.nan)
     sigma[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
-    factor = float(np.median(sigma[even][good] / fit.sigma_px[good]))
-    ahead = fit_cells(found.lattice(), even, **FORETOLD, leave_out=True)
-    off = np.linalg.norm(start - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
-    relative = upper_median(fit.residual[good] / fit.contrast[good])
-    return _Usual(signs, upper_median(fit.blur[good]), relative, max(factor, 1.0), upper_median(off))
+    factor = upper_median(sigma[row, column] / fit.sigma_px[good]) if good.any() else 1.0
+    for values, seen in ((blurs, fit.blur), (residual, fit.residual), (contrast, fit.contrast)):
+        values[row, column] = seen[good]
+    lattice = replace(refined.lattice, contrast=contrast)
+    part = replace(refined, lattice=lattice, blur_px=blurs, residual=residual)
+    return replace(part, scatter=max(factor, 1.0), correlated=1.0)
+
+
+def _usual(pixels: FloatArray, refined: RefinedLattice, even: BoolArray) -> _Usual:
+    """Return what the corners `even` (R, C) of `pixels` (R, C, 2) are like."""
+    blur, relative = upper_median(refined.blur_px[even]), upper_median(refined.relative_residual[even])
+    ahead = fit_cells(pixels, even, **FORETOLD, leave_out=True)
+    off = np.linalg.norm(pixels[even] - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
+    factor = refined.scatter * refined.correlated
+    return _Usual(refined.lattice.signs(), blur, relative, factor, upper_median(off))

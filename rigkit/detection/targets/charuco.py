@@ -63,7 +63,7 @@ class CharucoFinder(Finder):
         if search.quick:
             return every
         pairs = zip(every, found, strict=True)
-        return [relit(search.grey, item, refined.relative_residual, board) for item, (refined, board) in pairs]
+        return [relit(search.grey, item, refined, board) for item, (refined, board) in pairs]
 
 
 def _charuco_boards(

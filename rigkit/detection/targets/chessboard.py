@@ -36,7 +36,7 @@ class ChessboardFinder(Finder):
         if search.quick:
             return every
         pairs = zip(every, turned, strict=True)
-        return [relit(search.grey, item, refined.relative_residual) for item, refined in pairs]
+        return [relit(search.grey, item, refined) for item, refined in pairs]
 
 
 def _placed(
