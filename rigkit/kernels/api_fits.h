@@ -182,6 +182,11 @@ typedef struct {
     int64_t angles, iterations;
 } light_rules_t;
 
+EXPORT void lit_unevenly(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, aside, count),
+    ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts, double most_aside, double least_px,
+    double uneven, ARRAY(uint8_t, out, count));
 EXPORT void fit_light_steps(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
     ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, curvature, count, 2),

@@ -47,6 +47,32 @@ INLINE float brightness_at(const image_t image, float u, float v)
     return upper + below * (lower - upper);
 }
 
+/* Return the grey level at (u, v), bilinear, the border repeated; 0 where that is no place. */
+INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int64_t height, double u, double v)
+{
+    if (!(isfinite(u) && isfinite(v)))
+        return 0.0;
+    u = u > 0.0 ? u : 0.0;
+    v = v > 0.0 ? v : 0.0;
+    u = u < (double)(width - 1) ? u : (double)(width - 1);
+    v = v < (double)(height - 1) ? v : (double)(height - 1);
+    int64_t left = (int64_t)u, top = (int64_t)v;
+    left = left < width - 2 ? left : width - 2;
+    top = top < height - 2 ? top : height - 2;
+    const double right = u - (double)left, below = v - (double)top;
+    const int64_t at = top * width + left;
+    double a, b, c, d;
+    if (bytes) {
+        const uint8_t *image = (const uint8_t *)grey + at;
+        a = image[0], b = image[1], c = image[width], d = image[width + 1];
+    } else {
+        const float *image = (const float *)grey + at;
+        a = image[0], b = image[1], c = image[width], d = image[width + 1];
+    }
+    const double upper = a + right * (b - a), lower = c + right * (d - c);
+    return upper + below * (lower - upper);
+}
+
 #define PI 3.14159265358979323846
 /* Return the two angles of a corner from the `even` part of its ring (reference.front._angles). */
 INLINE void ring_angles(

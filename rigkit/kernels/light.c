@@ -300,6 +300,54 @@ INLINE double fit_together(
     return cholesky(N, UNKNOWNS) ? variance : -1.0;
 }
 
+/* Return whether opposite squares at a corner differ by more than the part `uneven` of its contrast, where they are looked
+ * at `parts` places along the lines and `off` beside them, in sides of the cell. */
+static int uneven_at(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, const double pixel[2], const double side[4],
+    const double *along, int64_t parts, const double off[2], double uneven)
+{
+    int seen = 0;
+    for (int64_t k = 0; k < parts; k++) {
+        double contrast = 0.0, apart = 0.0;
+        for (int line = 0; line < 2; line++) {
+            double values[2][2];
+            for (int n = 0; n < 4; n++) {
+                /* What is mirrored at the corner has the same colour. */
+                const double mirror = n % 2 ? -1.0 : 1.0, beside = (n < 2 ? -mirror : mirror) * off[1 - line];
+                const double x = mirror * along[k], *one = side + 2 * line, *other = side + 2 * (1 - line);
+                const double u = pixel[0] + x * one[0] + beside * other[0], v = pixel[1] + x * one[1] + beside * other[1];
+                if (!(u >= 0.0 && v >= 0.0 && u <= (double)(width - 1) && v <= (double)(height - 1)))
+                    return 0;
+                values[n / 2][n % 2] = grey_level_at(grey, bytes, width, height, u, v);
+            }
+            for (int n = 0; n < 2; n++) {
+                contrast = fmax(contrast, fabs(values[1][n] - values[0][n]));
+                apart = fmax(apart, fabs(values[n][1] - values[n][0]));
+            }
+        }
+        seen |= apart > uneven * contrast;
+    }
+    return seen;
+}
+
+void lit_unevenly(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
+    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double most_aside, double least_px,
+    double uneven, uint8_t *out)
+{
+    for (int64_t n = 0; n < count; n++) {
+        const double *side = sides + 4 * n, length[2] = {hypot(side[0], side[1]), hypot(side[2], side[3])};
+        double off[2], nearest = INFINITY;
+        for (int line = 0; line < 2; line++) {
+            off[line] = fmin(most_aside, aside[n] / fmax(length[line], 1e-9));
+            nearest = fmin(nearest, off[line] * length[line]);
+        }
+        /* Where the board may end, only the nearest places are looked at. */
+        out[n] = nearest > least_px && uneven_at(
+            grey, bytes, width, height, pixels + 2 * n, side, along, ends[n] ? 1 : parts, off, uneven);
+    }
+}
+
 FOR_EACH_PROCESSOR
 void fit_light_steps(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *start, const double *sides,

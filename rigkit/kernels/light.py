@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
@@ -42,5 +42,31 @@ def fit_light_steps(
     kernels().fit_light_steps(
         *(grey, grey.dtype == np.uint8, width, height, len(start), *known, blur, most_step, rules),
         *(most, np.empty((4, most)), out),
+    )
+    return out
+
+
+def lit_unevenly(
+    image: NDArray[np.uint8] | NDArray[np.float32],
+    pixels: FloatArray,
+    sides: FloatArray,
+    aside: FloatArray,
+    ends: BoolArray,
+    along: FloatArray,
+    most_aside: float,
+    least_px: float,
+    uneven: float,
+) -> BoolArray:
+    """Return which of N corners are lit unevenly, as `detection.subpixel.shadows.beside_shadows`.
+
+    The last four are its constants.
+    """
+    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
+    known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, aside)]
+    height, width = grey.shape
+    out = np.empty(len(pixels), np.bool_)
+    kernels().lit_unevenly(
+        *(grey, grey.dtype == np.uint8, width, height, len(pixels), *known, np.ascontiguousarray(ends, np.bool_)),
+        *(along, len(along), most_aside, least_px, uneven, out),
     )
     return out

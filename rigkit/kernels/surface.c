@@ -298,32 +298,6 @@ void surest_polynomial(
     }
 }
 
-/* Return the grey level at (u, v), bilinear, the border repeated; 0 where that is no place. */
-INLINE double grey_at(const void *grey, int64_t bytes, int64_t width, int64_t height, double u, double v)
-{
-    if (!(isfinite(u) && isfinite(v)))
-        return 0.0;
-    u = u > 0.0 ? u : 0.0;
-    v = v > 0.0 ? v : 0.0;
-    u = u < (double)(width - 1) ? u : (double)(width - 1);
-    v = v < (double)(height - 1) ? v : (double)(height - 1);
-    int64_t left = (int64_t)u, top = (int64_t)v;
-    left = left < width - 2 ? left : width - 2;
-    top = top < height - 2 ? top : height - 2;
-    const double right = u - (double)left, below = v - (double)top;
-    const int64_t at = top * width + left;
-    double a, b, c, d;
-    if (bytes) {
-        const uint8_t *image = (const uint8_t *)grey + at;
-        a = image[0], b = image[1], c = image[width], d = image[width + 1];
-    } else {
-        const float *image = (const float *)grey + at;
-        a = image[0], b = image[1], c = image[width], d = image[width + 1];
-    }
-    const double upper = a + right * (b - a), lower = c + right * (d - c);
-    return upper + below * (lower - upper);
-}
-
 FOR_EACH_PROCESSOR void read_modules(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double *maps, int64_t count, int64_t side,
     double *bright, double *spread)
@@ -336,7 +310,7 @@ FOR_EACH_PROCESSOR void read_modules(
             const double x = ((double)(k % side) + 0.5) / (double)side, y = ((double)(k / side) + 0.5) / (double)side;
             const double depth = h[6] * x + h[7] * y + h[8];
             const double u = (h[0] * x + h[1] * y + h[2]) / depth, v = (h[3] * x + h[4] * y + h[5]) / depth;
-            bright[k] = grey_at(grey, bytes, width, height, u, v);
+            bright[k] = grey_level_at(grey, bytes, width, height, u, v);
             mean += bright[k] / (double)modules;
         }
         for (int64_t k = 0; k < modules; k++) {

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.opencv import exact_interpolation
 from kernels.reference import light as reference
 
 from rigkit.core.arrays import FloatArray
-from rigkit.detection.subpixel.shadows import light_steps
+from rigkit.detection.subpixel.shadows import beside_shadows, light_steps
 
 SERIES_PX, SERIES = 1e-4, 1e-3
 """The kernel's edge is good to 1.5e-7 of the contrast, and starts come out the same: px, and of all other numbers."""
@@ -57,6 +58,18 @@ def test_steps_agree(dtype: type, rng: np.random.Generator) -> None:
     assert good.mean() > 0.8
     assert np.median(np.abs(ours.pixels - truth)[:-1][good]) < TRUE_PX
     assert np.median(np.abs(ours.left - left)[:-1][good]) < TRUE_LEFT
+
+
+@exact_interpolation
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_what_is_lit_unevenly_agrees(dtype: type, rng: np.random.Generator) -> None:
+    image = np.kron(rng.integers(0, 255, (15, 20)), np.ones((16, 16))).astype(dtype)
+    pixels, sides = rng.uniform(-10.0, 330.0, (400, 2)), rng.normal(0.0, 15.0, (400, 2, 2))
+    pixels[0], sides[1] = np.nan, 0.0
+    parts = (image, pixels, sides, rng.uniform(1.0, 18.0, 400), rng.random(400) < 0.3)
+    ours, theirs = beside_shadows(*parts), reference.beside_shadows(*parts)
+    assert 50 < ours.sum() < 350
+    assert (ours == theirs).all()
 
 
 def test_nothing_is_found_where_there_is_no_window(rng: np.random.Generator) -> None:

@@ -14,17 +14,12 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.saddles.response import FloatImage, GreyImage, sample
-from rigkit.kernels.light import LightRules, fit_light_steps
+from rigkit.detection.saddles.response import FloatImage, GreyImage
+from rigkit.kernels.light import LightRules, fit_light_steps, lit_unevenly
 
-SEEN_ALONG, SEEN_ASIDE = (0.15, 0.35), 0.12
+SEEN_ALONG, SEEN_ASIDE = np.array([0.15, 0.35]), 0.12
 """Where the light on opposite arms is compared: so far along them and aside, in sides of the cell. Beside the end of a
 board, where squares may be cut, only the nearer ones are looked at."""
-
-_LINES = np.eye(2)[:, None, :]
-_SEEN_ALONG = np.reshape(SEEN_ALONG, (-1, 1, 1, 1)) * _LINES
-_SEEN_ASIDE = np.array([-1.0, 1.0])[:, None] * _LINES[::-1]
-"""The same along columns and rows (2), on one side of the line and the other (2), in cells (2)."""
 
 LEAST_ASIDE_PX = 1.0
 """Nearer to a line its blur is seen, and nothing else."""
@@ -100,19 +95,7 @@ def beside_shadows(
 
     `aside` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
     """
-    lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1e-9)
-    off = np.minimum(SEEN_ASIDE, aside[:, None] / lengths)
-    seen = (off * lengths).min(axis=1) > LEAST_ASIDE_PX
-    cells = _SEEN_ALONG + _SEEN_ASIDE * off[:, None, None, None, :]
-    # What is mirrored at the corner has the same colour.
-    places = pixels[:, None, None, None, None] + np.stack([cells, -cells], axis=4) @ sides[:, None, None, None]
-    seen &= ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=(1, 2, 3, 4, 5))
-    values = sample(image, places)
-    contrast = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
-    apart = np.abs(values[..., 1] - values[..., 0]).max(axis=(2, 3))
-    uneven = apart > UNEVEN * contrast
-    uneven[ends, 1:] = False
-    return np.asarray(seen & uneven.any(axis=1))
+    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, LEAST_ASIDE_PX, UNEVEN)
 
 
 def light_steps(

@@ -6,8 +6,16 @@ import numpy as np
 from scipy.special import erf
 
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.shadows import LIGHT_RANGE, MOST_LIGHT_STEP, RULES
+from rigkit.detection.saddles.response import GreyImage, sample
+from rigkit.detection.subpixel.shadows import (
+    LEAST_ASIDE_PX,
+    LIGHT_RANGE,
+    MOST_LIGHT_STEP,
+    RULES,
+    SEEN_ALONG,
+    SEEN_ASIDE,
+    UNEVEN,
+)
 from rigkit.kernels.light import LIGHT_ASIDE
 
 RADIUS_PX, LIGHT_REACH_CELLS, WIDTH_RANGE_PX = RULES.radius_px, RULES.reach_cells, (RULES.least_width, RULES.most_width)
@@ -21,6 +29,30 @@ CORNER, LINES, BLUR, LEVEL, CONTRAST, TOWARDS, PLACE, WIDTH, LEFT, UNKNOWNS = (
 
 ON_EDGE = 1e-9
 """Pixels so little beyond an edge, px, are on it."""
+
+
+def beside_shadows(
+    image: GreyImage, pixels: FloatArray, sides: FloatArray, aside: FloatArray, ends: BoolArray
+) -> BoolArray:
+    """Return what `shadows.beside_shadows` does."""
+    lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1e-9)
+    off = np.minimum(SEEN_ASIDE, aside[:, None] / lengths)
+    seen = (off * lengths).min(axis=1) > LEAST_ASIDE_PX
+    lines = np.eye(2)[:, None, :]
+    cells = (
+        np.reshape(SEEN_ALONG, (-1, 1, 1, 1)) * lines
+        + np.array([-1.0, 1.0])[:, None] * lines[::-1] * off[:, None, None, None, :]
+    )
+    # What is mirrored at the corner has the same colour.
+    places = pixels[:, None, None, None, None] + np.stack([cells, -cells], axis=4) @ sides[:, None, None, None]
+    inside = ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=(2, 3, 4, 5))
+    seen &= inside[:, 0] & (inside[:, 1] | ends)
+    values = sample(image, places)
+    contrast = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
+    apart = np.abs(values[..., 1] - values[..., 0]).max(axis=(2, 3))
+    uneven = apart > UNEVEN * contrast
+    uneven[ends, 1:] = False
+    return np.asarray(seen & uneven.any(axis=1))
 
 
 def light_steps(
