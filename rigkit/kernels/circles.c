@@ -18,7 +18,7 @@ enum { BLOCK = 32 };
 /* The normal equations and, as the last of their columns, the residuals. */
 enum { OFF = PARAMETERS, COLUMNS };
 /* Further from an edge than this, in blurs, it is all one brightness. */
-static const double FAR = 12.0;
+static const float FAR = 12.0f;
 
 /* The pixels of a circle: arrays of their coordinates and brightness. */
 typedef struct {
@@ -76,13 +76,18 @@ INLINE void place(const circle_t *at, const double du[BLOCK], const double dv[BL
     }
 }
 
-/* Set `share` to the part of the disc in pixels that are `z` blurs inside its edge, `slope` to its derivative. */
+/* Set `share` to the part of the disc in pixels that are `z` blurs inside its edge, `slope` to its derivative. The limits
+ * have a loop of their own: as branches they would keep the other from being vectorised. */
 INLINE void shares(const double z[BLOCK], double share[BLOCK], double slope[BLOCK])
 {
-#pragma omp simd
+    float x[BLOCK];
+    for (int k = 0; k < BLOCK; k++) {
+        const float at = (float)z[k], most = at < FAR ? at : FAR;
+        x[k] = most > -FAR ? most : -FAR;
+    }
     for (int k = 0; k < BLOCK; k++) {
         float edge[5];
-        blurred_edge((float)limited(z[k], FAR), 0.0f, edge);
+        blurred_edge(x[k], 0.0f, edge);
         share[k] = 0.5 + 0.5 * (double)edge[0];
         slope[k] = 0.5 * (double)edge[1];
     }
