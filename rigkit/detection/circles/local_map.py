@@ -97,10 +97,13 @@ def local_maps(
     ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + MIN_RIDGE
     homography, own = _homographies(plane, values, weight)
     rest = np.where(known[..., None], values - homography, 0.0)
-    normal = np.einsum("mk,ki,kj->mij", weight, terms, terms, optimize=True) + np.diag(ridge)
-    solved = np.linalg.solve(normal, np.swapaxes(terms[None] * weight[..., None], 1, 2))
-    parts = solved @ rest + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
-    gain = np.sqrt((solved[:, 0] ** 2).sum(axis=1))
+    normal = _sums(weight, terms, terms) + np.diag(ridge)
+    # Beside the terms, what the first of them, the place itself, takes from each of the circles.
+    right = np.zeros((len(places), len(POWERS), 3))
+    right[:, :, :2], right[:, 0, 2] = np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2), 1.0
+    solved = np.linalg.solve(normal, right)
+    parts = solved[:, :, :2] + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
+    gain = np.linalg.norm(weight * (solved[:, :, 2] @ terms.T), axis=1)
     return PlaneMap(
         parts[:, 0] + middle,
         np.swapaxes(parts[:, 1:3], 1, 2),
@@ -132,6 +135,12 @@ def with_smooth_bends(
     return replace(around, second=np.where(known, second, around.second))
 
 
+def _sums(weight: FloatArray, one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the sums (M, I, J) of `weight` (M, K) times products of `one` (K, I) and `other` (K, J)."""
+    products = (one[:, :, None] * other[:, None, :]).reshape(len(one), -1)
+    return np.asarray((weight @ products).reshape(len(weight), one.shape[1], other.shape[1]))
+
+
 def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return M homographies through `values` (M, K, 2) over `plane` (K, 2), at the K places, and their derivatives
     (M, 6, 2) of order 0 to 2 at the origin.
@@ -142,16 +151,18 @@ def _homographies(plane: FloatArray, values: FloatArray, weight: FloatArray) -> 
     x, y = plane.T
     # x' (1 + g . w) = c + A w is linear in c, A and g.
     simple = np.stack([np.ones_like(x), x, y], axis=1)
-    each = np.zeros((count, len(plane), 2, 8))
-    each[:, :, 0, 0:3] = each[:, :, 1, 3:6] = simple
-    each[..., 6:] = -values[..., None] * plane[None, :, None, :]
-    rows = each.reshape(count, -1, 8)
-    weighted = rows * np.repeat(weight, 2, axis=1)[..., None]
+    u, v = weight * values[..., 0], weight * values[..., 1]
+    squares = u * values[..., 0] + v * values[..., 1]
+    normal, right = np.zeros((count, 8, 8)), np.zeros((count, 8, 1))
+    normal[:, 0:3, 0:3] = normal[:, 3:6, 3:6] = _sums(weight, simple, simple)
+    normal[:, 0:3, 6:], normal[:, 3:6, 6:] = -_sums(u, simple, plane), -_sums(v, simple, plane)
+    normal[:, 6:, 6:] = _sums(squares, plane, plane)
+    normal[:, 6:, :6] = np.swapaxes(normal[:, :6, 6:], 1, 2)
+    right[:, :, 0] = np.concatenate([u @ simple, v @ simple, -squares @ plane], axis=1)
     scale = np.maximum((weight[..., None] * values**2).mean(axis=(1, 2)), 1e-9)
     pull = np.zeros((count, 8))
     pull[:, :6], pull[:, 6:] = MIN_RIDGE, (scale * SLIGHT)[:, None]
-    normal = np.swapaxes(weighted, 1, 2) @ rows + pull[:, :, None] * np.eye(8)
-    found = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ values.reshape(count, -1, 1))[..., 0]
+    found = np.linalg.solve(normal + pull[:, :, None] * np.eye(8), right)[..., 0]
     offset, matrix, bend = found[:, [0, 3]], found[:, [1, 2, 4, 5]].reshape(count, 2, 2), found[:, 6:]
     below = 1.0 + bend @ plane.T
     # Where a horizon comes near there is nothing to foretell.
