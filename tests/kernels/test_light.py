@@ -8,6 +8,7 @@ from helpers.opencv import exact_interpolation
 from kernels.reference import light as reference
 
 from rigkit.core.arrays import FloatArray
+from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.shadows import beside_shadows, light_steps
 
 SERIES_PX, SERIES = 1e-4, 1e-3
@@ -18,6 +19,10 @@ TRUE_PX, TRUE_LEFT = 0.02, 0.02
 """Of noise of one grey level."""
 
 SIZE, CELL_PX, BLUR_PX = 64, 26.0, 0.9
+
+
+def stored(picture: FloatArray, dtype: type) -> GreyImage:
+    return np.rint(picture).astype(np.uint8) if dtype is np.uint8 else picture.astype(np.float32)
 
 
 def windows(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -41,8 +46,7 @@ def windows(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArra
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_steps_agree(dtype: type, rng: np.random.Generator) -> None:
     pictures, truth, sides, left = windows(rng, 24)
-    image = np.concatenate(list(pictures), axis=1)
-    image = np.rint(image).astype(np.uint8) if dtype is np.uint8 else image.astype(np.float32)
+    image = stored(np.concatenate(list(pictures), axis=1), dtype)
     truth[:, 0] += SIZE * np.arange(len(truth))
     start = truth + rng.uniform(-0.4, 0.4, truth.shape)
     # One at the frame, of whose window a part is seen.
@@ -63,7 +67,7 @@ def test_steps_agree(dtype: type, rng: np.random.Generator) -> None:
 @exact_interpolation
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_what_is_lit_unevenly_agrees(dtype: type, rng: np.random.Generator) -> None:
-    image = np.kron(rng.integers(0, 255, (15, 20)), np.ones((16, 16))).astype(dtype)
+    image = stored(rng.uniform(0.0, 255.0, (15, 20)).repeat(16, axis=0).repeat(16, axis=1), dtype)
     pixels, sides = rng.uniform(-10.0, 330.0, (400, 2)), rng.normal(0.0, 15.0, (400, 2, 2))
     pixels[0], sides[1] = np.nan, 0.0
     parts = (image, pixels, sides, rng.uniform(1.0, 18.0, 400), rng.random(400) < 0.3)

@@ -31,7 +31,7 @@ thirds of the light: REAL images without any had 63 such corners of 10 700, most
 LIGHT_RANGE = (0.1, 0.8)
 """What a shadow leaves of the light: of less, 8 bits show no squares, and it may be a hand."""
 
-RULES = LightRules.of(
+LIGHT_RULES = LightRules.of(
     # Of the window: as that of the edge model.
     radius_px=18.0,
     reach_cells=0.44,
@@ -106,7 +106,7 @@ def light_steps(
     `sides` (N, 2, 2) and `curvature` (N, 2) of the lines as in `Geometry`, `blur` about that of their edges, px; pixels
     further than `aside` (N,) px from both lines are not used.
     """
-    fitted = fit_light_steps(image, start, sides, curvature, aside, blur, MOST_LIGHT_STEP, RULES)
+    fitted = fit_light_steps(image, start, sides, curvature, aside, blur, MOST_LIGHT_STEP, LIGHT_RULES)
     _, _, sigma_px, towards, place, width, left, found = fitted.T
     step = LightSteps(
         centre=np.rint(start),

@@ -10,15 +10,19 @@ from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.shadows import (
     LEAST_ASIDE_PX,
     LIGHT_RANGE,
+    LIGHT_RULES,
     MOST_LIGHT_STEP,
-    RULES,
     SEEN_ALONG,
     SEEN_ASIDE,
     UNEVEN,
 )
 from rigkit.kernels.light import LIGHT_ASIDE
 
-RADIUS_PX, LIGHT_REACH_CELLS, WIDTH_RANGE_PX = RULES.radius_px, RULES.reach_cells, (RULES.least_width, RULES.most_width)
+RADIUS_PX, LIGHT_REACH_CELLS, WIDTH_RANGE_PX = (
+    LIGHT_RULES.radius_px,
+    LIGHT_RULES.reach_cells,
+    (LIGHT_RULES.least_width, LIGHT_RULES.most_width),
+)
 
 OFFSETS = np.stack(np.meshgrid(*[np.arange(-RADIUS_PX, RADIUS_PX + 1.0)] * 2), axis=-1).reshape(-1, 2)
 OFFSETS = OFFSETS[np.hypot(OFFSETS[:, 0], OFFSETS[:, 1]) < RADIUS_PX]
@@ -45,12 +49,13 @@ def beside_shadows(
     )
     # What is mirrored at the corner has the same colour.
     places = pixels[:, None, None, None, None] + np.stack([cells, -cells], axis=4) @ sides[:, None, None, None]
-    inside = ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=(2, 3, 4, 5))
+    last = np.array(image.shape[::-1]) - 1.0
+    inside: BoolArray = np.asarray(((places >= 0.0) & (places <= last)).all(axis=(2, 3, 4, 5)))
     seen &= inside[:, 0] & (inside[:, 1] | ends)
     values = sample(image, places)
-    contrast = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
+    contrast: FloatArray = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
     apart = np.abs(values[..., 1] - values[..., 0]).max(axis=(2, 3))
-    uneven = apart > UNEVEN * contrast
+    uneven: BoolArray = np.asarray(apart > UNEVEN * contrast)
     uneven[ends, 1:] = False
     return np.asarray(seen & uneven.any(axis=1))
 
@@ -73,7 +78,7 @@ def light_steps(
     pattern = edge_at(across[..., 0] / blur)[0] * edge_at(across[..., 1] / blur)[0]
     unknowns = np.zeros((len(start), UNKNOWNS))
     unknowns[:, CORNER], unknowns[:, LINES] = start - first, angles
-    unknowns[:, BLUR], unknowns[:, WIDTH] = np.log(blur), np.log(RULES.first_width)
+    unknowns[:, BLUR], unknowns[:, WIDTH] = np.log(blur), np.log(LIGHT_RULES.first_width)
     unknowns[:, [TOWARDS, PLACE, LEVEL, CONTRAST, LEFT]], found = hard_steps(values, pattern, weight)
     solved, sigma_px = together(values, weight, unknowns, curvature)
     left = solved[:, LEFT]
@@ -96,7 +101,7 @@ def hard_steps(values: FloatArray, pattern: FloatArray, weight: FloatArray) -> t
     products += [products[0] * values, products[1] * values, products[0] * values**2]
     out, best = np.zeros((count, 5)), np.full(count, np.inf)
     mine, strips = np.arange(count), len(places) + 1
-    for angle in np.arange(RULES.angles) * (2.0 * np.pi / RULES.angles):
+    for angle in np.arange(LIGHT_RULES.angles) * (2.0 * np.pi / LIGHT_RULES.angles):
         strip = np.ceil(OFFSETS @ (np.cos(angle), np.sin(angle)) - places[0] - ON_EDGE).clip(0, strips - 1).astype(int)
         of = np.zeros((len(strip), strips))
         of[np.arange(len(strip)), strip] = 1.0
@@ -104,7 +109,7 @@ def hard_steps(values: FloatArray, pattern: FloatArray, weight: FloatArray) -> t
         lit, dark = sums[:, :, :-1], sums[:, :, -1:] - sums[:, :, :-1]
         (level, contrast, rest), (level_2, contrast_2, rest_2) = levels(lit), levels(dark)
         left = (level * level_2 + contrast * contrast_2) / np.maximum(level**2 + contrast**2, 1e-9)
-        usable = (left > LIGHT_RANGE[0]) & (left < LIGHT_RANGE[1]) & (np.minimum(lit[0], dark[0]) > RULES.fewest)
+        usable = (left > LIGHT_RANGE[0]) & (left < LIGHT_RANGE[1]) & (np.minimum(lit[0], dark[0]) > LIGHT_RULES.fewest)
         total = np.where(usable, rest + rest_2, np.inf)
         at = total.argmin(axis=1)
         better = total[mine, at] < best
@@ -130,7 +135,11 @@ def together(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the unknowns (N, 11) of corner and step, and the corners' standard deviation (N,)."""
     known = np.zeros(UNKNOWNS)
-    known[LINES], known[BLUR], known[WIDTH] = RULES.line_sigma**-2, RULES.log_edge_sigma**-2, RULES.log_width_sigma**-2
+    known[LINES], known[BLUR], known[WIDTH] = (
+        LIGHT_RULES.line_sigma**-2,
+        LIGHT_RULES.log_edge_sigma**-2,
+        LIGHT_RULES.log_width_sigma**-2,
+    )
     count = np.maximum(weight.sum(axis=1), 2.0 * UNKNOWNS)
     one, damping, now = np.eye(UNKNOWNS), np.full(len(start), 1e-3), start
 
@@ -145,14 +154,14 @@ def together(
         return products, variance
 
     jacobian, rest, cost = seen(now)
-    for _ in range(RULES.iterations):
+    for _ in range(LIGHT_RULES.iterations):
         products, variance = normal(jacobian, cost)
         right = (jacobian @ rest[..., None])[..., 0] - variance[:, None] * known * (now - start)
         diagonal = damping[:, None, None] * products * one
         step = np.linalg.solve(products + diagonal, right[..., None])[..., 0].clip(-MOST_LIGHT_STEP, MOST_LIGHT_STEP)
         tried = now + step
         tried[:, WIDTH] = tried[:, WIDTH].clip(*np.log(WIDTH_RANGE_PX))
-        tried[:, LEFT] = tried[:, LEFT].clip(0.5 * LIGHT_RANGE[0], RULES.most_light)
+        tried[:, LEFT] = tried[:, LEFT].clip(0.5 * LIGHT_RANGE[0], LIGHT_RULES.most_light)
         fresh = seen(tried)
         better = fresh[2] < cost
         now, cost = np.where(better[:, None], tried, now), np.minimum(fresh[2], cost)
