@@ -51,10 +51,7 @@ MOVED_SIGMAS = 5.0
 
 TIMES_BETTER, MAX_RELIT_RESIDUAL = 1.5, 2.0
 """In even light a corner leaves so many times less, relative to its contrast, than before, if it was a shadow; and at
-most so many times what is usual on the board."""
-
-TIMES_WORSE = 1.25
-"""A corner whose fit left not so many times more than is usual on the board as a whole is not looked at."""
+most so many times what is usual on the board. One that left not so many times what is usual was beside none."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -84,7 +81,7 @@ def relit(
     own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
     # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual, or fitted as well, are beside none.
     plain = own < TIMES_BETTER * upper_median(found.sigma_px)
-    plain |= relative < TIMES_WORSE * upper_median(relative[np.isfinite(relative)])
+    plain |= relative < TIMES_BETTER * upper_median(relative[np.isfinite(relative)])
     doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
     if np.count_nonzero(doubtful) < MIN_SHADED:
         return found
