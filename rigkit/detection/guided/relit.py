@@ -152,12 +152,8 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
     ends = np.ones_like(cells)
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
-    inside = ((at >= 0.0) & (at <= np.array(image.shape[::-1]) - 1.0)).all(axis=1)
-    suspect = np.zeros(len(at), bool)
-    sides = shape.sides[inside]
-    suspect[inside] = beside_shadows(image, at[inside], sides, _aside(board, sides), ends[cells][inside])
     out = cells.copy()
-    out[cells] = suspect
+    out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
     return out
 
 
