@@ -87,16 +87,16 @@ def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOption
 
 def _many(args: argparse.Namespace) -> int:
     """Validate several data sets, each in a folder of its own; print one table."""
-    import os
     from dataclasses import replace
 
+    from rigkit.core.processes import available_cores
     from rigkit.report.tables import tables_to_json, tables_to_text
     from rigkit.workflows.validate_many import validate_datasets
 
     if args.paper or args.own_solvers:
         raise InputError("--paper is for one data set at a time")
     common = dataset_options(args, "datasets")
-    jobs = args.jobs or os.cpu_count() or 1
+    jobs = args.jobs or available_cores()
     progress = progress_on_stderr()
     done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
     # Sentences stand below the table, not in it.

@@ -1,4 +1,4 @@
-"""Work in several processes, none of which outlives the program, however it ends."""
+"""Work on all cores: in threads where it is mostly in C, else in processes, none of which outlives the program."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, InvalidStateError, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from typing import Any, ParamSpec, TypeVar
@@ -16,7 +16,27 @@ from typing import Any, ParamSpec, TypeVar
 from rigkit.core.errors import InputError
 
 Arguments = ParamSpec("Arguments")
+Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield what `work` returns of each item, in order, done on all cores at once.
+
+    For work that is mostly kernels, OpenCV and files, which leave the interpreter to others meanwhile: threads start at
+    once, processes after a second of imports. What it raises is raised here, and what has not begun is left.
+    """
+    pool = ThreadPoolExecutor(available_cores())
+    try:
+        yield from pool.map(work, items)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: a container or `taskset` may leave it fewer than there are."""
+    allowed = getattr(os, "sched_getaffinity", None)
+    return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
+from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
@@ -61,15 +62,17 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     """
     tags, markers = TagSightings(), MarkerSightings()
     plain: list[list[BoardDetection]] = []
-    sure = []
-    for k, image in enumerate(images):
-        progress(LOOKING, k, len(images))
-        plain.append([d for d in detect_boards(image) if d.complete])
-        if any(_without_marks(image, found) for found in plain[-1]):
-            sure.append(k)
-            continue
-        if not tags.look(k, image):
-            markers.look(k, image)
+    for found in in_threads(detect_boards, images):
+        progress(LOOKING, len(plain), len(images))
+        plain.append([d for d in found if d.complete])
+    sure = [
+        k
+        for k, (image, found) in enumerate(zip(images, plain, strict=True))
+        if any(_without_marks(image, one) for one in found)
+    ]
+    for k in (k for k in range(len(images)) if k not in sure):
+        if not tags.look(k, images[k]):
+            markers.look(k, images[k])
     # A tiled floor is a chessboard without marks in every image, but hardly of one size in most.
     if tags.images or markers.images or not _in_most(plain):
         for k in sure:

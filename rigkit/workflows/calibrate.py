@@ -23,7 +23,7 @@ from rigkit.workflows.corners import Cache, SessionCorners, session_corners, ses
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.folder_session import Known
 from rigkit.workflows.given_corners import given_corners
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.identify_board import misread
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
@@ -142,25 +142,16 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
                 progress=progress,
             )
         except DegenerateError as error:
-            shown = _other_board(session)
+            shown = misread(session.images, session.boards)
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
     verdicts = judge_session(result, dropped, suggest_ties(views, result))
     if verdicts[0].severity is Severity.BAD:
-        shown = _other_board(session)
+        shown = misread(session.images, session.boards)
         if shown is not None and 2 * len(views) < len(session.images):
             # What little passes for the board declared lies in wrong places.
             raise InputError(f"{session.path}: {shown}")
         if shown is not None:
             verdicts = (verdicts[0], Finding(severity=Severity.BAD, message=shown), *verdicts[1:])
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)
-
-
-def _other_board(session: Session) -> str | None:
-    """Return in words why the images show another board with marks than declared; None where that is not known.
-
-    Some of its marks are at home on the board declared: corners are found, in wrong places. Of chessboards the size of
-    the grids tells (`rigkit.calibration.usable.other_size`).
-    """
-    return explained(session.images, session.boards) if any(board.identified for board in session.boards) else None

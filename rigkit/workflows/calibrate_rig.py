@@ -12,6 +12,8 @@ from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.verdicts import judge
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text
@@ -25,6 +27,7 @@ from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.identify_board import misread
 from rigkit.workflows.known_cameras import known_cameras, with_known, with_known_first
 from rigkit.workflows.provenance import made
 from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
@@ -198,16 +201,22 @@ def rig_from(
     for name, own in session.cameras.items():
         seen, sizes[name], dropped[name] = session_views(own, corners[name])
         views[name] = [(frames[name][view.image], view) for view in seen]
-    rig = calibrate_rig(
-        views,
-        sizes,
-        model={name: own.model for name, own in session.cameras.items()},
-        degree={name: own.degree for name, own in session.cameras.items()},
-        board=next(iter(session.cameras.values())).board_shape,
-        rigid_boards=[group.boards for group in session.rigid_boards],
-        known=known_cameras(session),
-        progress=progress,
-    )
+    try:
+        rig = calibrate_rig(
+            views,
+            sizes,
+            model={name: own.model for name, own in session.cameras.items()},
+            degree={name: own.degree for name, own in session.cameras.items()},
+            board=next(iter(session.cameras.values())).board_shape,
+            rigid_boards=[group.boards for group in session.rigid_boards],
+            known=known_cameras(session),
+            progress=progress,
+        )
+    except DegenerateError as error:
+        causes = _misread(session)
+        if not causes:
+            raise
+        raise InputError(f"{session.path}: {causes[0]} ({error})") from error
     rig = named_by_rule(session, rig)
     if not session.rigid_boards:
         said = [
@@ -216,12 +225,21 @@ def rig_from(
             for s in suggest_ties([v for _, v in own], c)
         ]
         rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(said)))
+    if rig.verdicts[0].severity is Severity.BAD:
+        wrong = [Finding(severity=Severity.BAD, message=words) for words in _misread(session)]
+        rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
         replace(c, calibration=replace(c.calibration, dropped=alone.dropped))
         for c, alone in zip(rig.cameras, single, strict=True)
     ]
     return replace(rig, single=tuple(single), cameras=tuple(cameras))
+
+
+def _misread(session: RigSession) -> list[str]:
+    """Return in words why corners of boards with marks lie in wrong places, each reason once."""
+    shown = (misread(own.images, own.boards) for own in session.cameras.values())
+    return list(dict.fromkeys(words for words in shown if words is not None))
 
 
 def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:

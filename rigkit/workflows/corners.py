@@ -17,6 +17,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import counted
+from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
@@ -132,17 +133,23 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
         words = ("corners", "through the lens")[: 1 if camera is None else 2]
         what = " ".join(words if session.camera is None else (*words, "of", session.camera))
         out = {}
-        for i, name in enumerate(names):
-            progress(what, i, len(names))
+        progress(what, 0, len(names))
+
+        def found_in(name: str) -> FoundCorners | InputError:
             try:
-                out[name] = _found_in(paths[name], session, camera)
+                return _found_in(paths[name], session, camera)
             except InputError as error:
-                unreadable[name] = str(error)
-                if len(unreadable) == len(paths):
-                    raise
+                return error
+
+        for i, (name, found) in enumerate(zip(names, in_threads(found_in, names), strict=True), start=1):
+            progress(what, i, len(names))
+            if not isinstance(found, InputError):
+                kept.put(name, hashes[name], found, lens)
+                out[name] = found
                 continue
-            kept.put(name, hashes[name], out[name], lens)
-        progress(what, len(names), len(names))
+            unreadable[name] = str(found)
+            if len(unreadable) == len(paths):
+                raise found
         return out
 
     first |= look(fresh, None, None)

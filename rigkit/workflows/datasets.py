@@ -23,7 +23,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import available_cores, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
@@ -249,7 +249,7 @@ def over_pairs(
             waiting[pair.pair_id] = PairJob(pair, cameras, options)
         except RigkitError as error:
             outcomes[pair.pair_id] = error
-    count = min(len(waiting), options.jobs or os.cpu_count() or 1)
+    count = min(len(waiting), options.jobs or available_cores())
     progress(what, 0, len(waiting))
     with contextlib.ExitStack() as stack:
         attempt = functools.partial(_attempt, work)

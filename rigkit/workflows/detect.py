@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +17,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
 from rigkit.core.printing import brief, counted
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import available_cores, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
@@ -195,7 +194,7 @@ def _over_images(
 ) -> tuple[dict[str, Outcome], dict[str, str]]:
     """Return the detections per image in their order, whatever the number of processes, and what is seen in images
     without any."""
-    jobs = min(processes or os.cpu_count() or 1, len(tasks))
+    jobs = min(processes or available_cores(), len(tasks))
     found: dict[str, Outcome] = {}
     doubtful: dict[str, str] = {}
 

@@ -114,6 +114,26 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     return f"{what} seen in {counted(count, 'image')}; {words[0]}"
 
 
+def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+    """Return in words why corners of boards with marks lie in wrong places; None where that is not known.
+
+    Marks of another board may be at home on the one declared, and those of two boards alike are each other's. Of
+    chessboards the size of the grids tells (`rigkit.calibration.usable.other_size`).
+    """
+    if not any(board.identified for board in boards):
+        return None
+    return explained(paths, boards) or _alike(paths, boards)
+
+
+def _alike(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
+    """Say that images show two boards with the same marks; None where they do not."""
+    for name, image in _pictures(paths, EXPLAINING_IMAGES):
+        said = None if isinstance(image, InputError) else alike_boards(image, boards)
+        if said is not None:
+            return f"image '{Path(name).name}': {said}"
+    return None
+
+
 def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Say that images are mirrored, where boards with marks are seen in them only when they are flipped; None else. A
     chessboard in a mirror is a chessboard: nothing tells."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import importlib
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from typing import Any, TypeVar
 
 from rigkit.core.errors import InputError
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import available_cores, worker_pool
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -38,7 +37,7 @@ def over_items(
         for place, item in enumerate(items):
             yield place, function(item)
     else:
-        with worker_pool(min(jobs, len(items), os.cpu_count() or 1)) as pool:
+        with worker_pool(min(jobs, len(items), available_cores())) as pool:
             waiting = {pool.submit(function, item): place for place, item in enumerate(items)}
             for future in as_completed(waiting):
                 yield waiting[future], future.result()

@@ -14,7 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.identify_board import explained, misread
 
 BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
 
@@ -66,3 +66,24 @@ def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder
     assert said is not None and 'set type = "charuco"' in said
     said = explained([folder / "0.png"], [larger])
     assert said is not None and "8 x 8 are declared" in said
+
+
+def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two boards with the same marks are seen at once: either camera takes one of them, not always the same one."""
+    pictures = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))]
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+        for k, own in enumerate(pictures):
+            beside = pictures[k - 1 if name == "left" else k - 2]
+            cv2.imwrite(str(tmp_path / name / f"{k}.png"), np.hstack([own, beside]))
+    words = "charuco:7x7x30,dictionary=DICT_4X4_100,marker_mm=22.5"
+    folders = [str(tmp_path / "left"), str(tmp_path / "right")]
+    main(["calibrate", *folders, "--board", words, "-o", str(tmp_path / "rig.json"), "--model", "pinhole"])
+    assert "image '0.png': the marks of 'charuco-7x7x30' are seen twice" in "".join(capsys.readouterr())
+
+
+def test_boards_that_are_as_declared_are_not_misread(folder: Path) -> None:
+    assert misread(sorted(folder.glob("*.png")), [BOARD]) is None
+    assert misread([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
