@@ -68,10 +68,11 @@ def with_board_shape(
     if board == "flat" or not often_seen(observations).any():
         return observations, flat, []
     observations, flat, fits = _fit_shapes(observations, flat, board)
-    shapes, spared = _shapes(observations, fits, board, folds, progress)
-    shapes = [*([flat] if board == "auto" else []), *shapes]
+    shapes, spared = _shapes(observations, flat, fits, board, folds, progress)
     chosen = choose(observations, shapes)
-    return observations, chosen, [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
+    candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
+    # Corners that only another shape follows were taken in to compare the two, not to be believed.
+    return observations, flat if chosen.name == flat.name else chosen, candidates
 
 
 def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:
@@ -90,10 +91,11 @@ def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[O
 
 
 def _shapes(
-    observations: Observations, fits: dict[str, Fit], board: str, folds: int, progress: Progress
+    observations: Observations, flat: Option, fits: dict[str, Fit], board: str, folds: int, progress: Progress
 ) -> tuple[list[Option], list[Candidate]]:
-    """Return the shapes in the running, and what was not tried."""
+    """Return the shapes in the running, compared on the same corners, and what was not tried."""
     options = [Option(f"board {kind}", fit) for kind, fit in fits.items()]
+    options = [flat, *options] if board == "auto" else options
     spared = []
     if board == "auto" and "released" not in fits:
         reason = "not tried: corners stray from the warp by no more than chance"
