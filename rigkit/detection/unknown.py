@@ -26,6 +26,9 @@ MIN_IMAGES_OF_GUESS = 2
 LOOKING = "looking which board it is"
 """What progress is told of."""
 
+IMAGES_OF_PATTERN = 4
+"""Images whose corners tell which of two patterns a board has, where its markers do not."""
+
 MIN_SURE_CORNERS = 20
 """Lattices of as many corners are no chance."""
 
@@ -93,18 +96,30 @@ def _guess_of(
     if grids:
         return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:]))
     charuco = guessed_charuco(markers)
-    if charuco is None:
-        guess = _plain_guess(images, plain)
-        if guess is not None:
-            return guess
-    if charuco is not None:
-        return BoardGuess(charuco, tuple(markers.images))
+    if charuco:
+        return BoardGuess(_of_pattern(charuco, [images[k] for k in markers.images]), tuple(markers.images))
+    guess = _plain_guess(images, plain)
+    if guess is not None:
+        return guess
     # Last, as the markers of ChArUco boards stand in rows, too.
     aruco = TagSightings(ARUCO_TAGS)
     for k, image in enumerate(images):
         aruco.look_alone(k, image)
     grids = guessed_grids(aruco)
     return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else None
+
+
+def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> Board:
+    """Return the board of which the images show most corners, of the pattern of today or the one before it. Where a row
+    has an odd number of squares, the two are numbered alike but for one column, whose markers the images may not show:
+    with the wrong one the corners beside that column have no place on the board."""
+    if len(boards) == 1:
+        return boards[0]
+    some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
+    seen = in_threads(
+        lambda image: [sum(len(d.grid) for d in detect_boards(image, [b]) if d.board_id) for b in boards], some
+    )
+    return boards[int(np.sum(list(seen), axis=0).argmax())]
 
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:

@@ -131,8 +131,26 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
     # No image shows its whole height.
     for part in (places[:, 1] < 4, places[:, 1] > 2):
         seen.markers.append((kind, (misread[part], places[part], 0.75)))
-    board = guessed_charuco(seen)
-    assert board is not None and board.size == (8, 5) and board.pattern == pattern
+    (board,) = guessed_charuco(seen)
+    assert board.size == (8, 5) and board.pattern == pattern
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_corners_tell_the_pattern_where_markers_fit_both(legacy: bool) -> None:
+    """Nine squares a row: the two patterns are numbered alike but for one column, at either end, hidden here."""
+    board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_4X4_50", 45.0, legacy=legacy))
+    camera = Pinhole((900, 700), np.array([800.0, 800.0, 449.5, 349.5]))
+    facing = Rigid3(np.eye(3), np.array([-210.0, -120.0, 600.0]))
+    image = grey_image(render([PlacedBoard(board, facing)], camera, Rigid3.identity(), optics=Optics(0.5)))
+    left, right = camera.project(facing.apply(np.array([[-30.0, 0.0, 0.0], [450.0, 0.0, 0.0]])))[0][:, 0]
+    paper = image.copy()
+    paper[:, : int(left)] = paper[:, int(right) :] = 200.0
+    seen = MarkerSightings()
+    assert seen.look(0, paper)
+    assert len(guessed_charuco(seen)) == 2
+    guess = guess_board([paper])
+    assert guess is not None and isinstance(guess.board.pattern, Charuco)
+    assert guess.board.pattern.legacy is legacy
 
 
 def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,6 +116,9 @@ def test_steps_beyond_the_corners_go_on_in_proportion() -> None:
     assert longer.shape == (7, 8, 2)
     assert longer[3, :, 0] == pytest.approx(100.0 * 0.8 ** np.arange(-2, 6))
     assert longer[:, 3, 1] == pytest.approx(30.0 + 10.0 * np.arange(7))
+    # Of a misread board two places may be one.
+    pixels[1] = pixels[2]
+    assert np.isfinite(extended(pixels, 2)).all()
 
 
 def test_a_long_board_is_placed_in_tiles(rng: np.random.Generator) -> None:

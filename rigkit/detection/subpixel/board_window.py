@@ -140,5 +140,10 @@ def extended(pixels: FloatArray, rings: int) -> FloatArray:
 def _longer(lattice: np.ndarray) -> np.ndarray:
     """Return complex places (R, C) with a row more on both sides."""
     steps = np.diff(lattice, axis=0)
-    before, after = steps[0] ** 2 / steps[1], steps[-1] ** 2 / steps[-2]
+    before, after = _next(steps[0], steps[1]), _next(steps[-1], steps[-2])
     return np.concatenate([(lattice[0] - before)[None], lattice, (lattice[-1] + after)[None]])
+
+
+def _next(last: np.ndarray, one_before: np.ndarray) -> np.ndarray:
+    """Return the complex step that follows; where places of a misread board coincide, the last one again."""
+    return np.asarray(np.divide(last**2, one_before, out=last.copy(), where=one_before != 0.0))

@@ -127,10 +127,11 @@ def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntAr
         yield np.array(list(places)), np.array(list(places.values()))
 
 
-def guessed_charuco(seen: MarkerSightings) -> Board | None:
-    """Return the ChArUco board that most markers are of, with squares of 1 mm; None where none is told."""
+def guessed_charuco(seen: MarkerSightings) -> list[Board]:
+    """Return the ChArUco board that most markers are of, with squares of 1 mm: one of either pattern where the markers
+    fit both, none where no board is told."""
     if not seen.markers:
-        return None
+        return []
     (dictionary, inverted), _ = seen.kinds.most_common(1)[0]
     own = [markers for kind, markers in seen.markers if kind == (dictionary, inverted)]
     two_rows: Counter[int] = Counter()
@@ -140,13 +141,13 @@ def guessed_charuco(seen: MarkerSightings) -> Board | None:
     # Two rows of squares have as many white ones as a row has squares.
     columns = two_rows.most_common(1)[0][0] - 1 if two_rows else 0
     if columns < 2:
-        return None
+        return []
     own = [_in_order(*markers, columns) for markers in own]
     first = _first_marker(own)
     last = max(int(numbers.max()) for numbers, *_ in own)
     side = round(float(np.median([side for _, _, side in own])), 2)
     tall = Counter(int(np.ptp(places[:, 1])) for _, places, _ in own)
-    best: tuple[int, int, Board] | None = None
+    found: list[tuple[tuple[int, int], Board]] = []
     for legacy in (False, True):
         for rows in sorted({*tall, round(2.0 * (last + 1 - first) / (columns + 1)) - 1}):
             if rows < 2:
@@ -157,10 +158,10 @@ def guessed_charuco(seen: MarkerSightings) -> Board | None:
             if first + len(pattern.places(*board.size)) > marker_count(pattern.dictionary):
                 continue
             fitting = sum(_fitting(pattern, board, numbers, places) for numbers, places, _ in own)
-            # Of boards that explain as many markers the smallest, of its patterns the new one.
-            if best is None or (fitting, -rows) > best[:2]:
-                best = fitting, -rows, board
-    return None if best is None else best[2]
+            # Of boards that explain as many markers the smallest.
+            found.append(((fitting, -rows), board))
+    most = max((rank for rank, _ in found), default=None)
+    return [board for rank, board in found if rank == most]
 
 
 def _in_order(numbers: IntArray, places: IntArray, side: float, columns: int) -> Markers:
