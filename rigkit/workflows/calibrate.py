@@ -153,5 +153,5 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
             # What little passes for the board declared lies in wrong places.
             raise InputError(f"{session.path}: {shown}")
         if shown is not None:
-            verdicts = (verdicts[0], Finding(severity=Severity.BAD, message=shown), *verdicts[1:])
+            verdicts = (verdicts[0], Finding.bad(shown), *verdicts[1:])
     return replace(result, dropped=(*dropped, *result.dropped), verdicts=verdicts)

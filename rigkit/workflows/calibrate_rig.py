@@ -226,7 +226,7 @@ def rig_from(
         ]
         rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(said)))
     if rig.verdicts[0].severity is Severity.BAD:
-        wrong = [Finding(severity=Severity.BAD, message=words) for words in _misread(session)]
+        wrong = [Finding.bad(words) for words in _misread(session)]
         rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
     single = [replace(c, dropped=(*dropped[n], *c.dropped)) for n, c in zip(session.cameras, rig.single, strict=True)]
     cameras = [
