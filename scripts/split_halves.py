@@ -9,9 +9,12 @@ all sets say together is the last line. And a test that never alarms is worthles
 lenses, must be found.
 
     python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
-        [--model MODEL]
+        [--model MODEL] [--without IMAGE ...] [--twins N]
 
-With --images so many images are calibrated apart from all others: what a small session says of itself.
+With --images so many images are calibrated apart from all others: what a small session says of itself. With --without
+the images named are left out: does a ratio come from one of them? With --twins halves of so many SIMULATED sessions
+like the real one, whose images all err alike (`honesty.twins`): if these agree with their sigmas, small sessions know
+how sure they are, and where the real one does not, an image of it errs otherwise.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from honesty.twins import twin
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import drawn_errors, reduced_by_cluster
@@ -47,6 +51,8 @@ from rigkit.io.images import read_image
 
 Views = dict[str, list[BoardView]]
 """What each image shows, by its name."""
+Loaded = tuple[Views, tuple[int, int]]
+"""What the images of a set show, and their size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +78,6 @@ CAPTURES = {
     "ocam": Capture("real/ocam-fisheye1", "*.jpg", Board("b", 8, 6, 32.5, 32.5)),
     "ov-plane": Capture("real/ov-plane/corners", "*/*.orpc", Board("ov", 22, 22, 7.5, 7.5)),
     "caliper": Capture("public/caliper-board", "*.png", Board("b", 16, 10, 15.0, 15.0)),
-    "pose2sim": Capture("public/pose2sim", "*/*.jpg", Board("b", 7, 4, 60.0, 60.0)),
     "fisheye-chess": Capture("public/fisheye-chess", "*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "cylinder": Capture("public/cylinder/201", "*", Board("b", 19, 14, 10.0, 10.0)),
     "cylinder-202": Capture("public/cylinder/202", "*", Board("b", 19, 14, 10.0, 10.0)),
@@ -134,7 +139,7 @@ def views_of(path: Path, board: Board, cache: Path) -> tuple[list[BoardView], tu
     return [replace(view, image=path.name) for view in views], size
 
 
-def load(name: str, data: Path, cache: Path) -> tuple[Views, tuple[int, int]]:
+def load(name: str, data: Path, cache: Path) -> Loaded:
     """Return what the images of a set show, and their size."""
     capture = CAPTURES[name]
     found: Views = {}
@@ -211,9 +216,7 @@ def own_scatter(views: Views, size_px: tuple[int, int], splits: int, model: str,
     return np.exp(np.quantile(logs, [0.025, 0.5, 0.975]))
 
 
-def split(
-    name: str, loaded: tuple[Views, tuple[int, int]], splits: int, model: str, images: int | None
-) -> list[CalibrationComparison]:
+def split(name: str, loaded: Loaded, splits: int, model: str, images: int | None) -> list[CalibrationComparison]:
     """Print and return the comparisons of random halves of a set, or of so many `images` with all others."""
     rng = np.random.default_rng(len(name))
     found = []
@@ -230,6 +233,26 @@ def split(
         )
         print(in_words(f"{name} split {k} {about}", found[-1]), flush=True)
     return found
+
+
+def twins(name: str, loaded: Loaded, count: int, model: str) -> None:
+    """Print what halves of so many SIMULATED sessions like the real one come to."""
+    views, size = loaded
+    found, ratios, other = calibrated(views, size, model), [], 0
+    for seed in range(count):
+        rng = np.random.default_rng([seed, len(name)])
+        a, b = (calibrated(part, size, model) for part in halves(twin(found, views, rng), rng))
+        compared = compare_calibrations(a, b)
+        ratios.append(compared.ratio)
+        other += compared.verdict is CameraVerdict.OTHER
+    logs = np.log(ratios)
+    mean, error = np.exp(logs.mean()), np.exp(logs.std(ddof=1) / np.sqrt(count))
+    low, high = np.exp(np.quantile(logs, [0.05, 0.95])).tolist()
+    print(
+        f"{name}, {count} SIMULATED twins, board {found.boards[0].kind}: geometric mean ratio {mean:.2f} (x or / "
+        f"{error:.2f}), of one session 5 and 95 % {low:.2f} and {high:.2f}; another camera in {other}",
+        flush=True,
+    )
 
 
 def changed(views: Views, move: Callable[[np.ndarray], np.ndarray], size_px: tuple[int, int]) -> Views:
@@ -251,7 +274,7 @@ def shift_px(camera: Camera, pixels: np.ndarray, remaining_px: float) -> np.ndar
     return remaining_px / max(float(np.sqrt(2.0 * (left**2).mean())), 1e-9) * along
 
 
-def power(name: str, loaded: tuple[Views, tuple[int, int]], model: str) -> None:
+def power(name: str, loaded: Loaded, model: str) -> None:
     """Print the comparisons of one half with the other half behind a lens that was touched; and how often it would be
     found with as many images a side as are asked of a user, of this camera and these boards: errors drawn from what
     all images say that calibrations err by."""
@@ -296,12 +319,14 @@ def drawn_power(whole: Calibration, move: Callable[[np.ndarray], np.ndarray], im
     return found
 
 
-def summary(name: str, found: list[CalibrationComparison], args: argparse.Namespace) -> tuple[float, float] | None:
+def summary(
+    name: str, loaded: Loaded, found: list[CalibrationComparison], args: argparse.Namespace
+) -> tuple[float, float] | None:
     """Print what the splits of a set come to. Return the logarithm of their mean ratio over what it is by the median
     where sigmas are true, and the standard deviation that it has there; None of rendered images, and of small parts."""
     ratio = float(np.exp(np.mean([np.log(c.ratio) for c in found])))
     other = sum(c.verdict is CameraVerdict.OTHER for c in found)
-    views, size = load(name, args.data, args.cache)
+    views, size = loaded
     likely, off = "", None
     if args.images is None:
         low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
@@ -337,20 +362,28 @@ def main() -> None:
     parser.add_argument("--model", default="scaramuzza")
     parser.add_argument("--images", type=int, help="so many against all others, instead of halves")
     parser.add_argument("--power", action="store_true", help="find other cameras and moved lenses")
+    parser.add_argument("--without", nargs="+", default=[], metavar="IMAGE", help="leave these images out")
+    parser.add_argument("--twins", type=int, metavar="N", help="halves of so many simulated sessions like the real one")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
-    everything: dict[str, list[CalibrationComparison]] = {}
+    everything: dict[str, tuple[Loaded, list[CalibrationComparison]]] = {}
     for name in args.sets or CAPTURES:
-        loaded = load(name, args.data, args.cache)
+        views, size = load(name, args.data, args.cache)
+        if not views:
+            print(f"{name}: no images in {args.data / CAPTURES[name].folder}: left out")
+            continue
+        loaded = {image: own for image, own in views.items() if image not in args.without}, size
         if args.power:
             power(name, loaded, args.model)
+        elif args.twins:
+            twins(name, loaded, args.twins, args.model)
         else:
-            everything[name] = split(name, loaded, args.splits, args.model, args.images)
-    pairs = [(a, b) for a, b in OTHERS if args.power and (not args.sets or {a, b} <= set(args.sets))]
-    for a, b in pairs:
+            everything[name] = loaded, split(name, loaded, args.splits, args.model, args.images)
+    there = {name for name in args.sets or CAPTURES if (args.data / CAPTURES[name].folder).is_dir()}
+    for a, b in [pair for pair in OTHERS if args.power and set(pair) <= there]:
         first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))
         print(in_words(f"{a} against {b}", compare_calibrations(first, second)))
-    off = [summary(name, found, args) for name, found in everything.items() if found]
+    off = [summary(name, loaded, found, args) for name, (loaded, found) in everything.items() if found]
     if args.images is None and len(off) > 1:
         print_of_all([one for one in off if one is not None])
 

@@ -71,7 +71,9 @@ MAX_FLAGGED = 0.02
 
 
 def left_out() -> None:
-    """Print how many unchanged cameras of every set alarm with the limit that the other sets ask for."""
+    """Print how many unchanged cameras of every set alarm with the limit that other sets, if any, ask for."""
+    if len(UNCHANGED) < 2:
+        return
     flagged = count = 0
     for name, own in UNCHANGED.items():
         others = [c.chance if c.change is not None and c.change.most_px >= ALARM_PX else 1.0
