@@ -13,7 +13,7 @@ pairs: real pairs of textured scenes whose cameras and pose are known; the pose 
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
     python scripts/bench_sentinel.py [lens] [rig] [departs] [rendered] [scene] [pairs] [real] [--seeds 20]
-        [--lens NAME ...] [--board 9x6x25]
+        [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from bench_planner import LENSES, Lens, by_hand, free_poses, see
 from scipy.special import ndtr, ndtri
 from sentinel.captures import SAID, left_out, real
 from sentinel.scenes import pairs
-from sentinel.tally import CHANGED_PX, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
+from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 from split_halves import identified
 
 from rigkit.calibration.calibrate import calibrate
@@ -353,8 +353,10 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
     parser.add_argument("--board", type=identified, default=BOARD, metavar="CxRxMM", help="default 9x6x25")
+    parser.add_argument("--parameters-alone", action="store_true", help="lenses do nothing beyond their models")
     args = parser.parse_args()
     globals()["BOARD"] = args.board
+    COUNTED["beyond_model"] = not args.parameters_alone
     args.cache.mkdir(parents=True, exist_ok=True)
     work: dict[str, list[Callable[[], None]]] = {
         "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
