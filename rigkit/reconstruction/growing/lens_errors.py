@@ -6,7 +6,7 @@ lens whose axis or plane is tilted (of first order in the azimuth; D. C. Brown, 
 
 These are not the displacements with which calibrations count (`kernels.departures`), though they were tried: alone they
 leave poses twice as far off, for pairs show ripples that no such polynomial is; beside the waves over the image they do
-as well, but state poses too surely, as powers of the radius are large at its rim alone, where boards hardly are and
+as well, but state poses too surely, perhaps as powers of the radius are large at its rim alone, where boards hardly are and
 pairs are many (docs/pages/accuracy-clouds.md, "Tried and left out").
 """
 
