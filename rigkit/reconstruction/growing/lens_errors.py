@@ -5,9 +5,9 @@ lens whose axis or plane is tilted (of first order in the azimuth; D. C. Brown, 
 1966), then anything smooth. The part that is a rotation of the camera is kept apart: no pair of images shows it.
 
 These are not the displacements with which calibrations count (`kernels.departures`), though they were tried: alone they
-leave poses twice as far off, for pairs show ripples that no such polynomial is; beside the waves over the image they do
-as well, but state poses too surely, perhaps as powers of the radius are large at its rim alone, where boards hardly are and
-pairs are many (docs/pages/accuracy-clouds.md, "Tried and left out").
+leave poses twice as far off, for pairs show ripples that no such polynomial is. Beside the waves over the image they do
+as well, but state poses too surely, perhaps as powers of the radius are large at its rim alone, where boards hardly are
+and pairs are many (docs/pages/accuracy-clouds.md, "Tried and left out").
 """
 
 from __future__ import annotations
