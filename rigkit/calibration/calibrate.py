@@ -61,7 +61,8 @@ def calibrate(
     degree : size of a model that comes in several (degree of "scaramuzza", terms of "brown"); by default chosen by
         held-out error.
     board : "flat", "warp", "released", or "auto": chosen by held-out error.
-    folds : of the cross-validation over images; 0 for none: choices then rest on BIC, and halves are not compared.
+    folds : of the cross-validation over images; 0 for none: choices then rest on BIC, halves are not compared, and that
+        another model may show the images as well is not in the sigmas, which are too small beyond the boards.
     progress : told of the models tried.
 
     Raises
