@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from rigkit.detection.lattice.split import join_parts, split_at_turns, split_nec
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
 
@@ -98,12 +100,18 @@ def fitted(
             else [own]
         )
         if len(parts) == 1:
-            out += [placed_together(grey, own)] if large(own.lattice, min_corners) else []
+            out += [_scattered(placed_together(grey, own))] if large(own.lattice, min_corners) else []
             continue
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
         out += fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
     return out
+
+
+def _scattered(item: RefinedLattice) -> RefinedLattice:
+    """Return `item` with the sigmas of a small board raised to what its corners scatter (`scatter.small_scatter`)."""
+    raised = small_scatter(item.lattice.pixels, item.sigma_px)
+    return item if raised == 1.0 else replace(item, sigma_px=item.sigma_px * raised, scatter=item.scatter * raised)
 
 
 def _confirmed(

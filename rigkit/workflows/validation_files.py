@@ -44,6 +44,11 @@ class PairValidation:
     files: Mapping[str, bytes]
     section: PairSection | None
 
+    @property
+    def pair_id(self) -> str:
+        """Name of the pair."""
+        return self.best.pair_id
+
 
 def validation_files(
     dataset: Dataset,

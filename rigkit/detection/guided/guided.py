@@ -31,6 +31,7 @@ from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
+from rigkit.detection.subpixel.subpixel import unsure
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -156,6 +157,7 @@ def _with_added(
     """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
     state = _together(image, guide.board, _settled(image, guide.board, state, state.known & ~opened.known))
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
+    added &= ~unsure(state.sigma_px)
     sigma = _known_factor(found, state if state.together else opened) * state.sigma_px
     row, column = np.nonzero(added)
     grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])

@@ -1,0 +1,41 @@
+"""Boards of few corners: their sigmas are raised to what the corners scatter, where that is no lens's bend."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.detection.subpixel.scatter import small_scatter
+
+SIGMA_PX = 0.02
+
+
+def corners(columns: int, rows: int, bend: float = 0.0) -> np.ndarray:
+    """Return corners (R, C, 2) seen aslant, 30 px apart, pulled towards the middle of the image by a lens."""
+    u, v = np.meshgrid(np.arange(columns) - 1.7, np.arange(rows) - 1.2)
+    u, v = (30.0 * part / (1.0 + 0.03 * u - 0.02 * v) for part in (u, v))
+    squared = (u**2 + v**2) / 100.0**2
+    return np.stack([u, v], axis=-1) / np.sqrt(1.0 + bend * squared)[..., None]
+
+
+@pytest.mark.parametrize(("times", "low", "high"), [(1.0, 1.0, 1.3), (4.0, 3.0, 5.0)])
+def test_scatter_raises_sigmas(times: float, low: float, high: float) -> None:
+    rng = np.random.default_rng(4)
+    sigma_px = np.full((6, 4), SIGMA_PX)
+    noise = times * SIGMA_PX * rng.standard_normal((20, 6, 4, 2))
+    factors = [small_scatter(corners(4, 6) + one, sigma_px) for one in noise]
+    assert low <= np.median(factors) <= high
+
+
+def test_what_a_lens_bends_does_not() -> None:
+    sigma_px = np.full((6, 4), 0.001)
+    bent = corners(4, 6, bend=2.0) + 0.001 * np.random.default_rng(1).standard_normal((6, 4, 2))
+    assert small_scatter(bent, sigma_px) == 1.0
+
+
+def test_boards_of_many_or_hardly_any_corners_are_left_to_others() -> None:
+    rng = np.random.default_rng(2)
+    for columns, rows in ((9, 6), (3, 3)):
+        scattered = corners(columns, rows) + rng.standard_normal((rows, columns, 2))
+        assert small_scatter(scattered, np.full((rows, columns), SIGMA_PX)) == 1.0
+    assert small_scatter(np.full((4, 4, 2), np.nan), np.full((4, 4), np.nan)) == 1.0
