@@ -26,11 +26,8 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterato
     For work that is mostly kernels, OpenCV and files, which leave the interpreter to others meanwhile: threads start at
     once, processes after a second of imports. What it raises is raised here, and what has not begun is left.
     """
-    pool = ThreadPoolExecutor(available_cores())
-    try:
+    with ThreadPoolExecutor(available_cores()) as pool:
         yield from pool.map(work, items)
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def available_cores() -> int:
