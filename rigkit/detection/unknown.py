@@ -19,6 +19,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, TagSightings, guessed_grids
+from rigkit.detection.whole_grids import MIN_SURE_CORNERS, GridSeen, Size, grid_seen, size_of_parts, whole_sizes
 
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
@@ -29,8 +30,8 @@ LOOKING = "looking which board it is"
 IMAGES_OF_PATTERN = 4
 """Images whose corners tell which of two patterns a board has, where its markers do not."""
 
-MIN_SURE_CORNERS = 20
-"""Lattices of as many corners are no chance."""
+MAX_SHARE_ALIKE_PARTS = 0.5
+"""Parts of a board that the frame cuts are of one size in fewer of the images."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
@@ -49,11 +50,13 @@ class BoardGuess:
     board : with squares, or tags, of 1 mm.
     images : indices of the images that show it.
     beside : other boards that images show.
+    cut : the frame cuts the board in every image: it has so many columns and rows, or more.
     """
 
     board: Board
     images: tuple[int, ...]
     beside: tuple[Board, ...] = ()
+    cut: bool = False
 
 
 def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
@@ -61,18 +64,18 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
 
     Boards with marks are told by these: AprilGrids, ChArUco boards (also of the pattern before OpenCV 4.6, and
     inverted). Otherwise it is the largest chessboard that is seen often, or a grid of circles that more images show.
+    Of a chessboard that no image shows whole, other images may show where one and the other side ends.
     `progress` is told after every image.
     """
     tags, markers = TagSightings(), MarkerSightings()
-    plain: list[list[BoardDetection]] = []
-    for found in in_threads(detect_boards, images):
-        progress(LOOKING, len(plain), len(images))
-        plain.append([d for d in found if d.complete])
-    sure = [
-        k
-        for k, (image, found) in enumerate(zip(images, plain, strict=True))
-        if any(_without_marks(image, one) for one in found)
-    ]
+    plain: list[list[GridSeen]] = []
+    sure: list[int] = []
+    for k, found in enumerate(in_threads(detect_boards, images)):
+        progress(LOOKING, k, len(images))
+        grids = [(one, seen) for one in found if (seen := grid_seen(one, images[k].shape)) is not None]
+        plain.append([seen for _, seen in grids])
+        if any(_without_marks(images[k], one) for one, _ in grids):
+            sure.append(k)
     for k in (k for k in range(len(images)) if k not in sure):
         if not tags.look(k, images[k]):
             markers.look(k, images[k])
@@ -88,7 +91,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
 
 def _guess_of(
     images: Sequence[GreyImage],
-    plain: Sequence[Sequence[BoardDetection]],
+    plain: Sequence[Sequence[GridSeen]],
     tags: TagSightings,
     markers: MarkerSightings,
 ) -> BoardGuess | None:
@@ -99,14 +102,14 @@ def _guess_of(
     if charuco:
         return BoardGuess(_of_pattern(charuco, [images[k] for k in markers.images]), tuple(markers.images))
     guess = _plain_guess(images, plain)
-    if guess is not None:
+    if guess is not None and not guess.cut:
         return guess
     # Last, as the markers of ChArUco boards stand in rows, too.
     aruco = TagSightings(ARUCO_TAGS)
     for k, image in enumerate(images):
         aruco.look_alone(k, image)
     grids = guessed_grids(aruco)
-    return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else None
+    return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else guess
 
 
 def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> Board:
@@ -126,45 +129,68 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     """Say whether a lattice is a chessboard beyond doubt: large, and with nothing in its squares."""
     if len(found.grid) < MIN_SURE_CORNERS:
         return False
-    pixels = found.pixels.reshape(found.rows, found.columns, 2)
+    pixels = found.lattice()
     v, u = WITHIN_SQUARES[:, None, None, None, None], WITHIN_SQUARES[None, :, None, None, None]
     top = (1.0 - u) * pixels[:-1, :-1] + u * pixels[:-1, 1:]
     bottom = (1.0 - u) * pixels[1:, :-1] + u * pixels[1:, 1:]
-    levels = sample(image, ((1.0 - v) * top + v * bottom).reshape(-1, 2)).reshape(len(WITHIN_SQUARES) ** 2, -1)
+    places = ((1.0 - v) * top + v * bottom).reshape(len(WITHIN_SQUARES) ** 2, -1, 2)
     row, column = np.indices((found.rows - 1, found.columns - 1))
-    odd = ((row + column) % 2).ravel() == 1
+    seen = np.isfinite(places).all(axis=(0, 2))
+    levels, odd = sample(image, places[:, seen]), ((row + column) % 2).ravel()[seen] == 1
+    if not odd.any() or odd.all():
+        return False
     contrast = abs(float(levels[:, odd].mean() - levels[:, ~odd].mean()))
     return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVELS_APART * contrast for of in (odd, ~odd))
 
 
-def _sizes(found: Sequence[BoardDetection]) -> set[tuple[int, int]]:
-    """Return the sizes of an image's grids, the longer side first."""
-    return {(max(d.columns, d.rows), min(d.columns, d.rows)) for d in found}
-
-
-def _in_most(plain: Sequence[Sequence[BoardDetection]]) -> bool:
-    """Say whether at least half of the images, and more than one, show grids of one size."""
-    counts = Counter(size for found in plain for size in _sizes(found))
+def _in_most(plain: Sequence[Sequence[GridSeen]]) -> bool:
+    """Say whether at least half of the images, and more than one, show whole grids of one size."""
+    counts = Counter(size for found in plain for size in whole_sizes(found))
     return max(counts.values(), default=0) >= max(0.5 * len(plain), MIN_IMAGES_OF_GUESS)
 
 
-def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[BoardDetection]]) -> BoardGuess | None:
+def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
     circles, settled = CircleSightings(), _in_most(plain)
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if not (found and settled):
             circles.look(k, image)
-    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
-    counts = Counter(size for found in plain for size in _sizes(found))
-    often = [size for size, n in counts.items() if n >= min(MIN_IMAGES_OF_GUESS, max(counts.values()))]
-    best = max(often, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    best = _size(plain)
     grid = guessed_circles(circles)
-    if grid is not None and (best is None or len(grid[1]) > counts[best]):
+    if grid is not None and (best is None or len(grid[1]) > len(best[1])):
         return BoardGuess(*grid)
-    if best is None:
+    if best is not None:
+        return BoardGuess(Board("board", *best[0], 1.0, 1.0), best[1])
+    shown = tuple(k for k, found in enumerate(plain) if found)
+    if len(shown) < 0.5 * len(plain) or not shown:
         return None
-    shown = tuple(k for k, found in enumerate(plain) if best in _sizes(found))
-    return BoardGuess(Board("board", *best, 1.0, 1.0), shown)
+    sizes = np.array([grid.size for found in plain for grid in found])
+    columns, rows = sizes.max(axis=0).tolist()
+    return BoardGuess(Board("board", columns, rows, 1.0, 1.0), shown, cut=True)
+
+
+def _size(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:
+    """Return the size of the chessboard that images show, and the images that show it; None where none tells."""
+    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
+    whole, whole_images = _most_seen([whole_sizes(found) for found in plain])
+    # Of the outermost squares the frame may cut a part.
+    full, full_images = _most_seen([{grid.size for grid in found} for found in plain])
+    if whole_images < MIN_IMAGES_OF_GUESS:
+        parts = size_of_parts(plain, MIN_IMAGES_OF_GUESS)
+        if parts is not None:
+            return parts
+        if whole is None and full_images > MAX_SHARE_ALIKE_PARTS * len(plain):
+            whole = full
+    if whole is None:
+        return None
+    return whole, tuple(k for k, found in enumerate(plain) if any(grid.size == whole for grid in found))
+
+
+def _most_seen(sizes: Sequence[set[Size]]) -> tuple[Size | None, int]:
+    """Return the size that most images show, the larger one of two, and how many; None where none shows any."""
+    counts = Counter(size for own in sizes for size in own)
+    best = max(counts, key=lambda size: (counts[size], size[0] * size[1]), default=None)
+    return best, counts[best] if best is not None else 0
 
 
 def difference(guess: Board, declared: Board) -> str | None:

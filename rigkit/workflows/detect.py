@@ -31,7 +31,7 @@ from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
-from rigkit.workflows.identify_board import explained, suggested_words
+from rigkit.workflows.identify_board import explained, suggestion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +137,7 @@ def _nothing_found(images: Sequence[Path], boards: Sequence[Board], doubtful: Ma
     """Say what images show instead of what was looked for, where that is known, and otherwise what may be wrong."""
     looked_for = " or ".join(f"'{board.board_id}'" for board in boards) if boards else "chessboard"
     lead = f"no {'board ' if boards else ''}{looked_for} found in {counted(len(images), 'image')}"
-    shown = None if boards else suggested_words(images)
+    shown = None if boards else suggestion(images).words
     why = explained(images, boards) if boards else shown and f"they show --board {shown}"
     if why:
         return f"{lead}; {why}"

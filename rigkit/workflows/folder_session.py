@@ -17,7 +17,7 @@ from rigkit.io.images import IMAGE_ENDINGS
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
-from rigkit.workflows.identify_board import suggested_words
+from rigkit.workflows.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""
@@ -159,27 +159,28 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     Raises InputError where none is seen.
     """
     shown = _shown(places, progress)
-    if shown is None:
+    if shown.words is None:
+        if shown.part is not None:
+            raise InputError(f"calibrate: the images show only {shown.part}, and give it as --board {WORDS_HELP}")
         raise InputError(f"calibrate: no board is seen in the images; give it, such as --board {WORDS_HELP}")
-    return tuple(with_length(words, side_mm) for words in shown.split(" --board "))
+    return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 
-def _shown(places: Sequence[Path], progress: Progress = silent) -> str | None:
+def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
     if any(is_video(place) for place in places):
-        return suggested_words(places, progress)
+        return suggestion(places, progress)
     entries = [entry for found in cameras_in(places).values() for entry in found]
-    return suggested_words(sorted(image for folder, pattern in entries for image in folder.glob(pattern)), progress)
+    return suggestion(sorted(image for folder, pattern in entries for image in folder.glob(pattern)), progress)
 
 
 def _untold(folders: Sequence[Path]) -> str:
     """Return what to say where no board is given: what the images show of it."""
     shown = _shown(folders)
-    if shown is None:
+    if shown.words is None:
         such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
     else:
-        such = (
-            f"they show --board {shown}: measure the squares, and say that with the mm of one for MM, or as --square-mm"
-        )
+        board = f"--board {shown.words}"
+        such = f"they show {board}: measure the squares, and say that with the mm of one for MM, or as --square-mm"
     return f"calibrate: images cannot tell how large squares are; {such}"
 
 

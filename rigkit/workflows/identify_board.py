@@ -61,7 +61,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     InputError
         No image, or none that can be read.
     CheckFailed
-        No board is seen.
+        No board is seen, or none that tells its size: the frame cuts a chessboard in every image.
     """
     if not paths:
         raise InputError("board identify: no images; give some, or a folder")
@@ -83,6 +83,8 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
         nothing = "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {nothing}")
+    if guess.cut:
+        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show only {_part(guess.board)}")
     pictures = list(images.values())
     twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
@@ -102,7 +104,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     if mirrored is not None:
         return mirrored
     guess = _guess(paths)
-    if guess is None:
+    if guess is None or guess.cut:
         return None
     told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
     words = [one for one in told if one is not None]
@@ -159,18 +161,48 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     )
 
 
-def suggested_words(paths: Sequence[Path], progress: Progress = silent) -> str | None:
-    """Return the board that images show as `--board` takes it; None where none is seen."""
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """What images show of boards that nobody has described.
+
+    Attributes
+    ----------
+    words : as `--board` takes them; None where they do not tell.
+    part : what they do show, in words, where it is not enough.
+    """
+
+    words: str | None = None
+    part: str | None = None
+
+
+def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion:
+    """Return the board that images show."""
     guess = _guess(paths, progress)
-    return None if guess is None else " --board ".join(words_of_board(board) for board in (guess.board, *guess.beside))
+    if guess is None:
+        return Suggestion()
+    if guess.cut:
+        return Suggestion(part=_part(guess.board))
+    return Suggestion(" --board ".join(words_of_board(board) for board in (guess.board, *guess.beside)))
+
+
+def _part(board: Board) -> str:
+    size = f"{board.columns} x {board.rows} inner corners"
+    return f"parts of a chessboard, of at least {size}: the frame cuts it everywhere; count them on the board"
 
 
 def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | None:
-    try:
-        pictures = [image for _, image in _pictures(paths, EXPLAINING_IMAGES)]
-        return guess_board([image for image in pictures if not isinstance(image, InputError)], progress)
-    except (InputError, DegenerateError):
-        return None
+    """Return the board that a few images show, or more of them where those do not tell."""
+    guess = None
+    for most in (EXPLAINING_IMAGES, ENOUGH_IMAGES):
+        try:
+            pictures = [image for _, image in _pictures(paths, most) if not isinstance(image, InputError)]
+            guess = guess_board(pictures, progress)
+        except (InputError, DegenerateError):
+            return None
+        told = guess is not None and not guess.cut and len(guess.images) > 1
+        if told or (len(paths) <= most and not any(map(is_video, paths))):
+            break
+    return guess
 
 
 def _pictures(paths: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage | InputError]]:

@@ -17,7 +17,7 @@ from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
 from rigkit.io.manifest_writer import FoundPair, ImageBoards, NewManifest, board_sizes, group_pairs, manifest_text
-from rigkit.workflows.identify_board import suggested_words
+from rigkit.workflows.identify_board import suggestion
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +49,7 @@ def find_pairs(
         raise unreadable[0]
     if not any(image.boards for image in shown):
         what = "of the boards told is" if boards else "chessboard is"
-        seen = suggested_words(images)
+        seen = suggestion(images).words
         such = f"they show --board {seen}, with MM measured" if seen else "other boards must be told: --board"
         raise InputError(f"init: no {what} found in {counted(len(shown), 'image')}; {such}")
     return FoundPairs(tuple(group_pairs(shown, root)), tuple(unreadable))

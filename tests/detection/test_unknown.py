@@ -103,6 +103,47 @@ def test_a_board_in_a_room_with_tiles(pattern: Pattern) -> None:
     assert guess.board.size == (8, 6) and sorted(guess.images) == [0, 1, 2]
 
 
+def framed(board: Board, width: int, height: int, shift: tuple[float, float], slant_deg: float = 0.0) -> GreyImage:
+    """Return an image of a board 800 mm away, moved by so many mm, as much of it as the frame shows."""
+    turn = np.array(cv2.Rodrigues(np.array([0.0, np.deg2rad(slant_deg), 0.1]))[0])
+    camera = Pinhole((width, height), np.array([400.0, 400.0, width / 2.0, height / 2.0]))
+    middle = np.array([(board.columns - 1) * 30.0, (board.rows - 1) * 30.0, 0.0])
+    place = Rigid3(turn, np.array([*shift, 800.0]) - turn @ middle)
+    return grey_image(render([PlacedBoard(board, place)], camera, Rigid3.identity(), optics=Optics(0.5)))
+
+
+CUT = Board("b", 10, 7, 60.0, 60.0)
+"""600 px wide and 420 px high where it is 800 mm away, with its outermost squares 60 px more."""
+
+
+def test_a_board_that_the_frame_cuts_in_every_image() -> None:
+    """Two images show one side from end to end, two the other."""
+    images = [framed(CUT, 560, 250, (0.0, 200.0), s) for s in (0.0, 8.0)]
+    images += [framed(CUT, 300, 480, (x, 0.0)) for x in (150.0, 160.0)]
+    guess = guess_board(images)
+    assert guess is not None and not guess.cut
+    assert guess.board.size == (10, 7) and guess.images == (0, 1, 2, 3)
+
+
+def test_images_that_do_not_tell_how_large_a_board_is() -> None:
+    """No image shows the shorter side from end to end: it may be longer than what is seen."""
+    guess = guess_board([framed(CUT, 560, 250, (0.0, y)) for y in (250.0, 200.0, 140.0)])
+    assert guess is not None and guess.cut
+    assert guess.board.columns == 10 and guess.board.rows in (5, 6)
+
+
+def test_a_board_with_hidden_corners_is_as_large_as_its_grid() -> None:
+    """A sticker hides four corners of two images; the third shows a part only, without a gap."""
+    images = []
+    for slant in (0.0, 15.0):
+        image = framed(CUT, 560, 400, (0.0, 0.0), slant)
+        image[190:215, 270:300] = 128.0
+        images.append(image)
+    images.append(framed(CUT, 300, 480, (150.0, 0.0)))
+    guess = guess_board(images)
+    assert guess is not None and guess.board.size == (10, 7) and guess.images == (0, 1)
+
+
 def test_markers_far_into_a_dictionary_are_told() -> None:
     board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_5X5_1000", 45.0, first_marker=600))
     guess = guess_board([shown(board)])
