@@ -30,6 +30,8 @@ MAX_SHARE_REACHING = 0.1
 """Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
 MAX_SHARE_COPIES = 0.25
 """Images that show more whole boards than are listed, as a part of those with any: from here on there are copies."""
+MIN_TIMES_LARGER = 2.0
+"""The board is seen so many times as long as a picture of one in the background, or they may be two boards alike."""
 BESIDE = "grids beside the whole board, which may be parts of another or something else"
 """Why a grid in an image that is used gives no view."""
 MIN_SPREAD = 1e-6
@@ -125,7 +127,8 @@ def without_lookalikes(
     every board of the session stands whole beside it.
 
     A tiled floor or a patterned box lies in any room, and its squares need not be square. Where images often show more
-    whole boards than are listed, there are copies of them, and their parts are welcome.
+    whole boards than are listed, there are copies of them, and their parts are welcome. Where they do so once or twice,
+    a much smaller one is a picture of a board on the wall, or a toy: it is left out, and the large one is the board.
     """
     listed = {frozenset(board.size) for board in boards}
     whole = {
@@ -134,14 +137,32 @@ def without_lookalikes(
     }
     counts = [sum(own) for own in whole.values() if any(own)]
     copies = sum(count > len(boards) for count in counts) > MAX_SHARE_COPIES * len(counts)
-    return {
-        name: tuple(
-            d
-            for d, is_whole in zip(own, whole[name], strict=True)
-            if copies or is_whole or d.board_id is not None or sum(whole[name]) < len(boards)
-        )
-        for name, own in detections.items()
-    }
+    if copies:
+        return {name: tuple(own) for name, own in detections.items()}
+    out = {}
+    for name, own in detections.items():
+        full = sum(whole[name]) >= len(boards)
+        kept = [d for d, is_whole in zip(own, whole[name], strict=True) if is_whole or not full]
+        for board in boards:
+            if not board.identified and sum(set(board.size) == set(other.size) for other in boards) == 1:
+                kept = _without_small_copies(kept, board)
+        out[name] = tuple(kept)
+    return out
+
+
+def _without_small_copies(found: Sequence[BoardDetection], board: Board) -> list[BoardDetection]:
+    """Return the detections of an image without whole grids of the board's size that are seen much smaller than the
+    largest, which is named then."""
+    alike = [d for d in found if d.board_id is None and d.complete and (d.columns, d.rows) == board.size]
+    if len(alike) < 2:
+        return list(found)
+    length = np.array([float(np.linalg.norm(np.ptp(d.pixels, axis=0))) for d in alike])
+    small = [d for d, much in zip(alike, MIN_TIMES_LARGER * length <= length.max(), strict=True) if much]
+    kept = [d for d in found if all(d is not one for one in small)]
+    if len(small) + 1 < len(alike):
+        return kept
+    largest = alike[int(length.argmax())]
+    return [d.named(board.board_id) if d is largest else d for d in kept]
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,6 +99,18 @@ def test_parts_of_copies_of_the_board_are_used() -> None:
     assert left({str(k): [whole] * (1 + (k == 0)) + [part] for k in range(8)}) == [[63, 63], *[[63]] * 7]
 
 
+def test_a_picture_of_a_board_on_the_wall_is_not_the_board() -> None:
+    whole = grid(9, 7)
+    small = BoardDetection(None, 9, 7, whole.grid, 0.2 * whole.pixels, whole.sigma_px)
+    found = {str(k): [whole, small] if k == 0 else [whole] for k in range(8)}
+    first = without_lookalikes(found, STATED)["0"]
+    assert [d.board_id for d in first] == ["stated"] and np.array_equal(first[0].pixels, whole.pixels)
+    # One nearly as large may be a second board, and so may a small one that images often show.
+    near = BoardDetection(None, 9, 7, whole.grid, 0.7 * whole.pixels, whole.sigma_px)
+    assert left({**found, "0": [whole, near]})[0] == [63, 63]
+    assert left({str(k): [whole, small] for k in range(4)})[0] == [63, 63]
+
+
 @pytest.mark.parametrize("layout", ["regular", "asymmetric", "hexagonal"])
 @pytest.mark.parametrize("stagger", ["right", "left"])
 def test_a_part_of_a_grid_of_circles_keeps_its_stagger(layout: str, stagger: str) -> None:
