@@ -80,7 +80,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
         if not tags.look(k, images[k]):
             markers.look(k, images[k])
     # A tiled floor is a chessboard without marks in every image, but hardly of one size in most.
-    if tags.images or markers.images or not _in_most(plain):
+    if tags.seen or markers.images or not _in_most(plain):
         for k in sure:
             if not tags.look(k, images[k]):
                 markers.look(k, images[k])

@@ -31,6 +31,9 @@ MIN_MARKER_SIDE = 0.35
 MIN_MARKERS_READ = 3
 """Markers of one dictionary in an image whose numbers fit one board: one or two may be chance."""
 
+MIN_SHARE_FITTING = 0.5
+"""Of the markers read in all images, those that lie where the board has them: nearly all, or few by chance."""
+
 SURE_OF_KIND = 2
 """Images with markers after which only kinds seen before are looked for."""
 
@@ -142,6 +145,7 @@ def guessed_charuco(seen: MarkerSightings) -> list[Board]:
     columns = two_rows.most_common(1)[0][0] - 1 if two_rows else 0
     if columns < 2:
         return []
+    count = sum(len(numbers) for numbers, *_ in own)
     own = [_in_order(*markers, columns) for markers in own]
     first = _first_marker(own)
     last = max(int(numbers.max()) for numbers, *_ in own)
@@ -160,8 +164,9 @@ def guessed_charuco(seen: MarkerSightings) -> list[Board]:
             fitting = sum(_fitting(pattern, board, numbers, places) for numbers, places, _ in own)
             # Of boards that explain as many markers the smallest.
             found.append(((fitting, -rows), board))
-    most = max((rank for rank, _ in found), default=None)
-    return [board for rank, board in found if rank == most]
+    most = max((rank for rank, _ in found), default=(0, 0))
+    # What chance reads fits no board.
+    return [board for rank, board in found if rank == most and rank[0] >= MIN_SHARE_FITTING * count]
 
 
 def _in_order(numbers: IntArray, places: IntArray, side: float, columns: int) -> Markers:

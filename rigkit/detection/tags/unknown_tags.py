@@ -33,6 +33,9 @@ WIDEST_RATIO = 8.0
 MIN_TAGS_READ = 3
 """Tags of one family in a lattice: one may be chance among thousands of codes."""
 
+MIN_SHARE_COUNTED = 0.5
+"""Of the tags read in a lattice, those whose numbers count on from each other: nearly all, or hardly any by chance."""
+
 MAX_LONE_STEP = 3.0
 """From one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
 
@@ -42,6 +45,9 @@ OFF_TAG_PLACE = 0.2
 APRIL_TAGS = tuple((family, border) for family in TAG_FAMILIES for border in range(1, MAX_BORDER + 1))
 ARUCO_TAGS = tuple((dictionary, 1) for dictionary in DICTIONARIES if dictionary not in TAG_FAMILIES.values())
 """Families that may be there, with the modules of their borders."""
+
+Family: TypeAlias = tuple[str, int]
+"""Family and modules of the border."""
 
 Kind: TypeAlias = tuple[str, int, bool]
 """Family, modules of the border, whether tags stand alone."""
@@ -91,11 +97,9 @@ Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
 
 @dataclass(eq=False, slots=True)
 class TagSightings:
-    """The tags of all images: indices of the `images` that show some, and the tags as `seen`; `kinds` has the sum of
-    likenesses of each kind."""
+    """The tags of all images, as `seen`; `kinds` has the sum of likenesses of each kind."""
 
-    families: tuple[tuple[str, int], ...] = APRIL_TAGS
-    images: list[int] = field(default_factory=list)
+    families: tuple[Family, ...] = APRIL_TAGS
     kinds: Counter[Kind] = field(default_factory=Counter)
     seen: list[_SeenTags] = field(default_factory=list)
 
@@ -105,69 +109,73 @@ class TagSightings:
         corners, _ = find_corners(levels)
         lattices = build_lattices(corners, find_links(corners, levels[0], LENGTH_RATIO * WIDEST_RATIO))
         found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
-        if any(found):
-            self.images.append(index)
         return any(found) or self.look_alone(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         quads, squares = squares_of(lattice, dark=True)
-        best = _best_read(image, quads, self.families)
-        if best is None:
-            return False
-        total, (family, border), codes = best
+        return any(
+            self._counts(index, lattice.size, quads, squares, *read)
+            for read in _read_kinds(image, quads, self.families)
+        )
+
+    def _counts(
+        self, index: int, size: tuple[int, int], quads: FloatArray, squares: IntArray, family: Family, codes: TagCode
+    ) -> bool:
+        """Keep the tags of one family in a lattice, and say so, if their numbers are those of a board."""
         turn = int(np.bincount(codes.turns[codes.read], minlength=4).argmax())
         own = codes.read & (codes.turns == turn)
         # On a board every number stands once; what chance reads in squares that look alike is the same again and again.
         if np.count_nonzero(np.unique(codes.number[own], return_counts=True)[1] == 1) < MIN_TAGS_READ:
             return False
-        columns, rows = lattice.size
+        columns, rows = size
         cells = grid_turned(squares[own], (columns - 1, rows - 1), -turn)
         upright, places = np.roll(quads[own], -turn, axis=1), cells // 2
-        kind = (family, border, False)
-        self.kinds[kind] += total  # type: ignore[assignment]
-        self.seen.append(_SeenTags(index, kind, codes.number[own], places, _steps(upright, places)))
+        seen = _SeenTags(index, (*family, False), codes.number[own], places, _steps(upright, places))
+        counted = seen.counted()
+        # Small families read something in most squares, but do not count with it.
+        if counted is None or len(counted[2]) < max(MIN_TAGS_READ, MIN_SHARE_COUNTED * len(seen.numbers)):
+            return False
+        self._keep(seen, codes)
         return True
 
     def look_alone(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image that stand alone, without squares between their corners; say whether there are
         some."""
         quads = quadrilaterals(image)
-        best = _best_read(image, quads, self.families)
-        if best is None:
-            return False
-        total, (family, border), codes = best
+        return any(self._count_alone(index, quads, *read) for read in _read_kinds(image, quads, self.families))
+
+    def _count_alone(self, index: int, quads: FloatArray, family: Family, codes: TagCode) -> bool:
+        """Keep the lone tags of one family, and say so, if numbers of some beside each other are those of a board."""
         # The same tag is seen several times: at the outer and at the inner border.
         order = np.flatnonzero(codes.read)[np.argsort(-codes.likeness[codes.read], kind="stable")]
         own = order[np.unique(codes.number[order], return_index=True)[1]]
         upright = quads[own[:, None], (codes.turns[own, None] + np.arange(4)) % 4]
-        kind, shown = (family, border, True), False
+        shown = False
         for members, places in _beside_each_other(upright):
             steps = _steps(upright[members], places)
-            seen = _SeenTags(index, kind, codes.number[own[members]], places, steps)
+            seen = _SeenTags(index, (*family, True), codes.number[own[members]], places, steps)
             counted = seen.counted()
             # Chance reads codes, but does not count with them.
             if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
-                self.kinds[kind] += total  # type: ignore[assignment]
-                self.seen.append(seen)
+                self._keep(seen, codes)
                 shown = True
-        if shown:
-            self.images.append(index)
         return shown
 
+    def _keep(self, seen: _SeenTags, codes: TagCode) -> None:
+        self.kinds[seen.kind] += float(codes.likeness[codes.read].sum())  # type: ignore[assignment]
+        self.seen.append(seen)
 
-def _best_read(
-    image: GreyImage, quads: FloatArray, families: Sequence[tuple[str, int]]
-) -> tuple[float, tuple[str, int], TagCode] | None:
-    """Return the sum of likenesses, family and border, and codes of the kind of tags that quadrilaterals are most
-    like; None for none."""
-    best: tuple[float, tuple[str, int], TagCode] | None = None
+
+def _read_kinds(image: GreyImage, quads: FloatArray, families: Sequence[Family]) -> Iterator[tuple[Family, TagCode]]:
+    """Yield the families, with their borders, of which quadrilaterals may be tags, and what they are read as: those
+    first that they are most like."""
+    read = []
     for family, border in families:
         pattern = AprilGrid(1.0, family, border, numbering="opencv")
         codes = read_tags(image, quads, Codes.of(pattern, np.arange(marker_count(pattern.dictionary))))
-        total = float(codes.likeness[codes.read].sum())
-        if np.count_nonzero(codes.read) >= MIN_TAGS_READ and (best is None or total > best[0]):
-            best = total, (family, border), codes
-    return best
+        if np.count_nonzero(codes.read) >= MIN_TAGS_READ:
+            read.append(((family, border), codes))
+    yield from sorted(read, key=lambda one: -float(one[1].likeness[one[1].read].sum()))
 
 
 def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
@@ -263,6 +271,8 @@ def _board_of(cluster: Sequence[Counted], kind: Kind) -> Board | None:
         return None
     numbering = "opencv" if step > 0 else "kalibr"
     rows = (most - first) // columns + 1
+    if first + columns * rows > marker_count(TAG_FAMILIES.get(family, family)):
+        return None
     family = smallest_dictionary(family, first + columns * rows)
     pattern = AprilGrid(spacing, family, border, first, numbering, not alone)
     return Board("board", 2 * columns, 2 * rows, 1.0, 1.0, pattern=pattern)
