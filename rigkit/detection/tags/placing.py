@@ -22,6 +22,12 @@ AGREEING_TAGS = 0.4
 """Part of the squares of a lattice where tags would be in the place that tags give it, which are read as those tags: a
 code by chance stands alone, dirt and glare cover a few."""
 
+SURE_BITS = 100
+"""So many bits of tags that agree say it alone: of a blurred board few tags can be read."""
+
+MIN_SHARE_AGREEING = 0.8
+"""Of the tags that are read, those which agree then: by chance each would say something else."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TagBoard:
@@ -84,9 +90,9 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> tuple[int, in
     columns, rows = lattice.size
     every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
     own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
-    if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
-        return None
-    return votes, turn, shift
+    often = votes * bits >= MIN_BITS and votes >= AGREEING_TAGS * np.count_nonzero(own)
+    surely = votes * bits >= SURE_BITS and votes >= MIN_SHARE_AGREEING * len(sure)
+    return (votes, turn, shift) if often or surely else None
 
 
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
