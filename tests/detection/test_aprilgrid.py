@@ -135,6 +135,26 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     assert off.max() < 0.5
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_blurred_tags_are_read_together(turns: int, rng: np.random.Generator) -> None:
+    """Modules of 2.5 px under a blur of 2.5 px: hardly a tag is read by itself; together they have one place."""
+    image = np.rot90(facing(KALIBR, 25.0).render(optics=Optics(2.5), noise_levels=2.0, rng=rng), turns)
+    truth = facing(KALIBR, 25.0).truth()[0].pixels
+    height, width = image.shape if turns % 2 == 0 else image.shape[::-1]
+    for _ in range(turns):
+        truth, (height, width) = np.stack([truth[:, 1], width - 1.0 - truth[:, 0]], axis=1), (width, height)
+    (found,) = detect_boards(np.ascontiguousarray(image), [KALIBR])
+    assert found.board_id == "k" and len(found.grid) >= 78
+    off = found.pixels - truth[found.grid[:, 1] * KALIBR.columns + found.grid[:, 0]]
+    assert np.abs(off).max() < 1.0
+
+
+def test_blurred_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
+    image = facing(KALIBR, 25.0).render(optics=Optics(2.5), noise_levels=2.0, rng=rng)
+    others = replace(KALIBR, board_id="o", pattern=AprilGrid(0.3, first_tag=100))
+    assert not any(found.board_id for found in detect_boards(image, [others]))
+
+
 def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
     image = facing(KALIBR).render(noise_levels=2.0, rng=rng)
     others = [AprilGrid(0.3, first_tag=100), AprilGrid(0.3, "tag36h10")]

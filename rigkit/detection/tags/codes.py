@@ -25,6 +25,9 @@ MIN_CODE_CONTRAST = 1.5
 """Standard deviation of the modules' brightness, grey levels: less is paper, or a black square. Ink ten levels
 darker than paper makes 4."""
 
+MIN_SCATTER = 1e-6
+"""Correlations that scatter less are all the same: rounding."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Codes:
@@ -88,6 +91,16 @@ def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
     best = likeness.argmax(axis=1)
     most = np.where(spread < MIN_CODE_CONTRAST, 0.0, likeness[np.arange(len(quads)), best])
     return TagCode(codes.numbers[best], codes.turns[best], most)
+
+
+def excess_likeness(image: GreyImage, quads: FloatArray, codes: Codes) -> FloatArray:
+    """Return how much more each code is like a quadrilateral (N, 4, 2) than codes are on average, in their scatter: (N,
+    4 T) for each code of `codes`; 0 where there is nothing to read."""
+    bright, spread = read_modules(image, homographies(quads), codes.modules)
+    likeness = bright @ codes.patterns.T
+    excess = likeness - likeness.mean(axis=1, keepdims=True)
+    scatter = np.maximum(excess.std(axis=1, keepdims=True), MIN_SCATTER)
+    return np.asarray(np.where(spread[:, None] < MIN_CODE_CONTRAST, 0.0, excess / scatter))
 
 
 def homographies(quads: FloatArray) -> FloatArray:

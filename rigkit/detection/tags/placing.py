@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import Codes, read_tags
+from rigkit.detection.tags.codes import Codes, excess_likeness, read_tags
 
 MIN_BITS = 30
 """Bits, in all agreeing tags together, that say where a lattice lies: one tag of 36, two of 25 or 16."""
@@ -22,11 +23,15 @@ AGREEING_TAGS = 0.4
 """Part of the squares of a lattice where tags would be in the place that tags give it, which are read as those tags: a
 code by chance stands alone, dirt and glare cover a few."""
 
-SURE_BITS = 100
-"""So many bits of tags that agree say it alone: of a blurred board few tags can be read."""
+SURE_EXCESS = 6.0
+"""All tags of a lattice together are more like their codes than like others by so many times the scatter of what chance
+makes, normal for a sum of many: one in a billion, with hundreds of places to try."""
 
-MIN_SHARE_AGREEING = 0.8
-"""Of the tags that are read, those which agree then: by chance each would say something else."""
+AHEAD = 2.0
+"""So much more than of any other place."""
+
+MIN_TAGS_OF_PLACE = 4
+"""Fewer tags are read one by one, or not at all."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,21 +83,70 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
     return pixels, used
 
 
-def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> tuple[int, int, IntArray] | None:
-    """Return how many tags say it, quarter turns and shift (2,) that take the lattice to the board's grid."""
+Place = tuple[int, int, IntArray]
+"""How many tags say it, quarter turns and shift (2,) that take a lattice to the board's grid."""
+
+
+def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
+    """Return where a lattice lies on the board."""
     quads, cells = squares_of(lattice, dark=True)
     tags = read_tags(image, quads, board.codes)
     sure = np.flatnonzero(tags.read)
     if not len(sure):
-        return None
+        return _place_together(image, lattice, board)
     votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.corner_of(tags.number[sure]))
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
     columns, rows = lattice.size
     every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
     own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
-    often = votes * bits >= MIN_BITS and votes >= AGREEING_TAGS * np.count_nonzero(own)
-    surely = votes * bits >= SURE_BITS and votes >= MIN_SHARE_AGREEING * len(sure)
-    return (votes, turn, shift) if often or surely else None
+    if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
+        return _place_together(image, lattice, board)
+    return votes, turn, shift
+
+
+def _place_together(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
+    """Return where a lattice lies whose tags are too blurred to be read one by one: where all of them together are most
+    like the codes that the board has there."""
+    quads, cells = squares_of(lattice, dark=True)
+    if len(quads) < MIN_TAGS_OF_PLACE:
+        return None
+    excess = excess_likeness(image, quads, board.codes)
+    marked = excess.any(axis=1)
+    if np.count_nonzero(marked) < MIN_TAGS_OF_PLACE:
+        return None
+    cells, excess = cells[marked], excess[marked]
+    code_of = np.full(int(board.codes.numbers.max()) + 1, -1)
+    code_of[board.codes.numbers[::4]] = np.arange(0, len(board.codes.numbers), 4)
+    tall, wide = board.numbers.shape
+    columns, rows = lattice.size
+    found: list[tuple[FloatArray, IntArray, IntArray]] = []
+    for turn, odd in product(range(4), (0, 1)):
+        turned = grid_turned(cells, (columns - 1, rows - 1), turn)
+        # Tags stand in every second column and row.
+        own = turned[:, 0] % 2 == odd
+        if np.count_nonzero(own) < MIN_TAGS_OF_PLACE:
+            continue
+        parity = turned[own][0] % 2
+        tags = turned[own] // 2
+        low, high = tags.min(axis=0), tags.max(axis=0)
+        shifts = [np.arange(-b, n - a) for a, b, n in zip(low, high, (wide, tall), strict=True)]
+        shift = np.stack(np.meshgrid(*shifts), axis=-1).reshape(-1, 1, 2)
+        column, row = np.moveaxis(tags + shift, 2, 0)
+        inside = (column >= 0) & (column < wide) & (row >= 0) & (row < tall)
+        # Turned back by `turn`, the tag stands upright.
+        codes = code_of[board.numbers[np.where(inside, row, 0), np.where(inside, column, 0)]] + (-turn) % 4
+        total = np.where(inside, excess[own][np.arange(len(tags)), codes], 0.0).sum(axis=1)
+        count = inside.sum(axis=1)
+        score = np.where(count < MIN_TAGS_OF_PLACE, 0.0, total / np.sqrt(np.maximum(count, 1)))
+        move = np.insert(2 * shift[:, 0] - parity, 0, turn, axis=1)
+        found.append((score, count, move))
+    if not found:
+        return None
+    score, count, move = (np.concatenate(part) for part in zip(*found, strict=True))
+    best = int(score.argmax())
+    if score[best] < max(SURE_EXCESS, AHEAD + float(np.delete(score, best).max(initial=0.0))):
+        return None
+    return int(count[best]), int(move[best, 0]), move[best, 1:]
 
 
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
