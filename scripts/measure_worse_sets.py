@@ -1,0 +1,94 @@
+#!/usr/bin/env python3
+"""What becomes of whole sets of REAL images that are made worse: is the board still told, and the camera the same?
+
+    python scripts/measure_worse_sets.py MM=FOLDER ... [--only "noise 8" "jpeg 30" ...]
+
+Every image of a folder is made worse in the same way, and the folder calibrated as `rigkit calibrate FOLDER
+--square-mm MM` does it: nobody says which board it is. Both calibrations are of one camera and of the same pictures, so
+that they must differ by less than what `rigkit diff` predicts for pictures taken anew. Prints of each set and
+degradation the board, views used, camera model, held-out error, difference over the one predicted, and the verdict.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import cv2
+import numpy as np
+from compare_detection import eight_bit, images_of
+from detectors.degradations import degraded
+
+from rigkit.calibration.compare import CameraVerdict, compare_calibrations
+from rigkit.calibration.result import Calibration
+from rigkit.core.errors import RigkitError
+from rigkit.io.board_words import words_of_board
+from rigkit.io.images import read_image
+from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
+from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
+from rigkit.workflows.corners import Cache
+
+AS_IT_IS = "as it is"
+WORSE = ("noise 8", "gamma 1.8", "blur 2", "sharpened 1.2", "jpeg 30", "webcam 4", "motion 4", "inverted 1")
+"""Name and amount, as in `detectors.degradations`: what leaves pixels where they are."""
+
+
+def calibrated(folder: Path, square_mm: float) -> tuple[str, Calibration]:
+    """Return the board that a folder of images shows, in words, and the camera."""
+    options = CalibrateOptions(output=folder / "camera.json", cache=Cache.OFF)
+    result = calibrate_folders([folder], FolderOptions(square_mm=square_mm), options)
+    assert isinstance(result, SessionCalibration)
+    return " + ".join(map(words_of_board, result.session.boards)), result.calibration
+
+
+def rows(source: Path, square_mm: float, worse: list[str]) -> Iterator[str]:
+    """Yield a row of the table for every degradation of a set."""
+    images = {path.stem: eight_bit(read_image(path)) for path in images_of(source, None)}
+    first: Calibration | None = None
+    for how in (AS_IT_IS, *worse):
+        rng = np.random.default_rng(len(images))
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place) / "images"
+            folder.mkdir()
+            for name, grey in images.items():
+                kind, _, amount = how.partition(" ")
+                image = grey if how == AS_IT_IS else eight_bit(degraded(kind, float(amount), grey, rng)[0])
+                cv2.imwrite(str(folder / f"{name}.png"), image)
+            try:
+                words, own = calibrated(folder, square_mm)
+            except RigkitError as error:
+                yield f"{source.name} | {how} | {error}"
+                continue
+        heldout = "" if own.heldout_rms_px is None else f"{own.heldout_rms_px:.3f}"
+        line = f"{source.name} | {how} | {words} | {len(own.views)} | {own.camera.model} | {heldout}"
+        if how == AS_IT_IS:
+            first = own
+        elif first is not None:
+            compared = compare_calibrations(first, own)
+            same = "" if compared.verdict is CameraVerdict.SAME else f" {compared.verdict}"
+            line += f" | {compared.ratio:.2f}{same}"
+        yield line
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", nargs="+", metavar="MM=FOLDER")
+    parser.add_argument("--only", nargs="+", default=list(WORSE), metavar="NAME AMOUNT")
+    args = parser.parse_args()
+    print("set | made worse | board | views | model | held out, px | difference over predicted")
+    for item in args.sets:
+        square_mm, _, folder = item.partition("=")
+        for row in rows(Path(folder), float(square_mm), args.only):
+            print(row)
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
