@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 from kernels.reference.edge_model import PARAMETERS, _edge, collect, linearise, pattern_of
 
 from rigkit.detection.subpixel.edge_fit import fit_edges
-from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, Geometry
+from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, Geometry, tilted
 
 DERIVATIVE_REL = 0.01
 """Differences of a float32 model with steps of 1e-3 are good to 1e-4 / 1e-3 grey levels of 60."""
@@ -254,3 +255,17 @@ def test_a_covered_corner_shows_as_noise(rng: np.random.Generator) -> None:
     others = np.array([0, 1, 3, 4])
     assert np.abs(fit.noise[others] - 1.0).max() < 0.3
     assert fit.noise[2] > 12.0
+
+
+def test_neighbours_that_fell_together_turn_no_line() -> None:
+    """A tiny board: two corners in one place leave a cell without a direction, and no warning."""
+    n = 9
+    sides = np.tile(np.array([[10.0, 0.0], [0.0, 10.0]]), (n, 1, 1))
+    sides[4, 0] = 0.0
+    gaps = np.full((n, 2, 2), 10.0)
+    geometry = Geometry(sides, np.zeros((n, 2)), gaps, np.zeros((n, 2, 2), np.bool_))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        turned = tilted(geometry, np.ones((3, 3), np.bool_))
+    assert turned.tilts is not None and (turned.tilts == 0.0).all()
+    assert np.isfinite(np.delete(turned.gaps, 4, axis=0)).all()

@@ -94,14 +94,15 @@ def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
     turning as they do on the other side.
     """
     sides = np.full((cells.shape[0] + 2, cells.shape[1] + 2, 2, 2), np.nan)
-    sides[1:-1, 1:-1][cells] = geometry.sides
     row, column = np.nonzero(cells)
-    own = geometry.sides / np.sqrt((geometry.sides**2).sum(axis=2, keepdims=True))
+    length = np.sqrt((geometry.sides**2).sum(axis=2, keepdims=True))
+    # Neighbours that fell together have no direction.
+    own = geometry.sides / np.where(length > 0.0, length, np.nan)
+    sides[1:-1, 1:-1][cells] = own
     tilts = np.empty(geometry.gaps.shape)
     for k, ((down, right), line) in enumerate(zip(LINES_BESIDE, (0, 0, 1, 1), strict=True)):
         there, here = sides[row + 1 + down, column + 1 + right, line], own[:, line]
-        turn = (here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]) / np.sqrt((there**2).sum(axis=1))
-        tilts[:, line, k % 2] = turn
+        tilts[:, line, k % 2] = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
     tilts = np.where(np.isnan(tilts), -tilts[:, :, ::-1], tilts)
     tilts[np.isnan(tilts)] = 0.0
     # How far along line 1 and 2 the corner after, along row and column, lies.
