@@ -277,7 +277,7 @@ def length_costs(watched: Watched, task: Task) -> list[Goal]:
     """
     if len(watched.cameras) == 1:
         return [goal_of(watched.cameras[0], Reach(), task)]
-    found, unseen = [], None
+    layout, found, unseen = watched.layout, [], None
     for c in range(1, len(watched.cameras)):
         cameras, mounts = watched.cameras, watched.cam_from_rig
         try:
@@ -286,9 +286,9 @@ def length_costs(watched: Watched, task: Task) -> list[Goal]:
             unseen = error
             continue
         # The first camera is the rig's frame: its mount does not change.
-        lenses = np.r_[watched.lens(0), watched.lens(c)]
-        own, kept = np.r_[lenses, watched.mount(c)], np.r_[0 : len(lenses), len(lenses) + 6 : len(lenses) + 12]
-        weight = np.zeros((watched.size, watched.size))
+        lenses = np.r_[layout.cameras[0], layout.cameras[c]]
+        own, kept = np.r_[lenses, layout.mount(c)], np.r_[0 : len(lenses), len(lenses) + 6 : len(lenses) + 12]
+        weight = np.zeros((layout.count, layout.count))
         weight[np.ix_(own, own)] = goal.weight[np.ix_(kept, kept)]
         found.append(replace(goal, weight=weight))
     if not found and unseen is not None:

@@ -115,7 +115,7 @@ def _as_boards_tell(rig: Watched) -> FloatArray:
 def _corrected(rig: Watched, matches: Sequence[PairMatches]) -> Watched:
     """Return a rig as scenes correct it. They share their errors: together they count as one."""
     before = covariance_of(UNSURE**2 * rig.covariance)
-    change, now = np.zeros(rig.size), rig
+    change, now = np.zeros(rig.layout.count), rig
     for _ in range(CORRECTIONS):
         said = matches_say(now, matches)
         share = len(matches) * said.variance_px2

@@ -170,8 +170,10 @@ def test_what_a_lens_does_beyond_its_model_is_no_change() -> None:
     watched = watched_camera(known, "cam")
     check, changed = check_views(watched, same), check_views(watched, other)
     assert check.holds and not changed.holds
-    assert len(watched.of_models) == camera.parameters.size < watched.size
-    assert np.array_equal(np.delete(changed.step, watched.of_models), np.zeros(watched.size - len(watched.of_models)))
+    assert len(watched.of_models) == camera.parameters.size < watched.layout.count
+    assert np.array_equal(
+        np.delete(changed.step, watched.of_models), np.zeros(watched.layout.count - len(watched.of_models))
+    )
 
 
 def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:

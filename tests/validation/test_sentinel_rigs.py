@@ -134,8 +134,8 @@ def test_matches_that_say_nothing_are_told_from_those_that_say_little() -> None:
 def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Path) -> None:
     rig = _rig()
     far = FreshEvidence(
-        information=np.full((1, rig.size, rig.size), np.inf),
-        score=np.full((1, rig.size), np.inf),
+        information=np.full((1, rig.layout.count, rig.layout.count), np.inf),
+        score=np.full((1, rig.layout.count), np.inf),
         variance_px2=0.01,
         rms_px=50.0,
         expected_px=0.1,
@@ -156,9 +156,9 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
 def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     """The old rig measures points that the changed one sees."""
     watched, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
-    step = np.zeros(watched.size)
-    step[watched.lens(0)][:2] = 0.3
-    step[watched.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
+    step = np.zeros(watched.layout.count)
+    step[watched.layout.cameras[0]][:2] = 0.3
+    step[watched.layout.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
     now, (goal,) = watched.changed(step), length_costs(watched, task)
     rays, valid = watched.cameras[0].unproject(grid_pixels(watched.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
     points = measured_points(rays[valid], task, is_rig=True)[0]

@@ -55,11 +55,11 @@ class Cause:
 def causes_of(watched: Watched) -> list[Cause]:
     """Return what may have happened, the simplest first."""
     several = len(watched.cameras) > 1
-    lenses, mounts = [], []
+    layout, lenses, mounts = watched.layout, [], []
     for c, (name, camera) in enumerate(zip(watched.names, watched.cameras, strict=True)):
         own = name if several else None
-        whole = np.zeros((watched.size, 6))
-        whole[watched.lens(c)] = _lens_directions(camera)
+        whole = np.zeros((layout.count, 6))
+        whole[layout.cameras[c]] = _lens_directions(camera)
         units: tuple[str, ...] = ("%", *("px",) * 5)
         for kind, part in (
             ("focus", slice(0, 1)),
@@ -74,20 +74,20 @@ def causes_of(watched: Watched) -> list[Cause]:
             mounts.append(Cause("shift", own, turn[:, 3:], ("mm",) * 3))
             mounts.append(Cause("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
     if several:
-        scale = np.zeros((watched.size, 1))
+        scale = np.zeros((layout.count, 1))
         for c, pose in enumerate(watched.cam_from_rig[1:], start=1):
-            scale[watched.mount(c)][3:, 0] = 0.01 * pose.translation_mm
+            scale[layout.mount(c)][3:, 0] = 0.01 * pose.translation_mm
         mounts.append(Cause("scale", None, scale, ("%",)))
     return sorted([*lenses, *mounts], key=lambda cause: cause.directions.shape[1])
 
 
 def lens_goals(watched: Watched) -> list[Goal]:
     """Return for each camera the rms change of its projection, after the best rotation, over its image."""
-    out = []
-    for c, camera in enumerate(watched.cameras):
+    out, layout = [], watched.layout
+    for camera, own in zip(watched.cameras, layout.cameras, strict=True):
         goal = projection_goal(camera)
-        weight = np.zeros((watched.size, watched.size))
-        weight[watched.lens(c), watched.lens(c)] = goal.weight
+        weight = np.zeros((layout.count, layout.count))
+        weight[own, own] = goal.weight
         out.append(Goal(weight, goal.unit, goal.what))
     return out
 
@@ -134,19 +134,19 @@ def _lens_directions(camera: Camera) -> FloatArray:
 def _mount_directions(watched: Watched, c: int) -> FloatArray:
     """Return the change of theta (T, 6) where camera `c` turns by a degree about its own axes or is shifted by a
     millimetre along them: x in it becomes exp(w) x + v."""
-    out = np.zeros((watched.size, 6))
-    degree = np.radians(1.0)
+    layout, degree = watched.layout, np.radians(1.0)
+    out = np.zeros((layout.count, 6))
     if c > 0:
         # exp(w) (R x + t) + v: the turn swings t, too.
         pose = watched.cam_from_rig[c]
-        run = watched.mount(c)
+        run = layout.mount(c)
         out[run.start : run.start + 3, :3] = degree * np.eye(3)
         out[run.start + 3 : run.stop, :3] = -degree * skew(pose.translation_mm)
         out[run.start + 3 : run.stop, 3:] = np.eye(3)
         return out
     # The first is the frame: when it moves, all others move the other way.
     for k, pose in enumerate(watched.cam_from_rig[1:], start=1):
-        run = watched.mount(k)
+        run = layout.mount(k)
         out[run.start : run.start + 3, :3] = -degree * pose.rotation
         out[run.start + 3 : run.stop, 3:] = -pose.rotation
     return out

@@ -99,14 +99,15 @@ def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Sequen
 
 def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
     """Return what matches of a rig's cameras say of theta."""
-    n = watched.size
+    layout = watched.layout
+    n = layout.count
     information, scores, variances, disagreements = [], [], [], []
     squares, left_squares, count, parts = 0.0, 0.0, 0, 0
     for pair in matches:
         residual, jacobian, good = _linearised(watched, pair)
         if len(residual) == 0:
             raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
-        left, weight, sigma = _unexplained(residual, jacobian, watched.mount(pair.second))
+        left, weight, sigma = _unexplained(residual, jacobian, layout.mount(pair.second))
         by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
         np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
@@ -140,11 +141,12 @@ def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatA
     views = ((pair.first, pair.pixels1), (pair.second, pair.pixels2))
     usual = [_SeenRays.by(watched.cameras[c], pixels) for c, pixels in views]
     residual = _distances(watched, pair, usual)
-    jacobian = np.zeros((len(residual), watched.size))
+    layout = watched.layout
+    jacobian = np.zeros((len(residual), layout.count))
     for k in np.flatnonzero(reach > 0.0).tolist():
-        step = np.zeros(watched.size)
+        step = np.zeros(layout.count)
         step[k] = reach[k]
-        moved = [c for c, _ in views if watched.lens(c).start <= k < watched.lens(c).stop]
+        moved = [c for c, _ in views if layout.cameras[c].start <= k < layout.cameras[c].stop]
         ends = []
         for changed in (watched.changed(step), watched.changed(-step)):
             # Of a lens that stays, rays stay.

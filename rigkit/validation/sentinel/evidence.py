@@ -17,6 +17,7 @@ from rigkit.calibration.fit import inliers, sigma_of
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.poses import refine_poses
+from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
@@ -65,27 +66,17 @@ class Watched:
         agree better would do so by chance."""
         return max(self.sigma_px, MIN_SIGMA_PX) * max(self.overdispersion, 1.0)
 
-    def lens(self, c: int) -> slice:
-        """Return where the intrinsics of camera `c` stand in theta."""
-        first = sum(camera.parameters.size for camera in self.cameras[:c])
-        return slice(first, first + self.cameras[c].parameters.size)
-
-    def mount(self, c: int) -> slice:
-        """Return where the mount of camera `c` > 0 stands in theta."""
-        first = self.lens(len(self.cameras) - 1).stop + 6 * (c - 1)
-        return slice(first, first + 6)
-
     @property
-    def size(self) -> int:
-        """How many numbers theta has."""
-        return sum(camera.parameters.size for camera in self.cameras) + 6 * (len(self.cameras) - 1)
+    def layout(self) -> Layout:
+        """Where lenses and mounts stand in theta."""
+        return Layout.of_cameras(self.cameras)
 
     @property
     def of_models(self) -> IntArray:
         """Where in theta the parameters of the lenses' models and the mounts stand."""
-        amounts = np.zeros(self.size, dtype=bool)
-        for c, camera in enumerate(self.cameras):
-            own = self.lens(c)
+        layout = self.layout
+        amounts = np.zeros(layout.count, dtype=bool)
+        for camera, own in zip(self.cameras, layout.cameras, strict=True):
             amounts[own.start + lens_of(camera).parameters.size : own.stop] = True
         return np.flatnonzero(~amounts)
 
@@ -105,10 +96,15 @@ class Watched:
 
     def changed(self, change: FloatArray) -> Watched:
         """Return cameras and mounts after a change (T,) of theta."""
-        cameras = [c.with_parameters(c.parameters + change[self.lens(k)]) for k, c in enumerate(self.cameras)]
-        first, *others = self.cam_from_rig
-        mounts = (first, *(pose.moved(change[self.mount(k)]) for k, pose in enumerate(others, start=1)))
-        return replace(self, cameras=tuple(cameras), cam_from_rig=mounts)
+        layout = self.layout
+        cameras = [
+            c.with_parameters(c.parameters + change[own]) for c, own in zip(self.cameras, layout.cameras, strict=True)
+        ]
+        mounts = [
+            pose if own is None else pose.moved(change[own])
+            for pose, own in zip(self.cam_from_rig, layout.mounts, strict=True)
+        ]
+        return replace(self, cameras=tuple(cameras), cam_from_rig=tuple(mounts))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -148,12 +144,12 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
     found = _Placed.of(watched, views)
     for _ in range(POSE_ROUNDS):
         products = found.products(watched)
-        n = watched.size
+        n = watched.layout.count
         # Of a board nearly all of whose corners stray, too few are left for a pose: what they leave open stays.
         inverse = np.linalg.pinv(products[:, n : n + 6, n : n + 6], hermitian=True)
         step = (inverse @ products[:, n : n + 6, -1:])[..., 0]
         found = found.moved(np.asarray(step, dtype=np.float64))
-    information, score = reduced_by_cluster(found.products(watched), watched.size, found.frame)
+    information, score = reduced_by_cluster(found.products(watched), watched.layout.count, found.frame)
     squares, count, left_out = found.residual_squares(watched)
     sigma = watched.fresh_sigma_px
     return FreshEvidence(
@@ -182,7 +178,7 @@ def told_by(
     placed = _Placed(
         rotation, translation_mm, frames, observations, (frames,) * len(seen), tuple(o.weight for o in observations)
     )
-    return reduced_by_cluster(placed.products(watched), watched.size, frames)[0]
+    return reduced_by_cluster(placed.products(watched), watched.layout.count, frames)[0]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -237,7 +233,8 @@ class _Placed:
     def products(self, watched: Watched) -> FloatArray:
         """Return for each board in a frame the sums of the products of its rows, (G, T + 7, T + 7): derivatives by
         theta and by its pose in the rig, and the residual."""
-        n = watched.size
+        layout = watched.layout
+        n = layout.count
         out = np.zeros((len(self.frame), n + 7, n + 7))
         for c, seen in enumerate(self.observations):
             if seen is None:
@@ -245,13 +242,13 @@ class _Placed:
             own = view_products(seen, self.state(watched, c, seen), self.weight[c])
             p, turn = watched.cameras[c].parameters.size, watched.cam_from_rig[c].rotation
             follow = np.zeros((len(own), p + 7, n + 7))
-            follow[:, :p, watched.lens(c)] = np.eye(p)
+            follow[:, :p, layout.cameras[c]] = np.eye(p)
             follow[:, p : p + 3, n : n + 3] = follow[:, p + 3 : p + 6, n + 3 : n + 6] = turn
             follow[:, -1, -1] = 1.0
             if c > 0:
                 # A mount that turns by w swings the board's origin, R t away, with it.
                 lever = self.translation_mm[self.group[c]] @ turn.T
-                run = watched.mount(c).start
+                run = layout.mount(c).start
                 follow[:, p : p + 6, run : run + 6] = np.eye(6)
                 follow[:, p + 3 : p + 6, run : run + 3] = -skew(lever)
             np.add.at(out, self.group[c], np.swapaxes(follow, -1, -2) @ own @ follow)

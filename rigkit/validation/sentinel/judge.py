@@ -157,7 +157,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         if not _wild(evidence.rms_px, expected_px):
             raise
         chance = 0.0
-    step, covariance, change = np.zeros(watched.size), watched.covariance, None
+    step, covariance, change = np.zeros(watched.layout.count), watched.covariance, None
     fixed, after = watched, evidence
     if known:
         chance = _chance_of_any(whitened, known)
@@ -283,7 +283,8 @@ def _sizes_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsur
 
 def _turn_weight(watched: Watched, c: int) -> FloatArray:
     """Return what a turn of camera `c` in a change of theta moves, (T, T): see `turn_weight`."""
-    turn = watched.mount(c).start
-    out = np.zeros((watched.size, watched.size))
+    layout = watched.layout
+    turn = layout.mount(c).start
+    out = np.zeros((layout.count, layout.count))
     out[turn : turn + 3, turn : turn + 3] = turn_weight(watched.cameras[c])
     return out

@@ -170,7 +170,7 @@ def views_that_tell(
     ]
     evidence = FreshEvidence(
         information=frames.information[taken],
-        score=np.zeros((len(taken), watched.size)),
+        score=np.zeros((len(taken), watched.layout.count)),
         variance_px2=sigma**2,
         rms_px=float(np.sqrt(2.0) * sigma),
         expected_px=float(np.sqrt(2.0) * sigma),
