@@ -29,6 +29,8 @@ MIN_EIGENVALUE = -1e-6
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+GreyImage = NDArray[np.uint8] | NDArray[np.float32]
+"""Grey levels 0..255. Those of an 8-bit camera stay bytes: four times the memory costs as much time as the search."""
 Pixels = Annotated[FloatArray, "(..., 2) px, (u, v), (0, 0) the centre of the top-left pixel"]
 Points = Annotated[FloatArray, "(..., 3) mm"]
 Rays = Annotated[FloatArray, "(..., 3) unit"]

@@ -13,6 +13,7 @@ from typing import Any, Self, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.arrays import GreyImage
 from rigkit.kernels.declarations import SCALARS, Declaration, header
 
 STRUCTURES: dict[str, type[Struct]] = {}
@@ -24,7 +25,14 @@ NAMES_IN_SIZES: dict[str, Any] = dict(header().constants)
 EMPTY = ctypes.c_double()
 """What is passed for an empty array, which has no first value."""
 
+
 AnyStruct = TypeVar("AnyStruct", bound="Struct")
+
+
+def image_arguments(image: GreyImage) -> tuple[GreyImage, bool, int, int]:
+    """Return an image as kernels take it: its pixels, whether they are bytes, width and height."""
+    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
+    return grey, grey.dtype == np.uint8, grey.shape[1], grey.shape[0]
 
 
 def address(array: NDArray[Any]) -> int:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, image_arguments, structure
 from rigkit.kernels.declarations import header
 
 LAG, OUTCOMES = (header().constants[name] for name in ("LAG", "OUTCOMES"))
@@ -27,7 +26,7 @@ class BendRules(Struct):
 
 
 def fit_corners(
-    image: NDArray[np.uint8] | NDArray[np.float32],
+    image: GreyImage,
     pixels: FloatArray,
     sides: FloatArray,
     curvature: FloatArray,
@@ -45,14 +44,13 @@ def fit_corners(
 ) -> FloatArray:
     """Return the `OUTCOMES` of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
     library = kernels()
-    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
     parts = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, single, sign, blur, contrast)
     known = [np.ascontiguousarray(part, np.float64) for part in parts]
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(rules), np.float32)
-    height, width = grey.shape
     library.fit_edges(
-        *(grey, grey.dtype == np.uint8, width, height, len(pixels)),
+        *image_arguments(image),
+        len(pixels),
         *(*known, np.ascontiguousarray(ends, np.bool_), rules, scratch, out),
     )
     return out

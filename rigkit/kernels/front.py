@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
@@ -20,7 +20,6 @@ MOST_SUMMED = 256
 """Bytes whose sum fits 16 bits."""
 
 Image = NDArray[np.float32]
-Picture = NDArray[np.uint8] | NDArray[np.float32]
 
 
 @structure("ring_rules_t")
@@ -60,7 +59,7 @@ class _CornerArrays(Struct):
     """The corners that links are sought for."""
 
 
-def shrunk(image: Picture, factor: int) -> Image:
+def shrunk(image: GreyImage, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     height, width = image.shape
     bytewise = image.dtype == np.uint8 and factor <= MOST_SUMMED
@@ -72,7 +71,7 @@ def shrunk(image: Picture, factor: int) -> Image:
     return out
 
 
-def smoothed(image: Picture, kernel: Image) -> tuple[Image, Image]:
+def smoothed(image: GreyImage, kernel: Image) -> tuple[Image, Image]:
     """Return `image` smoothed with the symmetric `kernel` (5,), of multiples of 1/WHOLE, both ways, and every second of
     its pixels both ways."""
     height, width = image.shape

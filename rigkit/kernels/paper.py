@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, image_arguments, structure
 
 
 @structure("paper_rules_t")
@@ -16,7 +15,7 @@ class PaperRules(Struct):
 
 
 def find_paper(
-    image: NDArray[np.uint8] | NDArray[np.float32],
+    image: GreyImage,
     pixels: FloatArray,
     sides: FloatArray,
     gaps: FloatArray,
@@ -29,8 +28,6 @@ def find_paper(
 ) -> tuple[FloatArray, FloatArray]:
     """Return `paper` and `gaps`, (N, 2, 2) each, as `detection.subpixel.outer_squares.with_paper` sets them."""
     library, count = kernels(), len(pixels)
-    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
-    height, width = grey.shape
     before, after = (
         [np.ascontiguousarray(part, np.float64) for part in parts]
         for parts in ((pixels, sides, gaps), (contrast, blur, sign))
@@ -39,7 +36,8 @@ def find_paper(
     memory = np.empty(library.paper_memory(count), np.uint8)
     paper, out_gaps = np.empty((2, count, 2, 2))
     library.find_paper(
-        *(grey, grey.dtype == np.uint8, width, height, count),
+        *image_arguments(image),
+        count,
         *(*before, np.ascontiguousarray(ends, np.bool_), *after, np.ascontiguousarray(owner, np.int64)),
         *(rules, scratch, memory, near, paper, out_gaps),
     )

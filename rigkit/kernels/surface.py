@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, GreyImage
 from rigkit.kernels import kernels
+from rigkit.kernels.calls import image_arguments
 from rigkit.kernels.declarations import header
 
 SURFACE_DEGREE = header().constants["SURFACE_DEGREE"]
@@ -111,20 +111,16 @@ class Polynomials:
         return np.ascontiguousarray(wanted, np.float64), len(wanted), float(x), float(y), self.size, len(self.told)
 
 
-def read_modules(
-    image: NDArray[np.uint8] | NDArray[np.float32], maps: FloatArray, side: int
-) -> tuple[FloatArray, FloatArray]:
+def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
     """Return the brightness of the modules of N tags, of mean 0 and length 1, (N, side * side), and its standard
     deviation before, (N,).
 
     `maps` (N, 3, 3) take the unit square to each tag; brightness is bilinear at the middles of `side` x `side` modules,
     that of the border beyond it.
     """
-    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
     spread, bright = np.empty(len(maps)), np.empty((len(maps), side * side))
-    height, width = grey.shape
     kernels().read_modules(
-        *(grey, grey.dtype == np.uint8, width, height, np.ascontiguousarray(maps, np.float64), len(maps), side),
+        *(*image_arguments(image), np.ascontiguousarray(maps, np.float64), len(maps), side),
         *(bright, spread),
     )
     return bright, spread

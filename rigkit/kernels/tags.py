@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, image_arguments, structure
 from rigkit.kernels.declarations import header
 
 TAG_OUTCOMES, TAG_SIDE, TAG_BLOCK = (header().constants[name] for name in ("TAG_OUTCOMES", "TAG_SIDE", "TAG_BLOCK"))
@@ -19,7 +18,7 @@ class TagRules(Struct):
 
 
 def fit_tags(
-    image: NDArray[np.uint8] | NDArray[np.float32],
+    image: GreyImage,
     maps: FloatArray,
     centres: FloatArray,
     scales: FloatArray,
@@ -42,14 +41,14 @@ def fit_tags(
     blur, contrast : (N,) where to start.
     bend_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
     """
-    grey = np.ascontiguousarray(image, None if image.dtype == np.uint8 else np.float32)
     known = [np.ascontiguousarray(part, np.float64) for part in (maps, centres, scales)]
     starts = [np.ascontiguousarray(part, np.float64) for part in (blur, contrast, bend_sigma)]
     most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
-    height, width = grey.shape
     out = np.empty((len(maps), TAG_OUTCOMES))
     kernels().fit_tags(
-        *(grey, grey.dtype == np.uint8, width, height, len(maps), *known),
+        *image_arguments(image),
+        len(maps),
+        *known,
         *(np.ascontiguousarray(ink, np.bool_), ink.shape[1], np.ascontiguousarray(breaks, np.float64), reach),
         *(*starts, rules, most, np.empty((most, TAG_BLOCK)), out),
     )

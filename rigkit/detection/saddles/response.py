@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import GreyImage as GreyImage
 from rigkit.core.errors import InputError
 from rigkit.kernels import front
 
 FloatImage = NDArray[np.float32]
-
-GreyImage = NDArray[np.uint8] | NDArray[np.float32]
-"""Grey levels 0..255. Those of an 8-bit camera stay bytes: four times the memory costs as much time as the search."""
 
 BASE_PIXELS = 2.6e6
 """The finest level of the search has at most this many pixels; only the sub-pixel fit looks at larger images."""
