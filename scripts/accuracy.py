@@ -27,7 +27,7 @@ from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
-from rigkit.workflows.datasets import DatasetOptions, PairJob, load_cameras, over_pairs
+from rigkit.workflows.datasets import DatasetOptions, PairJob, over_pairs
 from rigkit.workflows.pairs import geometry_of, match_images
 from rigkit.workflows.paper import load_paper_tables
 
@@ -130,17 +130,15 @@ def measure(folder: Path, *, pairs: Sequence[str] = (), chain: str = "raw", jobs
     """Measure all pairs and both calibrations of datasets/lab-a against the truth under `folder`."""
     progress = progress_on_stderr()
     dataset = load_dataset(ROOT / "datasets" / "lab-a").select(pairs)
-    loaded = load_cameras(dataset, progress=progress)
-    cameras = {name: camera.camera for name, camera in loaded.known.items()}
     options = DatasetOptions(chain="rectified" if chain == "rectified" else "raw", jobs=jobs)
     work = partial(measure_pair, folder / "captures")
-    results, failures = over_pairs(work, dataset.pairs, loaded, options, what="pairs against truth", progress=progress)
+    results, failures, loaded = over_pairs(work, dataset, options, what="pairs against truth", progress=progress)
     if failures:
         raise failures[0].error
     lenses = {}
-    for name, camera in cameras.items():
+    for name, camera in loaded.known.items():
         truth = json.loads((folder / "calibration" / name / "truth.json").read_text())
-        lenses[name] = calibration_difference_px(camera, truth)
+        lenses[name] = calibration_difference_px(camera.camera, truth)
     return {"pairs": results, "calibration_px": lenses}
 
 

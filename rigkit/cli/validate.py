@@ -89,14 +89,14 @@ def _many(args: argparse.Namespace) -> int:
     """Validate several data sets, each in a folder of its own; print one table."""
     from dataclasses import replace
 
-    from rigkit.core.processes import available_cores
+    from rigkit.core.processes import process_count
     from rigkit.report.tables import tables_to_json, tables_to_text
     from rigkit.workflows.validate_many import validate_datasets
 
     if args.paper or args.own_solvers:
         raise InputError("--paper is for one data set at a time")
     common = dataset_options(args, "datasets")
-    jobs = args.jobs or available_cores()
+    jobs = process_count(args.jobs)
     progress = progress_on_stderr()
     done = validate_datasets(args.dataset, _options(args, common), jobs=jobs, cluster=args.cluster, progress=progress)
     # Sentences stand below the table, not in it.

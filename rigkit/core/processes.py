@@ -36,6 +36,13 @@ def available_cores() -> int:
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
+def process_count(jobs: int | None) -> int:
+    """Return how many processes `jobs` are: as many, or None: one a core. Raises InputError for fewer than one."""
+    if jobs is not None and jobs < 1:
+        raise InputError(f"--jobs {jobs}: at least one process is needed")
+    return jobs or available_cores()
+
+
 @contextmanager
 def _terminal_silent() -> Iterator[None]:
     """Let processes that start here leave Ctrl-C and a closed terminal to their parent: all of a group are told.

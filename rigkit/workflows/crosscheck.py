@@ -13,15 +13,7 @@ from rigkit.io.manifest import Dataset
 from rigkit.report.tables import table_files
 from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.workflows.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    load_cameras,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
 
 FILES = ("crosscheck.md", "crosscheck.json")
@@ -61,10 +53,7 @@ def crosscheck_dataset(
     """
     options = options or DatasetOptions()
     known = ready_dataset(dataset, options, reserved=FILES)
-    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-    reports, failures = over_pairs(
-        _crosscheck, known.pairs, cameras, options, what="cross-checking pairs", progress=progress
-    )
+    reports, failures, cameras = over_pairs(_crosscheck, known, options, what="cross-checking pairs", progress=progress)
     table = crosscheck_table(reports)
     files = {**cameras.files, **table_files([table], "crosscheck", "md", "json")}
     write_for(known, options, files)

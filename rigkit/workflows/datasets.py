@@ -12,7 +12,7 @@ import logging
 import os
 import re
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, Literal, TypeVar
@@ -23,7 +23,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError
-from rigkit.core.processes import available_cores, worker_pool
+from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
@@ -73,8 +73,7 @@ def ready_dataset(
     a pair's name that cannot be a folder beside the files called `reserved`, a folder that results cannot go to, and
     with `measured` that nothing was measured of any pair.
     """
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError(f"--jobs {options.jobs}: at least one process is needed")
+    process_count(options.jobs)
     known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     known = known.select(options.pairs)
     missing = []
@@ -228,18 +227,18 @@ class PairJob(Generic[Options]):
 
 def over_pairs(
     work: Callable[[PairJob[Options]], Result],
-    pairs: Sequence[Pair],
-    cameras: LoadedCameras,
+    dataset: Dataset,
     options: Options,
     *,
     what: str,
     progress: Progress = silent,
-) -> tuple[list[Result], tuple[PairFailure, ...]]:
-    """Return what `work` makes of every pair, in their order, and the pairs that came to nothing.
+) -> tuple[list[Result], tuple[PairFailure, ...], LoadedCameras]:
+    """Return what `work` makes of every pair, in their order, the pairs that came to nothing, and the cameras.
 
     Several processes work where that helps; `work` is a function of a module. A pair that cannot be done does not take
     the others with it; only if there is no result at all is the first pair's error raised.
     """
+    pairs, cameras = dataset.pairs, load_cameras(dataset, recalibrate=options.recalibrate, progress=progress)
     outcomes: dict[str, Result | RigkitError] = {}
     waiting: dict[str, PairJob[Options]] = {}
     for pair in pairs:
@@ -249,7 +248,7 @@ def over_pairs(
             waiting[pair.pair_id] = PairJob(pair, cameras, options)
         except RigkitError as error:
             outcomes[pair.pair_id] = error
-    count = min(len(waiting), options.jobs or available_cores())
+    count = min(len(waiting), process_count(options.jobs))
     progress(what, 0, len(waiting))
     with contextlib.ExitStack() as stack:
         attempt = functools.partial(_attempt, work)
@@ -264,7 +263,7 @@ def over_pairs(
         for failure in failures[1:]:
             _log.info(f"{failure}")
         raise failures[0].error
-    return [outcome for _, outcome in ordered if not isinstance(outcome, RigkitError)], failures
+    return [outcome for _, outcome in ordered if not isinstance(outcome, RigkitError)], failures, cameras
 
 
 def _attempt(work: Callable[[PairJob[Options]], Result], job: PairJob[Options]) -> Result | RigkitError:

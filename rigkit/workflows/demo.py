@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.core.errors import InputError
+from rigkit.core.processes import process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import load_dataset
 from rigkit.io.reading import usable_path
@@ -51,8 +52,7 @@ def run_demo(options: DemoOptions | None = None, *, progress: Progress = silent)
     options = options or DemoOptions()
     if options.seed < 0:
         raise InputError(f"demo: --seed {options.seed}: a number from 0 upwards is needed")
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError(f"--jobs {options.jobs}: at least one process is needed")
+    process_count(options.jobs)  # complaints before the work
     manifest = build_demo(usable_path(options.output), np.random.default_rng(options.seed), progress)
     _log.info(
         f"capture written to {options.output}: images, boards, {manifest.name}; truth.json, which rigkit does not read"

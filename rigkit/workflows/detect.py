@@ -17,7 +17,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import CheckFailed, InputError
 from rigkit.core.printing import brief, counted
-from rigkit.core.processes import available_cores, worker_pool
+from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
@@ -99,8 +99,7 @@ def detect_in_images(
         raise InputError(
             f"--min-corners {options.min_corners}: a chessboard of less than 3x3 corners cannot be recognised"
         )
-    if options.jobs is not None and options.jobs < 1:
-        raise InputError(f"--jobs {options.jobs}: at least one process is needed")
+    processes = process_count(options.jobs)
     boards = tuple(board_of_words(str(board)) for board in options.boards)
     given = [Path(path) for path in paths]
     videos, bad = _frames_of(list(filter(is_video, given)), boards, progress)
@@ -120,7 +119,7 @@ def detect_in_images(
     tasks = [
         _DetectJob(image, overlay, boards, camera, options) for image, overlay in zip(images, overlays, strict=True)
     ]
-    outcomes, doubtful = _over_images(tasks, options.jobs, progress)
+    outcomes, doubtful = _over_images(tasks, processes, progress)
     failures = bad | {name: outcome for name, outcome in outcomes.items() if isinstance(outcome, InputError)}
     found = {name: outcome for name, outcome in outcomes.items() if not isinstance(outcome, InputError)}
     if failures and not found:
@@ -190,11 +189,11 @@ Outcome: TypeAlias = tuple[BoardDetection, ...] | InputError
 
 
 def _over_images(
-    tasks: Sequence[_DetectJob], processes: int | None, progress: Progress
+    tasks: Sequence[_DetectJob], processes: int, progress: Progress
 ) -> tuple[dict[str, Outcome], dict[str, str]]:
     """Return the detections per image in their order, whatever the number of processes, and what is seen in images
     without any."""
-    jobs = min(processes or available_cores(), len(tasks))
+    jobs = min(processes, len(tasks))
     found: dict[str, Outcome] = {}
     doubtful: dict[str, str] = {}
 

@@ -26,15 +26,7 @@ from rigkit.validation.tables import (
     estimator_table,
     plane_table,
 )
-from rigkit.workflows.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    load_cameras,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.pairs import match_images
 from rigkit.workflows.provenance import software_facts
 
@@ -85,9 +77,8 @@ def validate_as_paper(
     options = options or PaperOptions()
     known = ready_dataset(dataset, options, measured=True)
     printed = printed_tables(known) or PaperTables()
-    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-    found, failures = over_pairs(
-        _repeat, known.pairs, cameras, options, what="repeating the paper on pairs", progress=progress
+    found, failures, cameras = over_pairs(
+        _repeat, known, options, what="repeating the paper on pairs", progress=progress
     )
     reports = tuple(report for of_pair in found for report in of_pair)
     tables = _tables(reports, printed, known.images)

@@ -14,15 +14,7 @@ from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.calibration_shifts import with_calibrations
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import pair_pictures
-from rigkit.workflows.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    load_cameras,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.pairs import match_images, reconstruct_on_planes, reconstruct_with, shifts_of
 
 
@@ -75,9 +67,8 @@ def reconstruct_dataset(
     """
     options = options or ReconstructOptions()
     known = ready_dataset(dataset, options)
-    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-    outcomes, failures = over_pairs(
-        _reconstruct, known.pairs, cameras, options, what="reconstructing pairs", progress=progress
+    outcomes, failures, cameras = over_pairs(
+        _reconstruct, known, options, what="reconstructing pairs", progress=progress
     )
     files: dict[str, str | bytes] = dict(cameras.files)
     for outcome in outcomes:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
+from rigkit.core.processes import process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.io.corner_cache import source_hash
 from rigkit.io.files import ensure_writable, write_atomic, write_together
@@ -70,8 +71,7 @@ def run_studies(
     Raises InputError before the work where a file cannot be read or written, or two studies have the same name.
     """
     options = options or StudyOptions()
-    if options.jobs < 1:
-        raise InputError(f"simulate: --jobs must be at least 1, got {options.jobs}")
+    process_count(options.jobs)  # complaints before the work
     studies = [load_study(path) for path in paths]
     if options.trials is not None:
         studies = [replace(study, trials=options.trials) for study in studies]

@@ -33,15 +33,7 @@ from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
-from rigkit.workflows.datasets import (
-    DatasetOptions,
-    PairFailure,
-    PairJob,
-    load_cameras,
-    over_pairs,
-    ready_dataset,
-    write_for,
-)
+from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
 from rigkit.workflows.pairs import (
     find_boards,
     geometry_of,
@@ -124,9 +116,8 @@ def validate_dataset(
     options = options or ValidateOptions()
     known = ready_dataset(dataset, options, RESERVED, measured=True)
     paper = printed_tables(known)
-    cameras = load_cameras(known, recalibrate=options.recalibrate, progress=progress)
-    pairs, failures = over_pairs(
-        _validate, known.pairs, cameras, options, what="reconstructing and validating pairs", progress=progress
+    pairs, failures, cameras = over_pairs(
+        _validate, known, options, what="reconstructing and validating pairs", progress=progress
     )
     compared = [pair.crosscheck for pair in pairs if pair.crosscheck is not None]
     passed = not failures and all(r.passed for pair in pairs for r in pair.reports) and all(r.passed for r in compared)
