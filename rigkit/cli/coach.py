@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.aim_arguments import add_reach_arguments, length_of, reach_of
 from rigkit.core.errors import ExitCode, InputError
 
 MAX_CAMERAS = 8
@@ -18,9 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--lens", type=float, default=70.0, metavar="DEG", help="rough field of view (default: 70)")
     parser.add_argument("--goal", type=float, default=0.1, metavar="PX", help="rms error to reach (default: 0.1)")
-    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
-    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
-    parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+    add_reach_arguments(parser)
     parser.add_argument("--length", type=float, metavar="MM", help="a length so long is to be measured,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance,")
     parser.add_argument("--goal-mm", type=float, metavar="MM", help="as well as this (standard error)")
@@ -48,8 +47,6 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.board_words import board_of_words
-    from rigkit.planning.candidates import Reach
-    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.coach import CoachOptions, run_coach
 
     if not 0.0 < args.goal < float("inf"):
@@ -61,21 +58,18 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--cameras {args.cameras}: 1 to {MAX_CAMERAS}")
     if args.goal_mm is not None and not 0.0 < args.goal_mm < float("inf"):
         raise InputError(f"--goal-mm {args.goal_mm}: it must be positive")
-    length = None
-    if args.goal_mm is not None:
-        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
     guide = GuideOptions(
         boards=tuple(board_of_words(words) for words in args.board),
         hfov_deg=args.lens,
         goal_px=args.goal,
         goal_mm=args.goal_mm,
-        reach=Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field),
+        reach=reach_of(args),
     )
     options = CoachOptions(
         folder=args.folder,
         boards=tuple(args.board),
         guide=guide,
-        length=length,
+        length=length_of(args, "coach"),
         cameras=args.cameras,
         watch=tuple(args.watch),
         video=tuple(args.video),

@@ -13,8 +13,12 @@ from rigkit.core.errors import printable
 from rigkit.core.progress import Progress
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
     from rigkit.core.arrays import FloatArray
     from rigkit.geometry.rigid3 import Rigid3
+    from rigkit.report.page_facts import PageFacts
 
 REDRAW_S = 0.1
 BAR_WIDTH = 24
@@ -50,6 +54,17 @@ def progress_on_stderr() -> Progress:
 def note(text: str) -> None:
     """Tell the person at the terminal: through the log, which goes to stderr; results go to stdout."""
     logging.getLogger("rigkit.cli").info("%s", printable(text))
+
+
+def note_written(paths: Iterable[Path]) -> None:
+    """Tell which files were written."""
+    for path in paths:
+        note(f"{path} written")
+
+
+def print_statement(facts: PageFacts) -> None:
+    """Print what a page states: its headline, and its sentences below."""
+    print("\n  ".join([facts.headline, *facts.sentences]))
 
 
 def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigma_mm: FloatArray) -> str:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rigkit.cli.aim_arguments import add_reach_arguments, length_of, reach_of
 from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
@@ -28,9 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")
-    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
-    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
-    parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+    add_reach_arguments(parser)
     parser.add_argument("-r", "--report", type=Path, metavar="FILE.html", help="write a page to look at")
     parser.add_argument("--force", action="store_true", help="replace an existing page")
     parser.add_argument("--json", action="store_true", help="print the result for programs")
@@ -43,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json
+    from rigkit.cli.console import note_written, print_json
+    from rigkit.core.printing import counted
     from rigkit.report.plan_page import plan_facts, plan_lead, plan_to_dict, plan_words
     from rigkit.report.tables import tables_to_text
 
@@ -57,10 +57,9 @@ def run(args: argparse.Namespace) -> int:
         if done.found:
             print(tables_to_text(done.found))
         elif args.lens is None:
-            more = "1 more picture" if len(plan.views) == 1 else f"{len(plan.views)} more pictures"
+            more = counted(len(plan.views), "more picture")
             print(f"{more} would bring {100.0 * plan.gain:.0f} %")
-    for path in done.written:
-        note(f"{path} written")
+    note_written(done.written)
     return ExitCode.WELL
 
 
@@ -98,22 +97,15 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
 
 
 def _options(args: argparse.Namespace, count: int) -> PlanOptions:
-    from rigkit.planning.candidates import Reach
-    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.plan import PlanOptions
 
-    if (args.length is None) != (args.distance is None):
-        raise InputError("plan: --length and --distance belong together")
     if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
         raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")
-    length = None
-    if args.length is not None:
-        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
     return PlanOptions(
         count=args.views or count,
         check=args.check,
-        length=length,
-        reach=Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field),
+        length=length_of(args, "plan"),
+        reach=reach_of(args),
         report=args.report,
         force=args.force,
     )

@@ -1,0 +1,37 @@
+"""Where boards can be held, and a length that is to be measured: arguments of `check`, `coach` and `plan`."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from rigkit.core.errors import InputError
+
+if TYPE_CHECKING:
+    from rigkit.planning.candidates import Reach
+    from rigkit.validation.certificate.contracts import Task
+
+
+def add_reach_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add where boards can be held."""
+    parser.add_argument("--near", type=float, default=0.0, metavar="MM", help="the board is not sharp nearer than this")
+    parser.add_argument("--far", type=float, default=float("inf"), metavar="MM", help="nor held farther than this")
+    parser.add_argument("--field", type=float, metavar="DEG", help="the lens sees no more than this full angle")
+
+
+def reach_of(args: argparse.Namespace) -> Reach:
+    """Return where boards can be held."""
+    from rigkit.planning.candidates import Reach
+
+    return Reach(nearest_mm=args.near, farthest_mm=args.far, field_deg=args.field)
+
+
+def length_of(args: argparse.Namespace, verb: str) -> Task | None:
+    """Return the length at a distance that is asked for, if one is; raises InputError for one without the other."""
+    from rigkit.validation.certificate.contracts import Quantity, Task
+
+    if (args.length is None) != (args.distance is None):
+        raise InputError(f"{verb}: --length and --distance belong together")
+    if args.length is None:
+        return None
+    return Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
