@@ -30,9 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json
+    from rigkit.cli.console import note_written, print_json, print_statement
     from rigkit.core.errors import ExitCode, InputError
-    from rigkit.report.certificate_page import basis, causes_table, certificate_facts
+    from rigkit.report.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.certify import CertifyOptions, certify_file
@@ -59,12 +59,9 @@ def run(args: argparse.Namespace) -> int:
     certificate, words = done.certificate, done.words
     if args.json:
         told = {"passed": words.passed, "statement": words.headline, "basis": basis(certificate)}
-        print_json(certificate.to_dict() | told | {"page": certificate_facts(certificate, args.limit).to_dict()})
+        print_json(certificate.to_dict() | told | {"page": words.to_dict()})
     else:
-        print(words.headline)
-        for sentence in words.sentences:
-            print(f"  {sentence}")
+        print_statement(words)
         print(tables_to_text([causes_table(certificate)]))
-    for path in done.written:
-        note(f"{path} written")
+    note_written(done.written)
     return ExitCode.CHECK_FAILED if words.passed is False else ExitCode.WELL

@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.core.errors import ExitCode, InputError
+from rigkit.cli.aim_arguments import length_of
+from rigkit.core.errors import ExitCode
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,19 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.cli.console import note, note_written, print_json, print_statement, progress_on_stderr
     from rigkit.io.board_words import board_files, board_of_words
     from rigkit.io.files import ensure_writable
     from rigkit.report.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
-    from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.check import CheckOptions, check_pictures
 
-    if (args.length is None) != (args.distance is None):
-        raise InputError("check: --length and --distance belong together")
-    length = None
-    if args.length is not None:
-        length = Task(quantity=Quantity.LENGTH, size_mm=args.length, distance_mm=args.distance)
+    length = length_of(args, "check")
     results = [path for path in (args.fix, args.report) if path is not None]
     ensure_writable(results, force=args.force, inputs=board_files(args.board))
     options = CheckOptions(
@@ -66,17 +62,14 @@ def run(args: argparse.Namespace) -> int:
         left_out = {"left_out": [list(entry) for entry in done.left_out], "unreadable": list(done.unreadable)}
         print_json(check_to_dict(check) | left_out)
     else:
-        print(done.words.headline)
-        for sentence in done.words.sentences:
-            print(f"  {sentence}")
+        print_statement(done.facts)
         if not check.holds:
             print(tables_to_text([check_table(check)]))
     for image, reason in done.left_out:
         note(f"left out: {image}: {reason}")
     for reason in done.unreadable:
         note(f"left out: {reason}")
-    for path in done.written:
-        note(f"{path} written")
+    note_written(done.written)
     if args.fix is not None and args.fix not in done.written:
         note(f"{args.fix} not written: {'nothing changed' if check.holds else 'no change explains the pictures'}")
     if not check.holds:

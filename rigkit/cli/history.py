@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from rigkit.cli.console import note, print_json
+    from rigkit.cli.console import note, note_written, print_json
     from rigkit.core.errors import InputError
     from rigkit.workflows.history import add_calibration, show_history
 
@@ -39,6 +39,5 @@ def run(args: argparse.Namespace) -> int:
             print(
                 printable(f"{entry.date} {entry.kind} of {entry.source}{heat}: p = {entry.chance:.3g}, {entry.verdict}")
             )
-    for path in written:
-        note(f"{path} written")
+    note_written(written)
     return ExitCode.WELL

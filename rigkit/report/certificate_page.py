@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,17 +31,8 @@ COVERED = 98.0
 LINE_CHARACTERS = 98
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateWords:
-    """What is stated: the headline, then sentences; `passed` against the limit, None where none was given."""
-
-    headline: str
-    sentences: tuple[str, ...]
-    passed: bool | None
-
-
-def in_words(certificate: Certificate, limit: float | None = None) -> CertificateWords:
-    """Return what a certificate states, against `limit` (in the task's unit) where one is given."""
+def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
+    """Return what a certificate states, against `limit` (in the task's unit) where one is given, and its table."""
     task, unit = certificate.task, certificate.task.unit
     what = WHAT[task.quantity].format(size=f"{task.size_mm:g}") + f", {task.distance_mm:g} mm away"
     percent = f"{100.0 * task.confidence:g} %"
@@ -59,7 +49,13 @@ def in_words(certificate: Certificate, limit: float | None = None) -> Certificat
         share = certificate.share_within(limit)
         sentences.insert(0, f"The limit of {limit:g} {unit} is kept in {100.0 * share:.0f} % of the view.")
     sentences += [finding.text[0].upper() + finding.text[1:] + "." for finding in certificate.findings]
-    return CertificateWords(headline, tuple(sentences), passed)
+    return PageFacts(
+        headline=headline,
+        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[passed],
+        passed=passed,
+        sentences=tuple(sentences),
+        tables=(causes_table(certificate),),
+    )
 
 
 def causes_table(certificate: Certificate) -> Table:
@@ -74,18 +70,6 @@ def causes_table(certificate: Certificate) -> Table:
         f"cause | median sigma [{unit}] .4 | sigma where worst [{unit}] .4 | part of the variance there [%] .1"
     )
     return Table("causes", "What the error is made of", heads, rows)
-
-
-def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
-    """Return what the certificate's page says."""
-    words = in_words(certificate, limit)
-    return PageFacts(
-        headline=words.headline,
-        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[words.passed],
-        passed=words.passed,
-        sentences=words.sentences,
-        tables=(causes_table(certificate),),
-    )
 
 
 def certificate_page(
@@ -105,10 +89,10 @@ def certificate_pdf(
     certificate: Certificate, title: str, provenance: Mapping[str, str], limit: float | None = None
 ) -> bytes:
     """Return the certificate as one sheet of A4 with room for a signature."""
-    words = in_words(certificate, limit)
-    verdict = {None: "", True: "WITHIN THE LIMIT. ", False: "BEYOND THE LIMIT. "}[words.passed]
+    said = certificate_facts(certificate, limit)
+    verdict = "" if said.passed is None else f"{said.badge.upper()}. "
     facts = [f"{name}: {fact}" for name, fact in {**basis(certificate), **provenance}.items()]
-    return sheet_pdf(certificate, title, [f"{verdict}{words.headline}.", *words.sentences], facts)
+    return sheet_pdf(certificate, title, [f"{verdict}{said.headline}.", *said.sentences], facts)
 
 
 def basis(certificate: Certificate) -> dict[str, str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import without_nan
+from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.goal import px_words
 from rigkit.report import svg
@@ -26,17 +27,9 @@ PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "ro
 STROKE = "#1f4e8c"
 
 
-@dataclass(frozen=True, slots=True)
-class CheckWords:
-    """What a check states: the headline, then sentences."""
-
-    headline: str
-    sentences: tuple[str, ...]
-
-
-def check_words(check: SentinelCheck) -> CheckWords:
-    """Return what a check states."""
-    frames = "1 fresh frame" if check.frames == 1 else f"{check.frames} fresh frames"
+def check_facts(check: SentinelCheck) -> PageFacts:
+    """Return what a check states, and its tables."""
+    frames = counted(check.frames, "fresh frame")
     p = f"p = {check.chance:.3g}"
     sentences = [
         f"Fresh points lie {check.rms_px:.3f} px rms from where the calibration has them ({check.corners} points in "
@@ -77,7 +70,13 @@ def check_words(check: SentinelCheck) -> CheckWords:
         sentences.append(_could_have_found(worst))
         if worst.chance < FOUND and len(check.watched.cameras) == 1:
             sentences.append("Which pictures would tell most: rigkit plan CALIBRATION --check")
-    return CheckWords(headline, tuple(sentences))
+    return PageFacts(
+        headline=headline,
+        badge="holds" if check.holds else "does not hold",
+        passed=check.holds,
+        sentences=tuple(sentences),
+        tables=(check_table(check), power_table(check.powers)),
+    )
 
 
 def _cost_words(check: SentinelCheck, change: Change) -> str:
@@ -159,11 +158,11 @@ def check_table(check: SentinelCheck) -> Table:
 
 def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
     """Return what a program needs to know."""
-    change = check.change
+    change, facts = check.change, check_facts(check)
     return {
         "holds": check.holds,
         "chance": check.chance,
-        "statement": check_words(check).headline,
+        "statement": facts.headline,
         "cause": None if change is None else change.cause.kind,
         "camera": None if change is None else change.cause.camera,
         "amounts": [] if change is None else change.amounts.tolist(),
@@ -172,20 +171,8 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
         "size_px": None if change is None else change.size_px,
         **{name: getattr(check, name) for name in ("cost", "cost_unit", "rms_px", "rms_fixed_px", "expected_px")},
         "powers": [without_nan(asdict(power)) for power in check.powers],
-        "page": check_facts(check).to_dict(),
+        "page": facts.to_dict(),
     }
-
-
-def check_facts(check: SentinelCheck) -> PageFacts:
-    """Return what the page of a check says."""
-    words = check_words(check)
-    return PageFacts(
-        headline=words.headline,
-        badge="holds" if check.holds else "does not hold",
-        passed=check.holds,
-        sentences=words.sentences,
-        tables=(check_table(check), power_table(check.powers)),
-    )
 
 
 def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) -> str:

@@ -100,8 +100,7 @@ def calibrate_session(
         files |= foreign_files(calibration, options.output, options.exports)
     if options.report is not None:
         files[options.report] = session_page(session, calibration, corners, files)
-    if files:
-        write_together(files, force=options.force)
+    write_together(files, force=options.force)
     return SessionCalibration(
         session=session, calibration=calibration, unreadable=corners.unreadable, written=tuple(files)
     )

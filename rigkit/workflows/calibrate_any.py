@@ -133,8 +133,7 @@ def calibrate_folders(
     told = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
     ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *told])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
-    if new:
-        write_together(dict(new), force=options.force)
+    write_together(dict(new), force=options.force)
     try:
         with _told_of(folders, wanted.path):
             return calibrate_session_file(wanted.path, options, progress=progress)

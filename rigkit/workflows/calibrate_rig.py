@@ -106,8 +106,7 @@ def calibrate_rig_session(
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
         files[options.report] = rig_page(session, rig, shown_cameras(rig), checks, corners, files)
-    if files:
-        write_together(files, force=options.force)
+    write_together(files, force=options.force)
     unreadable = {image: reason for one in corners.values() for image, reason in one.unreadable.items()}
     return RigSessionCalibration(
         session=session, rig=rig, checks=tuple(checks), unreadable=unreadable, written=tuple(files)

@@ -15,7 +15,8 @@ from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
-from rigkit.report.certificate_page import CertificateWords, certificate_page, certificate_pdf, in_words
+from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
+from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task, instrument_of_rig
 from rigkit.workflows.provenance import digest_line, software_facts
@@ -41,10 +42,10 @@ class CertifyOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CertifiedFile:
-    """What was certified: the bound over the image, what it states in words, and the files that were written."""
+    """What was certified: the bound over the image, what its page says, and the files that were written."""
 
     certificate: Certificate
-    words: CertificateWords
+    words: PageFacts
     written: tuple[Path, ...]
 
     __repr__ = brief
@@ -74,9 +75,9 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         files[options.report] = certificate_page(certificate, title, facts, options.limit)
     if options.pdf is not None:
         files[options.pdf] = certificate_pdf(certificate, title, facts, options.limit)
-    if files:
-        write_together(files, force=options.force)
-    return CertifiedFile(certificate=certificate, words=in_words(certificate, options.limit), written=tuple(files))
+    write_together(files, force=options.force)
+    words = certificate_facts(certificate, options.limit)
+    return CertifiedFile(certificate=certificate, words=words, written=tuple(files))
 
 
 def load_instrument(

@@ -29,7 +29,8 @@ from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal
-from rigkit.report.check_page import CheckWords, check_page, check_words
+from rigkit.report.check_page import check_facts, check_page
+from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
@@ -65,11 +66,11 @@ class CheckOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CheckedPictures:
-    """The verdict, what it says in words, images without a board by the reason, those that cannot be used at all (cut
+    """The verdict, what its page says, images without a board by the reason, those that cannot be used at all (cut
     off, of another size), and the files that were written."""
 
     check: SentinelCheck
-    words: CheckWords
+    facts: PageFacts
     left_out: tuple[tuple[str, str], ...]
     unreadable: tuple[str, ...]
     written: tuple[Path, ...]
@@ -115,17 +116,15 @@ def check_pictures(
         with about(source):
             views = _views(watched, source, frames, boards, left_out, unreadable, progress)
             check = check_views(watched, views, cost)
-    words = check_words(check)
     files = _files(source, check, options)
-    if files:
-        write_together(files, force=options.force)
+    write_together(files, force=options.force)
     if options.history is not None:
         place = as_seen_from(options.history, source)
         entry = HistoryEntry.of_check(check, place, digest=digest_of(source), temperature_c=options.temperature_c)
         add_entry(options.history, entry)
     written = (*files, *([options.history] if options.history is not None else []))
     return CheckedPictures(
-        check=check, words=words, left_out=tuple(left_out), unreadable=tuple(unreadable), written=written
+        check=check, facts=check_facts(check), left_out=tuple(left_out), unreadable=tuple(unreadable), written=written
     )
 
 

@@ -25,7 +25,7 @@ from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.report.check_page import check_page, check_words
+from rigkit.report.check_page import check_facts, check_page
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND
@@ -52,7 +52,7 @@ def test_unchanged_cameras_hold(calibration: Calibration) -> None:
     assert all(check.holds for check in checks)
     # P-values of one and the same calibration's error are all alike, but none is impossible.
     assert min(check.chance for check in checks) > 1e-3
-    assert "Still holds" in check_words(checks[0]).headline
+    assert "Still holds" in check_facts(checks[0]).headline
 
 
 @pytest.mark.parametrize(
@@ -111,13 +111,13 @@ def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibrat
         assert (power.found_from < power.size) == (power.chance > FOUND) == (power.frames == 3)
     # A narrow lens shows where its axis is, better than its focus.
     assert powers["principal point"].chance > FOUND > powers["focus"].chance
-    assert "would have been found with chance" in check_words(check).sentences[-2]
-    assert "rigkit plan CALIBRATION --check" in check_words(check).sentences[-1]
+    assert "would have been found with chance" in check_facts(check).sentences[-2]
+    assert "rigkit plan CALIBRATION --check" in check_facts(check).sentences[-1]
     # A calibration that is no surer finds no more with any number of pictures.
     vague = replace(calibration, covariance=1e4 * calibration.covariance)
     said = checked(vague, lens("reg"), np.random.default_rng(0))
     assert all(p.frames is None and p.chance < 0.5 for p in said.powers)
-    assert "the calibration is" in check_words(said).sentences[-2]
+    assert "the calibration is" in check_facts(said).sentences[-2]
     # One from many times as many pictures would, with as many fresh ones.
     unsure = replace(calibration, covariance=UNSURE * calibration.covariance)
     powers = {p.kind: p for p in checked(unsure, lens("reg"), np.random.default_rng(0)).powers}
@@ -130,7 +130,7 @@ def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: n
     other = lens("reg").with_parameters(lens("reg").parameters * [1.3, 1.05, 1.0, 1.0, 2.0, 0.2, 1.0, 1.0, 1.0])
     check = checked(calibration, other, rng)
     assert check.unexplained and not check.holds
-    assert "another camera" in " ".join(check_words(check).sentences)
+    assert "another camera" in " ".join(check_facts(check).sentences)
 
 
 def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
@@ -202,7 +202,7 @@ def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration
     much = lens("reg").with_parameters(usual + 6.0 * (changed_lens(several).parameters - usual))
     check = checked(calibration, much, np.random.default_rng(1))
     assert check.change is not None and check.change.cause.kind == "lens" and not check.holds
-    words = check_words(check)
+    words = check_facts(check)
     assert re.search(r"changed in several ways; [\d.]+ px, [\d.]+ mm at 1 m$", words.headline)
     assert re.search(r"\d+% of what is seen is explained by this alone: the ", words.sentences[1])
 

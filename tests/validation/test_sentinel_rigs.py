@@ -17,7 +17,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.history_file import HistoryEntry
 from rigkit.planning.candidates import Reach
-from rigkit.report.check_page import check_words
+from rigkit.report.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
@@ -79,7 +79,7 @@ def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random
     assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
     assert check.change.sigmas.max() < 0.01
     # A rig's file may come from anywhere.
-    assert "never held" in check_words(check).sentences[-1]
+    assert "never held" in check_facts(check).sentences[-1]
 
 
 def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generator) -> None:
@@ -146,7 +146,7 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
     )
     check = judge_evidence(rig, lambda _: far)
     assert check.unexplained and not check.holds and check.change is None
-    assert "nothing that moved explains it" in check_words(check).headline
+    assert "nothing that moved explains it" in check_facts(check).headline
     assert HistoryEntry.of_check(check, tmp_path).verdict == "nothing that moved explains it"
     # Where nothing is off, it is the calibration's numbers that are.
     with pytest.raises(DegenerateError, match="calibration's numbers"):
