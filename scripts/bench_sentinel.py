@@ -97,32 +97,36 @@ def fresh_rig_poses(lens: Lens, watched: Watched, rng: np.random.Generator) -> l
     ]
 
 
-def seen(camera: Camera, pose: Rigid3, name: str, noise_px: float, rng: np.random.Generator) -> BoardView | None:
-    pixels, valid = camera.project(pose.apply(BOARD.points()))
+def seen(
+    camera: Camera,
+    pose: Rigid3,
+    name: str,
+    noise_px: float,
+    rng: np.random.Generator,
+    *,
+    board: Board = BOARD,
+    least: int = 20,
+) -> BoardView | None:
+    """Return a noisy view of all corners that are on the image; None of fewer than `least`."""
+    pixels, valid = camera.project(pose.apply(board.points()))
     valid &= camera.on_image(pixels)
-    if valid.sum() < 20:
+    if valid.sum() < least:
         return None
     noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
     noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
-    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), noise_px))
+    return BoardView(name, board, board.grid()[valid], noisy, np.full(len(noisy), noise_px))
 
 
-def views_on(
-    camera: Camera, poses: Sequence[Rigid3], board: Board, noise_px: float, rng: np.random.Generator
+def views_of(
+    camera: Camera,
+    poses: Sequence[Rigid3],
+    noise_px: float,
+    rng: np.random.Generator,
+    *,
+    board: Board = BOARD,
+    least: int = 20,
 ) -> list[BoardView]:
-    """Return noisy views of all corners that are on the image."""
-    out = []
-    for k, pose in enumerate(poses):
-        pixels, valid = camera.project(pose.apply(board.points()))
-        valid &= camera.on_image(pixels)
-        noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
-        noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
-        out.append(BoardView(f"{k:02d}", board, board.grid()[valid], noisy, np.full(len(noisy), noise_px)))
-    return out
-
-
-def views_of(camera: Camera, poses: Sequence[Rigid3], noise_px: float, rng: np.random.Generator) -> list[BoardView]:
-    views = [seen(camera, pose, f"{k:02d}", noise_px, rng) for k, pose in enumerate(poses)]
+    views = [seen(camera, p, f"{k:02d}", noise_px, rng, board=board, least=least) for k, p in enumerate(poses)]
     return [view for view in views if view is not None]
 
 
@@ -198,7 +202,10 @@ def departing(name: str, seeds: int, noise_px: float) -> None:
         longer = model.with_parameters(model.parameters * np.where(np.arange(model.parameters.size) < 2, LONGER, 1.0))
         changed = DisplacedCamera(size, np.append(longer.parameters, amounts), longer, camera.modes)
         poses = [Rigid3(rotations[k], shifts[k]) for k in right]
-        fresh = {"nothing": [views[k] for k in right], "focus": views_on(changed, poses, views[0].board, noise_px, rng)}
+        fresh = {
+            "nothing": [views[k] for k in right],
+            "focus": views_of(changed, poses, noise_px, rng, board=views[0].board, least=0),
+        }
         for what, own in fresh.items():
             for beyond in (False, True):
                 watched = watched_camera(known, "camera", beyond_model=beyond)

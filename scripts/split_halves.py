@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 from honesty.twins import twin
+from truth.cameras import published_corners
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import drawn_errors, reduced_by_cluster
@@ -109,26 +110,18 @@ OTHERS = [
 
 
 WITHIN_95 = 1.96
+PUBLISHED_SIZE_PX = (1280, 800)
+"""Of the images of published corners."""
 DRAWS = 4000
 """Sessions drawn anew, for the scatter of a ratio."""
 ASKED_IMAGES, POWER_DRAWS = 20, 20
 """Images a side with which a touched lens is asked to be found, and pairs of such sessions drawn."""
 
 
-def published_corners(path: Path, board: Board) -> tuple[list[BoardView], tuple[int, int]]:
-    """Return the view of a file of published corners (*.orpc) and the image's size, 1280x800 px."""
-    lines = path.read_text().splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith("encoding")) + 1
-    table = np.array([[float(x) for x in line.split(",")] for line in lines[start:] if line.strip()])
-    row, column = np.divmod(table[:, 1].astype(np.int64), board.columns)
-    view = BoardView(path.name, board, np.stack([column, row], -1), table[:, 3:5], np.full(len(table), 0.1))
-    return [view], (1280, 800)
-
-
 def views_of(path: Path, board: Board, cache: Path) -> tuple[list[BoardView], tuple[int, int]]:
     """Return what an image shows and its size, from the images or from the cache."""
     if path.suffix == ".orpc":
-        return published_corners(path, board)
+        return [published_corners(path, board)], PUBLISHED_SIZE_PX
     digest = hashlib.sha256(path.read_bytes() + repr(board).encode()).hexdigest()[:20]
     kept = cache / f"{digest}.pickle"
     if not kept.is_file():

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.calibration_scenes import lens, random_views
+from helpers.calibration_scenes import lens, noisy_view, random_views
 from helpers.stereo_pictures import BOARD as PRINTED
 from helpers.stereo_pictures import CAMERA as LENS
 
@@ -123,9 +123,7 @@ def test_a_second_axis_counts_by_how_certain_it_makes_the_place(rng: np.random.G
             place = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(600.0, 800.0)])
             pose = Rigid3(turn, place - turn @ middle)
             board = random_views(camera, 1, rng, reach_deg=10.0, noise_px=0.1)[0][0].board
-            pixels, _ = camera.project(pose.apply(board.points()))
-            noisy = pixels + 0.1 * rng.normal(size=pixels.shape)
-            views.append(BoardView(f"{k}.png", board, board.grid(), noisy, np.full(len(noisy), 0.1)))
+            views.append(noisy_view(camera, pose, f"{k}.png", rng, 0.1, board=board))
             true = X.inverse() @ pose @ Z.inverse()
             told.append(Rigid3(exp_so3(rng.normal(0.0, ROBOT_TURN_RAD, 3)) @ true.rotation, true.translation_mm))
         result = hand_eye(camera, views, told)

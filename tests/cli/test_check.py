@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.calibration_scenes import noisy_view
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
@@ -17,7 +18,6 @@ from rigkit.cameras.brown import Brown
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
@@ -58,11 +58,7 @@ def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: P
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A calibration, fresh pictures of the same camera, and of one whose focus changed."""
     root, rng = tmp_path_factory.mktemp("check"), np.random.default_rng(6)
-    views = []
-    for k, pose in enumerate(_poses(14)):
-        pixels, _ = CAMERA.project(pose.apply(BOARD.points()))
-        noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
-        views.append(BoardView(f"{k}", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX)))
+    views = [noisy_view(CAMERA, pose, f"{k}", rng, NOISE_PX, board=BOARD) for k, pose in enumerate(_poses(14))]
     save_calibration(root / "cam.json", calibrate(views, CAMERA.size_px, model="brown", degree=5, board="flat"))
     _pictures(root / "same", CAMERA, rng)
     moved = CAMERA.parameters.copy()

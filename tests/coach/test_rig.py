@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
+from helpers.calibration_scenes import noisy_view
 
 from rigkit.calibration.result import Calibration
 from rigkit.coach.coach import Coach, Take
@@ -17,7 +18,6 @@ from rigkit.coach.guide import GuideOptions
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import SHARED_FRAMES, RigGuide
 from rigkit.coach.sources import watched_frames
-from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
@@ -71,12 +71,9 @@ def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Genera
 
 def glance(pose: Rigid3, rng: np.random.Generator, name: str) -> Glance:
     """What a camera sees of a board held still, without a picture."""
-    pixels, valid = CAMERA.project(pose.apply(BOARD.points()))
-    valid &= CAMERA.on_image(pixels)
-    if valid.sum() < 30:
+    view = noisy_view(CAMERA, pose, name, rng, NOISE_PX, board=BOARD)
+    if len(view.grid) < 30:
         return Glance(size_px=SIZE, view=None)
-    noisy = np.clip(pixels[valid] + NOISE_PX * rng.standard_normal((int(valid.sum()), 2)), -0.5, np.array(SIZE) - 0.5)
-    view = BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), NOISE_PX))
     return Glance(size_px=SIZE, view=view, edge_px=2.0, moved_px=0.0, contrast=150.0)
 
 

@@ -13,6 +13,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 
 SIZE = (1624, 1240)
@@ -79,6 +80,23 @@ def random_views(
         translations.append(translation)
     assert len(views) == count, "the board does not fit into that part of the view"
     return views, np.array(rotations), np.array(translations)
+
+
+def noisy_view(
+    camera: Camera,
+    cam_from_board: Rigid3,
+    name: str,
+    rng: np.random.Generator,
+    noise_px: float,
+    *,
+    board: Board = BOARD,
+) -> BoardView:
+    """Return the view of a board in one pose: its corners that are on the image."""
+    pixels, valid = camera.project(cam_from_board.apply(board.points()))
+    valid &= camera.on_image(pixels)
+    noisy = pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2))
+    noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
+    return BoardView(name, board, board.grid()[valid], noisy, np.full(len(noisy), noise_px))
 
 
 def with_outliers(views: list[BoardView], share: float, size_px: float, rng: np.random.Generator) -> list[BoardView]:

@@ -7,10 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from helpers.calibration_scenes import BOARD, lens
+from helpers.calibration_scenes import BOARD, lens, noisy_view
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
-from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
@@ -34,16 +33,9 @@ def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3
     return [view.cam_from_board for view in plan.views]
 
 
-def view_of(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator, noise_px: float = NOISE_PX) -> BoardView:
-    pixels, valid = camera.project(pose.apply(BOARD.points()))
-    valid &= camera.on_image(pixels)
-    noisy = np.clip(pixels[valid] + noise_px * rng.standard_normal((int(valid.sum()), 2)), 0.0, None)
-    return BoardView(name, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), noise_px))
-
-
 def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
     poses = poses_held("reg", 3)
-    views = [FreshView(f"{k}", 0, view_of(camera, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
+    views = [FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
     return check_views(watched_camera(calibration, "cam"), views)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.data import shared_data
+from truth.cameras import published_corners
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.observations import Observations
@@ -81,15 +82,7 @@ def _true_rays(pixels: FloatArray, truth: dict[str, list[float]]) -> FloatArray:
 def plane_views(part: str) -> list[BoardView]:
     folder = shared_data(f"real/ov-plane/corners/{part}")
     board = Board("ov", 22, 22, 7.5, 7.5)
-    views = []
-    for path in sorted(folder.glob("*.orpc")):
-        lines = path.read_text().splitlines()
-        start = next(i for i, line in enumerate(lines) if line.startswith("encoding")) + 1
-        table = np.array([[float(x) for x in line.split(",")] for line in lines[start:] if line.strip()])
-        row, column = np.divmod(table[:, 1].astype(np.int64), 22)
-        sigma = np.full(len(table), 0.1)
-        views.append(BoardView(path.name, board, np.stack([column, row], -1), table[:, 3:5], sigma))
-    return views
+    return [published_corners(path, board) for path in sorted(folder.glob("*.orpc"))]
 
 
 @pytest.mark.parametrize(("shape", "limit"), [("warp", PLANE_WARP_PX), ("released", PLANE_RELEASED_PX)])

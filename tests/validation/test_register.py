@@ -11,22 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import lens
-from helpers.sentinel_scenes import checked, poses_held, view_of
+from helpers.sentinel_scenes import checked
 
-from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import save_calibration
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, load_history
 from rigkit.report.history_page import drift_svg, history_facts, history_page
 from rigkit.workflows.history import add_calibration, show_history
-
-
-@pytest.fixture(scope="module")
-def calibration() -> Calibration:
-    camera, rng = lens("reg"), np.random.default_rng(2)
-    views = [view_of(camera, pose, f"{k}", rng) for k, pose in enumerate(poses_held("reg", 14))]
-    return calibrate(views, camera.size_px, model="brown", degree=5, board="flat")
 
 
 def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Path) -> None:

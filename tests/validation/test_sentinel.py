@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import REACH_DEG, lens, random_views
-from helpers.sentinel_scenes import NOISE_PX, changed_lens, checked, poses_held, view_of
+from helpers.calibration_scenes import REACH_DEG, lens, noisy_view, random_views
+from helpers.sentinel_scenes import NOISE_PX, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
@@ -38,13 +37,6 @@ POWER_DRAWS, POWER_NOISE_PX = 30, 0.04
 UNSURE = 16.0
 POWER_WITHIN = 0.27
 """Three standard deviations of the share of 30 that is found one time in two."""
-
-
-@pytest.fixture(scope="module")
-def calibration() -> Calibration:
-    camera, rng = lens("reg"), np.random.default_rng(2)
-    views = [view_of(camera, pose, f"{k}", rng) for k, pose in enumerate(poses_held("reg", 14))]
-    return calibrate(views, camera.size_px, model="brown", degree=5, board="flat")
 
 
 def test_unchanged_cameras_hold(calibration: Calibration) -> None:
@@ -85,13 +77,13 @@ def test_changes_are_found_as_often_as_the_check_says() -> None:
     focus = camera.parameters * [1, 1, 0, 0, 0, 0, 0, 0, 0]
     for seed in range(POWER_DRAWS):
         rng = np.random.default_rng(seed)
-        views = [view_of(camera, pose, f"{k}", rng, POWER_NOISE_PX) for k, pose in enumerate(poses)]
+        views = [noisy_view(camera, pose, f"{k}", rng, POWER_NOISE_PX) for k, pose in enumerate(poses)]
         known = calibrate(views, camera.size_px, model="brown", degree=5, board="flat", folds=0)
         changed = camera.with_parameters(
             camera.parameters + focus * 0.15 / np.sqrt(focus @ projection_goal(camera).weight @ focus)
         )
         seen = [
-            FreshView(f"{k}", 0, view_of(changed, pose, f"{k}", rng, POWER_NOISE_PX)) for k, pose in enumerate(fresh)
+            FreshView(f"{k}", 0, noisy_view(changed, pose, f"{k}", rng, POWER_NOISE_PX)) for k, pose in enumerate(fresh)
         ]
         check = check_views(watched_camera(known, "cam"), seen)
         (power,) = (p for p in check.powers if p.kind == "focus")
@@ -136,8 +128,8 @@ def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: n
 def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
     """Such as of a patterned box that passed for a part of the board: it leaves no pose to solve for."""
     camera, poses = lens("reg"), poses_held("reg", 4)
-    views = [view_of(camera, pose, f"{k}", rng) for k, pose in enumerate(poses)]
-    box = view_of(camera, poses[0], "box", rng)
+    views = [noisy_view(camera, pose, f"{k}", rng, NOISE_PX) for k, pose in enumerate(poses)]
+    box = noisy_view(camera, poses[0], "box", rng, NOISE_PX)
     box = replace(box, pixels=np.clip(box.pixels + 12.0 * rng.standard_normal(box.pixels.shape), 0.0, [1623.0, 1239.0]))
     watched = watched_camera(calibration, "cam")
     alone = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate(views)])
@@ -165,7 +157,7 @@ def test_what_a_lens_does_beyond_its_model_is_no_change() -> None:
     same = [FreshView(f"{k}", 0, views[k]) for k in right]
     longer = beyond(camera.with_parameters(camera.parameters * [LONGER, LONGER, 1, 1, 1, 1, 1, 1]))
     poses = [Rigid3(rotations[k], translations[k]) for k in right]
-    other = [FreshView(f"{k}", 0, view_of(longer, pose, f"{k}", rng)) for k, pose in enumerate(poses)]
+    other = [FreshView(f"{k}", 0, noisy_view(longer, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
     assert not check_views(watched_camera(known, "cam", beyond_model=False), same).holds
     watched = watched_camera(known, "cam")
     check, changed = check_views(watched, same), check_views(watched, other)
@@ -230,9 +222,7 @@ def test_a_declared_board_of_another_size_is_accepted(calibration: Calibration, 
     known = Knowledge.guessed(camera, CornerError(NOISE_PX))
     views = []
     for k, proposal in enumerate(plan_views(known, [larger], projection_goal(camera), 3).views):
-        pixels, _ = camera.project(proposal.cam_from_board.apply(larger.points()))
-        noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
-        view = BoardView(f"{k}", larger, larger.grid(), noisy, np.full(len(noisy), NOISE_PX))
+        view = noisy_view(camera, proposal.cam_from_board, f"{k}", rng, NOISE_PX, board=larger)
         views.append(FreshView(f"{k}", 0, view))
     assert check_views(watched_camera(calibration, "cam"), views).holds
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import lens
-from helpers.sentinel_scenes import NOISE_PX, poses_held, view_of
+from helpers.calibration_scenes import lens, noisy_view
+from helpers.sentinel_scenes import NOISE_PX, poses_held
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -52,8 +52,8 @@ NEAR = Reach(nearest_mm=300.0)
 def _rig_check(pose: Rigid3, second: Camera, rng: np.random.Generator) -> SentinelCheck:
     rig, views = _rig(), []
     for k, held in enumerate(poses_held("wide", 3, NEAR)):
-        views.append(FreshView(f"{k}", 0, view_of(rig.cameras[0], held, f"{k}", rng)))
-        views.append(FreshView(f"{k}", 1, view_of(second, pose @ held, f"{k}", rng)))
+        views.append(FreshView(f"{k}", 0, noisy_view(rig.cameras[0], held, f"{k}", rng, NOISE_PX)))
+        views.append(FreshView(f"{k}", 1, noisy_view(second, pose @ held, f"{k}", rng, NOISE_PX)))
     return check_views(rig, views)
 
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import BOARD, lens
+from helpers.calibration_scenes import BOARD, lens, noisy_view
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
@@ -34,13 +34,9 @@ PROMISED_WITHIN = 0.01
 
 
 def _views(plan: Plan, rng: np.random.Generator) -> list[BoardView]:
-    camera, out = lens("wide"), []
-    for k, view in enumerate(plan.views):
-        pixels, valid = camera.project(view.cam_from_board.apply(BOARD.points()))
-        assert valid.all() and camera.on_image(pixels).all()
-        noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
-        out.append(BoardView(f"{k}", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX)))
-    return out
+    views = [noisy_view(lens("wide"), v.cam_from_board, f"{k}", rng, NOISE_PX) for k, v in enumerate(plan.views)]
+    assert all(len(view.grid) == BOARD.corner_count for view in views)
+    return views
 
 
 @pytest.fixture(scope="module")
@@ -107,10 +103,8 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
         rig_from_board = rig.cam_from_rig[rig.names.index(view.seen_by[0])].inverse() @ view.cam_from_board
         for name in view.seen_by:
             c = rig.names.index(name)
-            pixels, valid = rig.cameras[c].project((rig.cam_from_rig[c] @ rig_from_board).apply(BOARD.points()))
-            assert valid.all() and rig.cameras[c].on_image(pixels).all()
-            noisy = pixels + NOISE_PX * rng.standard_normal(pixels.shape)
-            own = BoardView(f"{k}", BOARD, BOARD.grid(), noisy, np.full(len(noisy), NOISE_PX))
+            own = noisy_view(rig.cameras[c], rig.cam_from_rig[c] @ rig_from_board, f"{k}", rng, NOISE_PX)
+            assert len(own.grid) == BOARD.corner_count
             frames.append(FreshView(f"{k}", c, own))
     said = check_views(rig, frames).powers
     assert [(p.kind, p.camera) for p in said] == [(p.kind, p.camera) for p in promised]
