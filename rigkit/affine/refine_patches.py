@@ -17,7 +17,7 @@ from rigkit.kernels.patches import MOST_LEVELS, PatchRules, Pyramid, aligned, st
 PATCH_STEPS = 20
 HALF_WIDTH_OF_FEATURE = 16
 """Px, of a patch in the image that shows it larger; the surface is taken as flat within."""
-SETTLED_PX = 1e-3
+PATCH_SETTLED_PX = 1e-3
 """Move of a patch's border at which it is done."""
 WINDOW_OF_PATCH = 0.6
 """Standard deviation of the window, in half sides of the patch."""
@@ -74,7 +74,7 @@ def patch_rules(
     least_correlation: float = -1.0,
     most_sigma: float = np.inf,
     excess_noise: float = 1.0,
-    settled_px: float = SETTLED_PX,
+    settled_px: float = PATCH_SETTLED_PX,
 ) -> PatchRules:
     """Return how patches are aligned.
 

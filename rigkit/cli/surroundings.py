@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-ROOM, PATH = "make room or choose another folder", "correct the path"
+MAKE_ROOM, PATH = "make room or choose another folder", "correct the path"
 SURROUNDINGS = {
     getattr(errno, name): remedy
     for remedy, names in (
-        (ROOM, ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")),
+        (MAKE_ROOM, ("ENOSPC", "EDQUOT", "EROFS", "EACCES", "EPERM", "EIO", "EMFILE", "ENFILE")),
         (PATH, ("ENAMETOOLONG", "ELOOP")),
     )
     for name in names

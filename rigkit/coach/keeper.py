@@ -21,7 +21,7 @@ from rigkit.io.rig_session import ONE
 _log = logging.getLogger(__name__)
 
 FRAME_NAME = "frame-{:04d}.png"
-KEPT = re.compile(r"frame-(\d{4,6})\.png")
+KEPT_FRAME = re.compile(r"frame-(\d{4,6})\.png")
 FRAME_FOLDER = "images"
 
 
@@ -55,7 +55,7 @@ class Keeper:
     @property
     def frames(self) -> list[str]:
         """The names of the frames taken, in order."""
-        found = {path.name for place in self._places for path in place.iterdir() if KEPT.fullmatch(path.name)}
+        found = {path.name for place in self._places for path in place.iterdir() if KEPT_FRAME.fullmatch(path.name)}
         return sorted(found, key=_number)
 
     def images(self) -> Iterator[tuple[str, list[NDArray[Any]]]]:
@@ -95,6 +95,6 @@ def _aside(path: Path) -> Path:
 
 
 def _number(name: str) -> int:
-    match = KEPT.fullmatch(name)
+    match = KEPT_FRAME.fullmatch(name)
     assert match is not None
     return int(match[1])

@@ -29,7 +29,7 @@ from rigkit.io.json_reader import parse_json
 from rigkit.io.reading import read_bytes, read_text
 
 CORNERS_SCHEMA = "rigkit.corners/2"
-MARK = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
+FILE_START = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')
 """How such a file begins, of any version, even if the rest of it is damaged."""
 SOURCE_SUFFIXES = {".py", ".c", ".h"}
 
@@ -136,7 +136,7 @@ class CornerCache:
         """Write the file if anything is new; raises InputError where it cannot be written, or a file of that name is
         no file of kept corners."""
         if self._changed and self.path is not None:
-            if self.path.is_file() and not MARK.match(read_bytes(self.path)):
+            if self.path.is_file() and not FILE_START.match(read_bytes(self.path)):
                 raise InputError(f"'{self.path}' is no file of corners kept by rigkit and is left as it is; rename it")
             data = {"schema": CORNERS_SCHEMA, "detector": self.detector, "images": self._entries}
             write_atomic(self.path, json.dumps(data, allow_nan=False) + "\n", force=True)

@@ -180,15 +180,15 @@ HISTORY_FILE = file(
         "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
     },
 )
-_POSE = matrix(3, 4)
+_ROBOT_POSE = matrix(3, 4)
 HAND_EYE_FILE = file(
     "rigkit.hand_eye/1",
     "Where a camera sits on a robot",
     {
-        "cam_from_hand?": said(_POSE, "of a camera on the hand"),
-        "base_from_board?": said(_POSE, "with it"),
-        "cam_from_base?": said(_POSE, "of a camera that stands before a robot"),
-        "hand_from_board?": said(_POSE, "with it"),
+        "cam_from_hand?": said(_ROBOT_POSE, "of a camera on the hand"),
+        "base_from_board?": said(_ROBOT_POSE, "with it"),
+        "cam_from_base?": said(_ROBOT_POSE, "of a camera that stands before a robot"),
+        "hand_from_board?": said(_ROBOT_POSE, "with it"),
         "covariance": said(matrix(), "of both poses (rad, mm), twelve by twelve"),
         "freedom?": said(nullable(NUMBER), "degrees of freedom of the covariance, which is Student's; null: infinite"),
         "rms_px": NUMBER,

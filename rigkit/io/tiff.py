@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-NEW_SUBFILE_TYPE, WIDTH, HEIGHT, ORIENTATION = 254, 256, 257, 274
+NEW_SUBFILE_TYPE, IMAGE_WIDTH, IMAGE_LENGTH, ORIENTATION = 254, 256, 257, 274
 REDUCED_OR_MASK = 1 | 4
 """Bits of NewSubfileType: a smaller copy of another page, or its transparency."""
 AS_STORED = 1
@@ -46,7 +46,7 @@ def page_sizes(data: bytes) -> list[tuple[int, int]]:
     if order is None:
         return []
     pages = [p for p in _pages(data, order) if not _value(p, NEW_SUBFILE_TYPE) & REDUCED_OR_MASK]
-    return [(_value(p, WIDTH), _value(p, HEIGHT)) for p in pages]
+    return [(_value(p, IMAGE_WIDTH), _value(p, IMAGE_LENGTH)) for p in pages]
 
 
 def _value(page: dict[int, _Tag], tag: int) -> int:

@@ -26,11 +26,11 @@ def between(unit: str, what: str, a: str, b: str) -> Schema:
     return obj({"a": said(TEXT, what, a), "b": said(TEXT, "the other one", b), **measured(unit)})
 
 
-_ANGLE = {"a": "plane1", "b": "plane2", "value_deg": 90.0, "sigma_deg": 0.3, "how": "set square"}
+_SQUARE = {"a": "plane1", "b": "plane2", "value_deg": 90.0, "sigma_deg": 0.3, "how": "set square"}
 _DISTANCE = {"a": "plane1.centre", "b": "plane2", "value_mm": 300.0, "sigma_mm": 1.0, "how": "steel rule"}
 TRUTH_KEYS: Mapping[str, Schema] = {
     "angles?": said(
-        array(between("deg", "a board", "plane1", "plane2")), "angles between boards, across their faces", [_ANGLE]
+        array(between("deg", "a board", "plane1", "plane2")), "angles between boards, across their faces", [_SQUARE]
     ),
     "distances?": said(
         array(between("mm", "a place: plane1, plane1.centre, plane1[0,5]", "plane1.centre", "plane2")),

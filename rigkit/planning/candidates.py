@@ -13,7 +13,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import HeldBoards
 
-DRAWN, KEPT = 2400, 900
+CANDIDATES_DRAWN, CANDIDATES_KEPT = 2400, 900
 """Poses tried, and so many at the most of those that can be held: both fill place, tilt and size evenly."""
 TILT_DEG = (15.0, 60.0)
 """Flat views do not tell the focal length; beyond, corners are seen too slantingly to be placed well."""
@@ -59,7 +59,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
 
     Raises DegenerateError where the board fits nowhere into the image.
     """
-    u, v, size, tilt, way, upright = _even(DRAWN, 6).T
+    u, v, size, tilt, way, upright = _even(CANDIDATES_DRAWN, 6).T
     width, height = camera.size_px
     facing = _tilted(np.radians(TILT_DEG[0] + tilt * (TILT_DEG[1] - TILT_DEG[0])), 2.0 * np.pi * way)
     facing = facing @ exp_so3(np.where(upright < UPRIGHT_SHARE, 0.5 * np.pi, 0.0)[:, None] * np.array([0.0, 0.0, 1.0]))
@@ -84,7 +84,7 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
             f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) can be held nowhere wholly in view "
             "at the distances allowed; take a smaller board, or allow other distances"
         )
-    chosen = np.flatnonzero(good)[:KEPT]
+    chosen = np.flatnonzero(good)[:CANDIDATES_KEPT]
     return HeldBoards(board.points(), rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
 
 

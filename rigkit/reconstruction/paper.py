@@ -40,7 +40,7 @@ MOTIONS: Mapping[PoseType, str] = {
 """Solver by pose type, as in the paper."""
 OWN_MOTIONS: Mapping[PoseType, str] = {**MOTIONS, PoseType.STANDARD: "standard-rows", PoseType.FORWARD: "forward-roll"}
 """Solver by pose type, each constrained as far as the type goes."""
-SCALE = "sqmean"
+PAPER_SCALE = "sqmean"
 """The paper's scale of DET3UDIR."""
 
 
@@ -132,5 +132,5 @@ def _affinities(chords: MatchedPair, method: str) -> Affinities:
         E21 = fundamental_for("general").solve(m, "equal").E21
         epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
     return affines_from_directions(
-        chords.directions, method, epipolar=epipolar, scale=SCALE, epipolar_rows="soft", min_conditioning=0.0
+        chords.directions, method, epipolar=epipolar, scale=PAPER_SCALE, epipolar_rows="soft", min_conditioning=0.0
     )

@@ -15,11 +15,11 @@ from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.report import svg
-from rigkit.report.svg import round_down, round_up
+from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, round_down, round_up
 
-WIDTH, HEIGHT = 600.0, 330.0
+WIDTH, HEIGHT = DRAWN_WIDTH, 330.0
 LEFT, RIGHT, TOP, BOTTOM = 70.0, 24.0, 12.0, 46.0
-INK, MARK, SOFT, FAINT_WORDS = "#1f4e8c", "#c2410c", "#8a94a3", "#5b6575"
+LINES, FAINT_WORDS = "#c2410c", "#5b6575"
 MAX_RESIDUAL_DOTS = 4000
 BARS_NAMED = 24
 """More images are numbered only: their names would lie over each other."""
@@ -55,7 +55,7 @@ class _Plot:
         self.parts = [svg.opened(title, f"0 0 {WIDTH:g} {HEIGHT:g}")]
         for value in _ticks(*y):
             at = self.v(value)
-            self.parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="#e3e7ee"/>')
+            self.parts.append(f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="{svg.GRID_COLOUR}"/>')
             self.words(LEFT - 6, at + 4, f"{value:g}", "end")
         self.words(0.5 * (LEFT + WIDTH - RIGHT), HEIGHT - 6, labels[0], "middle")
         self.parts.append(
@@ -115,8 +115,8 @@ def images_svg(calibration: Calibration) -> str:
         )
     if not names:
         plot.below(_ticks(0.0, len(rms) - 1.0))
-    plot.line(np.array([-0.5, len(rms) - 0.5]), np.full(2, calibration.rms_px), MARK, dashes="5 4")
-    plot.words(WIDTH - RIGHT, TOP + 12, f"line: all, {calibration.rms_px:.3f} px", "end", MARK)
+    plot.line(np.array([-0.5, len(rms) - 0.5]), np.full(2, calibration.rms_px), LINES, dashes="5 4")
+    plot.words(WIDTH - RIGHT, TOP + 12, f"line: all, {calibration.rms_px:.3f} px", "end", LINES)
     return plot.done()
 
 
@@ -151,8 +151,8 @@ def radius_svg(calibration: Calibration) -> str:
     )
     order = np.array_split(np.argsort(radius), min(IMAGE_RINGS, max(len(radius) // 20, 1)))
     rings = np.array([[radius[o].mean(), np.sqrt(np.mean(error[o] ** 2))] for o in order])
-    plot.line(rings[:, 0], rings[:, 1], MARK, width=2.4)
-    plot.words(WIDTH - RIGHT, TOP + 12, "line: RMS of rings", "end", MARK)
+    plot.line(rings[:, 0], rings[:, 1], LINES, width=2.4)
+    plot.words(WIDTH - RIGHT, TOP + 12, "line: RMS of rings", "end", LINES)
     plot.below(_ticks(0.0, reach))
     return plot.done()
 
@@ -173,9 +173,9 @@ def histogram_svg(calibration: Calibration) -> str:
         y, wide = plot.v(float(count)), plot.u(float(left + step)) - plot.u(float(left))
         place = f'x="{plot.u(float(left)):.1f}" y="{y:.1f}" width="{wide:.1f}" height="{plot.v(0.0) - y:.1f}"'
         plot.parts.append(f'<rect {place} fill="{INK}" fill-opacity=".6"/>')
-    plot.line(x, curve, MARK)
+    plot.line(x, curve, LINES)
     beyond = int((np.abs(values) > reach).sum())
-    plot.words(WIDTH - RIGHT, TOP + 12, f"line: normal, sigma {sigma:.3g} px; {beyond} lie outside", "end", MARK)
+    plot.words(WIDTH - RIGHT, TOP + 12, f"line: normal, sigma {sigma:.3g} px; {beyond} lie outside", "end", LINES)
     plot.below([-reach, -0.5 * reach, 0.0, 0.5 * reach, reach])
     return plot.done()
 

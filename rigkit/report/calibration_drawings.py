@@ -15,10 +15,8 @@ from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_m
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.report import svg
-from rigkit.report.svg import dots, round_down, strokes
+from rigkit.report.svg import DRAWN_WIDTH, INK, MARK, SOFT, WRONG, dots, round_down, strokes
 
-WIDTH = 600.0
-"""Width of the drawn image, in units of the drawing."""
 FOOT = 24.0
 """Below the image: room for a scale or a bar of colours."""
 MAX_VECTORS = 5000
@@ -37,7 +35,6 @@ CONTOURS_PX = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
 ARROW_HEAD = 3.2
 """Length of the strokes of an arrow's head, in units of the drawing."""
 VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], dtype=float)
-INK, MARK, BAD, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
 
 
 def residuals_svg(calibration: Calibration) -> str:
@@ -54,7 +51,7 @@ def residuals_svg(calibration: Calibration) -> str:
         _open(calibration, words),
         f'<path d="{strokes(zoom * q, zoom * times * d)}" stroke="{INK}" stroke-width="1" fill="none"/>',
         f'<path d="{dots(zoom * q)}" stroke="{INK}" stroke-width="2.2" stroke-linecap="round"/>',
-        f'<path d="{_crosses(zoom * crossed)}" stroke="{BAD}" stroke-width="1.2" fill="none"/>',
+        f'<path d="{_crosses(zoom * crossed)}" stroke="{WRONG}" stroke-width="1.2" fill="none"/>',
         _scale(calibration, times),
         _foot(
             calibration, words, f"crosses: {len(crossed)} corners left out" if len(crossed) else "no corner left out"
@@ -177,8 +174,8 @@ def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> st
 def _scale(calibration: Calibration, times: float) -> str:
     """Return a stroke below the drawing as long as a round number of pixels, magnified as the residuals are."""
     per_px = _zoom(calibration) * times
-    length = round_down(0.15 * WIDTH / per_px)
-    y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, WIDTH - 4.0
+    length = round_down(0.15 * DRAWN_WIDTH / per_px)
+    y, x = _zoom(calibration) * calibration.camera.size_px[1] + 12.0, DRAWN_WIDTH - 4.0
     return (
         f'<path d="M{x - length * per_px:.1f} {y:.1f}H{x}m0 -4v8m{-length * per_px:.1f} 0v-8" stroke="#333"/>'
         + svg.words(x - length * per_px - 6, y + 4, f"{length:g} px", "end")
@@ -232,7 +229,7 @@ def _corners(calibration: Calibration) -> tuple[Pixels, FloatArray, np.ndarray]:
 
 
 def _zoom(calibration: Calibration) -> float:
-    return WIDTH / calibration.camera.size_px[0]
+    return DRAWN_WIDTH / calibration.camera.size_px[0]
 
 
 def _ordinal(number: int) -> str:
@@ -254,8 +251,8 @@ def _colour(level: float) -> str:
 def _open(calibration: Calibration, title: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     return (
-        svg.opened(title, f"-1 -1 {WIDTH + 2:g} {height + FOOT:.1f}")
-        + f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}"/>'
+        svg.opened(title, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + FOOT:.1f}")
+        + f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}"/>'
     )
 
 
@@ -265,6 +262,6 @@ def _foot(calibration: Calibration, *lines: str) -> str:
     height = _zoom(calibration) * calibration.camera.size_px[1]
     words = "<br>".join(escape(line) for line in lines if line)
     return (
-        f'<rect width="{WIDTH:g}" height="{height:.1f}" fill="none" stroke="{svg.RIM_COLOUR}"/></svg>'
+        f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="none" stroke="{svg.RIM_COLOUR}"/></svg>'
         f'<p class="foot">{words}</p>'
     )

@@ -26,7 +26,7 @@ MAX_RATIO_BEYOND = 3.0
 """Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
 BADGE_WORDS = {"good": "good", "look": "usable, with care", "bad": "do not use"}
 PASSED = {Severity.GOOD: True, Severity.LOOK: None, Severity.BAD: False}
-IMAGES, LEFT_OUT, NEXT = "images", "left-out", "plan"
+IMAGES_KEY, LEFT_OUT_KEY, NEXT_KEY = "images", "left-out", "plan"
 """Keys of tables that the page shows with pictures."""
 
 
@@ -34,7 +34,9 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
     """Return what the page says of one camera; `plan`: the pictures that would help most next."""
     tables = [_parameters(c), _candidates(c), _boards(c), _images(c)]
     if c.dropped:
-        tables.append(Table(LEFT_OUT, "Left out", columns("image | why"), tuple(cells(*entry) for entry in c.dropped)))
+        tables.append(
+            Table(LEFT_OUT_KEY, "Left out", columns("image | why"), tuple(cells(*entry) for entry in c.dropped))
+        )
     sentences = [*map(str, gravest_first(c.verdicts))]
     if plan is not None:
         sentences += [next_words(plan), *plan_words(plan)]
@@ -147,4 +149,4 @@ def _images(c: Calibration) -> Table:
     heads = columns(
         "image | board | RMS [px] | corners used .0 | left out .0 | distance [mm] .0 | tilt [deg] .0 | remark"
     )
-    return Table(IMAGES, "Images", heads, tuple(rows), "Tilt: between the board and the image plane.")
+    return Table(IMAGES_KEY, "Images", heads, tuple(rows), "Tilt: between the board and the image plane.")

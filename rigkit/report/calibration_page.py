@@ -19,7 +19,7 @@ from rigkit.io.images import Image
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.calibration_facts import IMAGES, LEFT_OUT, NEXT, camera_facts, next_words, rig_facts
+from rigkit.report.calibration_facts import IMAGES_KEY, LEFT_OUT_KEY, NEXT_KEY, camera_facts, next_words, rig_facts
 from rigkit.report.page_facts import told
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
@@ -130,13 +130,13 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
         "next_words": "" if section.plan is None else next_words(section.plan),
-        "tables": [shown_table(table, _pictures(table, sources)) for table in facts.tables if table.key != NEXT],
+        "tables": [shown_table(table, _pictures(table, sources)) for table in facts.tables if table.key != NEXT_KEY],
     }
 
 
 def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
     """Return the picture of each row of a table of images, each with the first of its boards; of others none."""
-    if table.key not in (IMAGES, LEFT_OUT):
+    if table.key not in (IMAGES_KEY, LEFT_OUT_KEY):
         return []
     names = [str(row[0].value) for row in table.rows]
     return [sources.get(name) if name not in names[:k] else None for k, name in enumerate(names)]

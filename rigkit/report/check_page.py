@@ -15,16 +15,15 @@ from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.svg import DRAWN_WIDTH, INK
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
-DRAWN_WIDTH = 600.0
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05
 """The largest arrow is as long as this part of the image's width."""
 PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "rotation": "moved", "shift": "moved"}
 """What changes in several ways are made of."""
-STROKE = "#1f4e8c"
 
 
 def check_facts(check: SentinelCheck) -> PageFacts:
@@ -198,12 +197,10 @@ def change_svg(check: SentinelCheck, c: int) -> str:
     longest = float(np.linalg.norm(by, axis=1).max(initial=0.0))
     zoom = DRAWN_WIDTH / before.size_px[0]
     times = ARROW_LENGTH * before.size_px[0] / longest if longest > 1e-6 else 0.0
-    height = zoom * before.size_px[1]
     words = f"{longest:.3g} px at most, drawn {times:.2g} times as long" if times else "nothing moves"
     return (
-        svg.opened(words, f"-1 -1 {DRAWN_WIDTH + 2:g} {height + 2:.1f}")
-        + f'<rect width="{DRAWN_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}" stroke="{svg.RIM_COLOUR}"/>'
-        f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{STROKE}" stroke-width="1.3" fill="none"/>'
-        f'<path d="{svg.dots(zoom * start)}" stroke="{STROKE}" stroke-width="3" stroke-linecap="round"/>'
+        svg.image_ground(words, DRAWN_WIDTH, zoom * before.size_px[1])
+        + f'<path d="{svg.strokes(zoom * start, zoom * times * by)}" stroke="{INK}" stroke-width="1.3" fill="none"/>'
+        f'<path d="{svg.dots(zoom * start)}" stroke="{INK}" stroke-width="3" stroke-linecap="round"/>'
         f'</svg><p class="foot">{words}</p>'
     )

@@ -15,7 +15,7 @@ MAX_DRAWN = 150_000
 REACH_QUANTILE = 0.95
 """Of the points' distances from their middle: a few far ones do not make the others small."""
 SPACING_SAMPLES = 2000
-GAP = 2.0
+POINT_SIDE = 2.0
 """Side of a drawn point, in distances to its nearest neighbour: surfaces look closed."""
 
 
@@ -39,7 +39,7 @@ def build_cloud_page(title: str, cloud: OrientedCloud, provenance: Mapping[str, 
         title=title,
         lead=told if len(shown) == len(cloud) else f"{told}; {len(shown)} are shown",
         count=len(shown),
-        spacing=f"{GAP * float(np.median(nearest[:, 1])):.3g}",
+        spacing=f"{POINT_SIDE * float(np.median(nearest[:, 1])):.3g}",
         packed=base64.b64encode(packed).decode(),
         provenance=provenance,
     )

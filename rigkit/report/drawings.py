@@ -17,8 +17,8 @@ from rigkit.validation.checks import ValidationReport
 WHISKER = 1.5
 """Whiskers reach to the last value within this many interquartile ranges, as in the paper's figures."""
 
-WIDTH, HEIGHT = 1100.0, 300.0
-LEFT, BOTTOM, TOP = 60.0, 46.0, 26.0
+BOXES_WIDTH, BOXES_HEIGHT = 1100.0, 300.0
+BOXES_LEFT, BOXES_BOTTOM, BOXES_TOP = 60.0, 46.0, 26.0
 
 RESIDUAL_LENGTH = 0.04
 """The root mean square residual is drawn as long as this part of the image's width."""
@@ -44,28 +44,29 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
     names = list(dict.fromkeys(name for _, boxes in groups for name, _ in boxes))
     highest = max((float(np.max(v)) for _, boxes in groups for _, v in boxes if len(v)), default=1.0)
     top = svg.round_up(highest)
-    plot = HEIGHT - BOTTOM - TOP
-    step = (WIDTH - LEFT - 10.0) / max(len(groups), 1)
+    plot = BOXES_HEIGHT - BOXES_BOTTOM - BOXES_TOP
+    step = (BOXES_WIDTH - BOXES_LEFT - 10.0) / max(len(groups), 1)
     slot = step * 0.8 / max(len(names), 1)
 
     def y(value: float) -> float:
-        return TOP + plot * (1.0 - value / top)
+        return BOXES_TOP + plot * (1.0 - value / top)
 
-    out = [svg.opened(label, f"0 0 {WIDTH:g} {HEIGHT:g}", size=12)]
+    out = [svg.opened(label, f"0 0 {BOXES_WIDTH:g} {BOXES_HEIGHT:g}", size=12)]
     for tick in np.linspace(0.0, top, 5):
-        out.append(f'<line x1="{LEFT}" x2="{WIDTH - 10}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" stroke="#e3e7ee"/>')
-        out.append(svg.words(LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
+        ends = f'x1="{BOXES_LEFT}" x2="{BOXES_WIDTH - 10}" y1="{y(tick):.1f}" y2="{y(tick):.1f}"'
+        out.append(f'<line {ends} stroke="{svg.GRID_COLOUR}"/>')
+        out.append(svg.words(BOXES_LEFT - 6, y(tick) + 4, f"{tick:.3g}", "end"))
     for g, (group, boxes) in enumerate(groups):
-        start = LEFT + g * step + 0.1 * step
-        out.append(svg.words(start + 0.4 * step, HEIGHT - BOTTOM + 18, group, "middle"))
+        start = BOXES_LEFT + g * step + 0.1 * step
+        out.append(svg.words(start + 0.4 * step, BOXES_HEIGHT - BOXES_BOTTOM + 18, group, "middle"))
         for name, values in boxes:
             index = names.index(name)
             out += _box(start + slot * (index + 0.5), 0.7 * slot, values, board_colour(index), y)
     for index, name in enumerate(names):
-        x = LEFT + 110.0 * index
-        out.append(f'<rect x="{x}" y="{HEIGHT - 18}" width="10" height="10" fill="{board_colour(index)}"/>')
-        out.append(svg.words(x + 15, HEIGHT - 9, name, "start"))
-    out.append(svg.words(LEFT, 14, label, "start"))
+        x = BOXES_LEFT + 110.0 * index
+        out.append(f'<rect x="{x}" y="{BOXES_HEIGHT - 18}" width="10" height="10" fill="{board_colour(index)}"/>')
+        out.append(svg.words(x + 15, BOXES_HEIGHT - 9, name, "start"))
+    out.append(svg.words(BOXES_LEFT, 14, label, "start"))
     return "".join([*out, "</svg>"])
 
 

@@ -11,16 +11,15 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
-from rigkit.report.check_page import DRAWN_WIDTH, STROKE
 from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG
 from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 
-DRIFT_HEIGHT, MARGIN = 190.0, 56.0
-MIDDLE = 0.5 * (DRIFT_HEIGHT - 24.0)
+DRIFT_HEIGHT, LEFT_MARGIN = 190.0, 56.0
+ZERO_HEIGHT = 0.5 * (DRIFT_HEIGHT - 24.0)
 CONTROL_SIGMAS = 3.0
 """Control limits: what one amount of unchanged cameras leaves in one of 370 checks."""
-LIMIT, ALARM, ZERO = "#b3261e", "#b3261e", "#8a94a3"
 
 
 def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
@@ -132,16 +131,16 @@ def drift_svg(entries: Sequence[HistoryEntry], name: str) -> str:
     x = _across(days)
     out = [svg.opened(name, f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     # One picture tells less than three: every entry has its own limits, up to halfway to its neighbours.
-    ends = np.concatenate([[MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
-    for side, colour, dash in ((0.0, ZERO, ""), (1.0, LIMIT, "5 4"), (-1.0, LIMIT, "5 4")):
-        height = np.repeat(MIDDLE * (1.0 - side * limit / top), 2)
+    ends = np.concatenate([[LEFT_MARGIN], 0.5 * (x[1:] + x[:-1]), [DRAWN_WIDTH - 6.0]])
+    for side, colour, dash in ((0.0, SOFT, ""), (1.0, WRONG, "5 4"), (-1.0, WRONG, "5 4")):
+        height = np.repeat(ZERO_HEIGHT * (1.0 - side * limit / top), 2)
         steps = svg.line(np.stack([np.repeat(ends, 2)[1:-1], height], axis=-1))
         out.append(
             f'<path d="{steps}" fill="none" stroke="{colour}" stroke-dasharray="{dash}"/>'
-            f"{svg.words(MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
+            f"{svg.words(LEFT_MARGIN - 5, height[0] + 4, f'{side * limit[0]:.2g}', 'end')}"
         )
-    y = MIDDLE * (1.0 - value / top)
-    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{STROKE}" stroke-opacity="0.4"/>')
+    y = ZERO_HEIGHT * (1.0 - value / top)
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.4"/>')
     return "".join([*out, *_points(own, name, x, top), *_below(x, [entry.date[:10] for entry in own]), "</svg>"])
 
 
@@ -150,14 +149,16 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
     celsius = _celsius(entries)
     value, sigma = np.array([entry.amounts[name] for entry in entries]).T
     top = _top(0.0, value, sigma)
-    x, y = _across(celsius), MIDDLE * (1.0 - heat.at(celsius) / top)
+    x, y = _across(celsius), ZERO_HEIGHT * (1.0 - heat.at(celsius) / top)
     out = [svg.opened(f"{name} over the temperature", f"0 -6 {DRAWN_WIDTH:g} {DRIFT_HEIGHT + 6:g}", size=12)]
     for amount in (-top / 1.1, 0.0, top / 1.1):
-        height = MIDDLE * (1.0 - amount / top)
-        ends = svg.line([np.array([MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])
-        stroke = ZERO if amount == 0.0 else svg.RIM_COLOUR
-        out.append(f'<path d="{ends}" stroke="{stroke}"/>{svg.words(MARGIN - 5, height + 4, f"{amount:.2g}", "end")}')
-    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{STROKE}" stroke-opacity="0.6"/>')
+        height = ZERO_HEIGHT * (1.0 - amount / top)
+        ends = svg.line([np.array([LEFT_MARGIN, height]), np.array([DRAWN_WIDTH - 6.0, height])])
+        stroke = SOFT if amount == 0.0 else svg.RIM_COLOUR
+        out.append(
+            f'<path d="{ends}" stroke="{stroke}"/>{svg.words(LEFT_MARGIN - 5, height + 4, f"{amount:.2g}", "end")}'
+        )
+    out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.6"/>')
     told = [f"{c:g} °C" for c in celsius]
     return "".join([*out, *_points(entries, name, x, top), *_below(x, told), "</svg>"])
 
@@ -170,7 +171,7 @@ def _top(least: float, value: FloatArray, sigma: FloatArray) -> float:
 def _across(values: FloatArray) -> FloatArray:
     """Return where values are between the left and the right of a drawing; one alone in the middle."""
     part = (values - values[0]) / max(float(np.ptp(values)), 1e-9) if len(values) > 1 else np.full(1, 0.5)
-    return np.asarray(MARGIN + (DRAWN_WIDTH - MARGIN - 14.0) * part)
+    return np.asarray(LEFT_MARGIN + (DRAWN_WIDTH - LEFT_MARGIN - 14.0) * part)
 
 
 def _below(x: FloatArray, told: Sequence[str]) -> list[str]:
@@ -185,7 +186,7 @@ def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: floa
     out = []
     for a, entry in zip(x, entries, strict=True):
         value, sigma = entry.amounts[name]
-        b, s, colour = MIDDLE * (1.0 - value / top), MIDDLE * sigma / top, STROKE if entry.holds else ALARM
+        b, s, colour = ZERO_HEIGHT * (1.0 - value / top), ZERO_HEIGHT * sigma / top, INK if entry.holds else WRONG
         out.append(
             f'<line x1="{a:.1f}" x2="{a:.1f}" y1="{b - s:.1f}" y2="{b + s:.1f}" stroke="{colour}"/>'
             f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.4" fill="{colour}">'

@@ -23,7 +23,7 @@ from rigkit.report.rig_tables import rig_reach
 from rigkit.report.scene_view import boards_scene, rig_scene
 from rigkit.report.tables import measured_words
 
-WIDTH, HEIGHT, RIM = 420.0, 300.0, 14.0
+SCENE_WIDTH, SCENE_HEIGHT, SCENE_RIM = 420.0, 300.0, 14.0
 MAX_DRAWN_POINTS = 600
 """Points drawn; of more, every second, third, ..."""
 SHADES = ("#e6550d", "#1f77b4", "#2ca02c", "#9467bd", "#b79a00", "#17becf", "#e377c2", "#7f7f7f")
@@ -66,14 +66,14 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
     points = np.array(scene["points"]).reshape(-1, 3)
     everything = np.concatenate([*cameras, *planes, points]) @ VIEWED_FROM.T
     low, high = everything[:, :2].min(axis=0), everything[:, :2].max(axis=0)
-    zoom = float(min((np.array([WIDTH, HEIGHT]) - 2.0 * RIM) / np.maximum(high - low, 1e-9)))
+    zoom = float(min((np.array([SCENE_WIDTH, SCENE_HEIGHT]) - 2.0 * SCENE_RIM) / np.maximum(high - low, 1e-9)))
 
     def drawn(places: FloatArray) -> FloatArray:
-        return np.asarray((places @ VIEWED_FROM.T)[:, :2] - low) * zoom + RIM
+        return np.asarray((places @ VIEWED_FROM.T)[:, :2] - low) * zoom + SCENE_RIM
 
-    height = zoom * (high[1] - low[1]) + 2.0 * RIM
-    shown = f'width="{WIDTH:g}" style="background: #fff"'
-    out = [svg.opened("cameras and boards", f"0 0 {WIDTH:g} {height:.0f}", size=11, more=shown)]
+    height = zoom * (high[1] - low[1]) + 2.0 * SCENE_RIM
+    shown = f'width="{SCENE_WIDTH:g}" style="background: #fff"'
+    out = [svg.opened("cameras and boards", f"0 0 {SCENE_WIDTH:g} {height:.0f}", size=11, more=shown)]
     for plane, corners in zip(scene["planes"], planes, strict=True):
         colour = SHADES[plane["board"] % len(SHADES)]
         outline = svg.line(drawn(corners))
@@ -85,7 +85,7 @@ def scene_svg(scene: Mapping[str, Any]) -> str:
         out.append(f'<path d="{path}" stroke="{SHADES[index % len(SHADES)]}" stroke-width="3" stroke-linecap="round"/>')
     for camera, corners in zip(scene["cameras"], cameras, strict=True):
         tip, *base = drawn(corners)
-        below = max(float(y) for _, y in (tip, *base)) + RIM - 3.0
+        below = max(float(y) for _, y in (tip, *base)) + SCENE_RIM - 3.0
         wire = svg.line(np.array(base)) + "Z" + "".join(svg.line(np.array([tip, corner])) for corner in base)
         out.append(f'<path d="{wire}" fill="none" stroke="#333"/>')
         out.append(svg.words(tip[0], below, camera["name"]))

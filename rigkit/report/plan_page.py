@@ -18,10 +18,10 @@ from rigkit.report import svg
 from rigkit.report.board_sheet import black_squares
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.render import drawing, render, shown_table
+from rigkit.report.svg import INK, MARK
 
 VIEW_WIDTH = 320.0
 """Width of a drawn view, in units of the drawing."""
-PAPER, SEEN = "#e6550d", "#1f4e8c"
 CIRCLE_CORNERS = 12
 MAX_DOTS = 1500
 """More corners taken so far make the drawing black: of more, a part is drawn."""
@@ -85,20 +85,16 @@ def view_svg(plan: Plan, index: int, taken: Pixels | None = None) -> str:
     view = plan.views[index]
     camera = view.camera
     zoom = VIEW_WIDTH / camera.size_px[0]
-    height = zoom * camera.size_px[1]
     where = placement(camera, view.board, view.cam_from_board)
-    out = [
-        svg.opened(str(where), f"-1 -1 {VIEW_WIDTH + 2:g} {height + 2:.1f}")
-        + f'<rect width="{VIEW_WIDTH:g}" height="{height:.1f}" fill="{svg.GROUND_COLOUR}" stroke="{svg.RIM_COLOUR}"/>'
-    ]
+    out = [svg.image_ground(str(where), VIEW_WIDTH, zoom * camera.size_px[1])]
     if taken is not None and len(taken):
         path = svg.dots(zoom * taken[:: -(-len(taken) // MAX_DOTS)])
-        out.append(f'<path d="{path}" stroke="{SEEN}" stroke-opacity="0.35" stroke-width="2" stroke-linecap="round"/>')
+        out.append(f'<path d="{path}" stroke="{INK}" stroke-opacity="0.35" stroke-width="2" stroke-linecap="round"/>')
     out += [
-        f'<path d="{_path(zoom * square)}Z" fill="{PAPER}" fill-opacity="0.75"/>'
+        f'<path d="{_path(zoom * square)}Z" fill="{MARK}" fill-opacity="0.75"/>'
         for square in printed_outlines(camera, view.board, view.cam_from_board)
     ]
-    out.append(f'<path d="{_path(zoom * where.outline_px)}Z" fill="none" stroke="{PAPER}" stroke-width="2"/></svg>')
+    out.append(f'<path d="{_path(zoom * where.outline_px)}Z" fill="none" stroke="{MARK}" stroke-width="2"/></svg>')
     return "".join(out)
 
 

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
 
-RIM_COLOUR, GROUND_COLOUR, WORDS_COLOUR = "#b8c0cc", "#fbfcfd", "#333"
+DRAWN_WIDTH = 600.0
+"""Of most drawings, in their own units."""
+RIM_COLOUR, GROUND_COLOUR, WORDS_COLOUR, GRID_COLOUR = "#b8c0cc", "#fbfcfd", "#333", "#e3e7ee"
+INK, MARK, WRONG, SOFT = "#1f4e8c", "#e6550d", "#b3261e", "#8a94a3"
+"""Colours of what is drawn: what is usual, to be noticed, wrong, and to be held against."""
 ROUND = (1.0, 2.0, 5.0, 10.0)
 
 
@@ -19,6 +23,14 @@ def opened(title: str, box: str, *, size: float = 13, more: str = "") -> str:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-family="sans-serif" '
         f'font-size="{size:g}"{more and f" {more}"}><title>{escape(title)}</title>'
+    )
+
+
+def image_ground(title: str, width: float, height: float) -> str:
+    """Return the start of a drawing over an image, and the image's place in it."""
+    return (
+        opened(title, f"-1 -1 {width + 2:g} {height + 2:.1f}")
+        + f'<rect width="{width:g}" height="{height:.1f}" fill="{GROUND_COLOUR}" stroke="{RIM_COLOUR}"/>'
     )
 
 

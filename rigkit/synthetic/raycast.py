@@ -99,7 +99,7 @@ def _plane_from_ray(cam_from_plane: Rigid3, scale: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(forward))
 
 
-NONE, PART, FULL = 0, 1, 2
+NOT_COVERED, PART, FULL = 0, 1, 2
 
 
 class Chart:
@@ -139,7 +139,7 @@ class Chart:
         plane = self.nodes @ surface.plane_from_ray.T
         front = plane[..., 2] > 1e-9
         if not front.any():
-            return NONE
+            return NOT_COVERED
         if not front.all():
             return PART
         xy = plane[..., :2] / plane[..., 2:]
@@ -147,7 +147,7 @@ class Chart:
         # Chebyshev nodes stop short of the tile's border; half the range more is ample.
         pad = 0.5 * (high - low)
         if not ((high + pad >= surface.low) & (low - pad <= surface.high)).all():
-            return NONE
+            return NOT_COVERED
         inside = ((low - pad >= surface.low) & (high + pad <= surface.high)).all()
         return FULL if inside else PART
 

@@ -39,7 +39,7 @@ RANSAC_ITERATIONS = 60
 """With a third of the points bad, no good sample of three is found once in a billion."""
 WEIGHT_ROUNDS = 3
 """Weights follow from the plane and the plane from the weights: a third round changes nothing that shows."""
-NEWTON_STEPS, NEWTON_TOLERANCE = 100, 1e-10
+NOISE_STEPS, NOISE_TOLERANCE = 100, 1e-10
 """Until it is near, a step doubles the noise's variance at least; then convergence is quadratic."""
 
 
@@ -244,10 +244,10 @@ class _Across:
         # rest / s^2 + sum along / (s^2 + sizes^2) = free. The left side falls and is convex: Newton's steps from below
         # the root stay below. Where the common errors can explain everything, there is no rest.
         variance = max(rest / free, float(np.mean(self.floor_mm / sigma)) ** 2)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(NOISE_STEPS):
             spread = variance + sizes**2
             excess = rest / variance + float(np.sum(along / spread)) - free
-            if excess <= NEWTON_TOLERANCE * free:
+            if excess <= NOISE_TOLERANCE * free:
                 break
             variance += excess / (rest / variance**2 + float(np.sum(along / spread**2)))
         return variance

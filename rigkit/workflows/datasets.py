@@ -33,7 +33,7 @@ from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
 
-MAX_NAME_BYTES = 200
+MAX_FOLDER_BYTES = 200
 """Names of folders have at most 255 bytes, and temporary files need some of them."""
 
 _log = logging.getLogger(__name__)
@@ -80,9 +80,9 @@ def ready_dataset(
     for pair in known.pairs:
         if pair.pair_id in {*reserved, CALIBRATIONS}:
             raise InputError(f"{known.manifest}: pair '{pair.pair_id}': a file of results has that name; rename it")
-        if len(os.fsencode(pair.pair_id)) > MAX_NAME_BYTES:
+        if len(os.fsencode(pair.pair_id)) > MAX_FOLDER_BYTES:
             raise InputError(
-                f"{known.manifest}: the name of pair '{pair.pair_id[:20]}...' has more than {MAX_NAME_BYTES} bytes; "
+                f"{known.manifest}: the name of pair '{pair.pair_id[:20]}...' has more than {MAX_FOLDER_BYTES} bytes; "
                 "its results need a folder of that name: shorten it"
             )
         try:

@@ -20,7 +20,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task, instrument_of_rig
-from rigkit.validation.certificate.propagation import CORNERS, LENSES, MOUNTS, measured_points
+from rigkit.validation.certificate.propagation import OF_CORNERS, OF_LENSES, OF_MOUNTS, measured_points
 
 TRIALS = 800
 COVERAGE = (0.93, 0.97)
@@ -144,7 +144,7 @@ def test_bounds_hold_where_the_covariance_itself_is_an_estimate(rng: np.random.G
     task = Task(quantity=Quantity.LENGTH, size_mm=150.0, distance_mm=1500.0)
     exact = certify(rig_of("brown", joint, scale_sigma=0.0), task, cells=(3, 3))
     row, column = exact.worst_place
-    sigma = np.array([exact.sigma[cause][row, column] for cause in (CORNERS, LENSES, MOUNTS)])
+    sigma = np.array([exact.sigma[cause][row, column] for cause in (OF_CORNERS, OF_LENSES, OF_MOUNTS)])
     inside, narrow = 0, 0
     for estimate in rng.chisquare(freedom, trials) / freedom:
         bound = bound_at(sigma * np.sqrt([1.0, estimate, estimate]), freedom)

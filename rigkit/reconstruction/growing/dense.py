@@ -50,7 +50,7 @@ POSE_STEP_RAD = 1e-5
 """For differences of planes: far above rounding, far below where they bend."""
 SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
-OVERLAP = 3.5
+WINDOW_OVERLAP = 3.5
 """Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
 
 Calibrations: TypeAlias = tuple[UncertainCamera, UncertainCamera | None]
@@ -212,14 +212,14 @@ def _pose_from_grown(
             even = kept.matches.select(kept.inliers)
             # What pairs err by together across their epipolar lines they err by along them too.
             there = kept.refined.cam2_from_cam1
-            found = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, OVERLAP)
+            found = pose_with_lens_errors(even, cameras, there, PoseType.STANDARD, None, WINDOW_OVERLAP)
             return _EvenPose(replace(found, cam2_from_cam1=there, covariance=kept.refined.covariance), even)
         # Without a level a type holds exactly.
         level = r.level_sigma_rad or 0.0
         fit = fit_scene_pose(_floored(matches), r.pose_type, level, np.random.default_rng(0), start=pose)
         even = fit.matches.select(fit.inliers)
         found = pose_with_lens_errors(
-            even, cameras, fit.refined.cam2_from_cam1, fit.pose_type, fit.level_sigma_rad, OVERLAP
+            even, cameras, fit.refined.cam2_from_cam1, fit.pose_type, fit.level_sigma_rad, WINDOW_OVERLAP
         )
         before, pose = pose, found.cam2_from_cam1
         turn = rotation_angle(pose.rotation @ before.rotation.T)

@@ -24,7 +24,7 @@ HALF_WIDTH = 7
 COARSEST = 2
 """Levels up to which patches of little texture grow: of four times the half side."""
 MIN_CORRELATION = 0.9
-MAX_MOVE_PX = 2.0
+MAX_GROWTH_MOVE_PX = 2.0
 """From where a neighbour predicts a patch."""
 MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
@@ -198,7 +198,7 @@ def grow(
     rules = patch_rules(
         HALF_WIDTH,
         coarsest=COARSEST,
-        most_move=MAX_MOVE_PX,
+        most_move=MAX_GROWTH_MOVE_PX,
         least_correlation=min_correlation,
         settled_px=GROWN_SETTLED_PX,
         most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,

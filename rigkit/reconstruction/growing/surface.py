@@ -28,10 +28,10 @@ from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches
 
 PLANE_REACH_PX = 2.0 * HALF_WIDTH
 """To either side, of the nodes that a plane is fitted to: those further away share no texture with the middle one."""
-PLANE_ROUNDS = 5
+SMOOTHING_ROUNDS = 5
 TURN_OF_LOSS = 2.385
 """In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
-MIN_SUPPORT = 0.2
+MIN_NODE_SUPPORT = 0.2
 """Share of the nodes around, in sum of weights, that a plane needs: fewer agree by chance, or across an edge."""
 MAX_STEP_PX = 1.0
 """By which planes differ from node to node on one surface."""
@@ -197,13 +197,13 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         np.linalg.inv(covariance),
         measured.frame,
         reach=reach,
-        rounds=PLANE_ROUNDS,
+        rounds=SMOOTHING_ROUNDS,
         turn=TURN_OF_LOSS,
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         ray = measured.frame[..., 0, :]
         inverse = np.sum(plane * ray, axis=-1)
-        keep = (inverse > 0.0) & (support >= MIN_SUPPORT * (2 * reach + 1) ** 2)
+        keep = (inverse > 0.0) & (support >= MIN_NODE_SUPPORT * (2 * reach + 1) ** 2)
         points = ray / inverse[..., None]
         normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
         # How far the own range of a node is from the plane, px along the epipolar line.

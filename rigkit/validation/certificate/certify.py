@@ -19,11 +19,11 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import (
-    CORNERS,
-    DISTANCE,
-    LENSES,
-    MOUNTS,
-    SCALE,
+    OF_CORNERS,
+    OF_DISTANCE,
+    OF_LENSES,
+    OF_MOUNTS,
+    OF_SCALE,
     gradients,
     measured_points,
     variances,
@@ -93,7 +93,7 @@ def _quantile(sigma: Mapping[str, FloatArray], freedom: float, confidence: float
     whole = np.sum([s**2 for s in sigma.values()], axis=0)
     if not np.isfinite(freedom):
         return np.full(whole.shape, float(ndtri(upper)))
-    calibration = np.sum([sigma[cause] ** 2 for cause in (LENSES, MOUNTS) if cause in sigma], axis=0)
+    calibration = np.sum([sigma[cause] ** 2 for cause in (OF_LENSES, OF_MOUNTS) if cause in sigma], axis=0)
     known = freedom * (whole / np.maximum(calibration, np.finfo(float).tiny)) ** 2
     return np.asarray(stdtrit(np.minimum(known, AS_NORMAL), upper))
 
@@ -112,7 +112,7 @@ def _findings(certificate: Certificate) -> list[Finding]:
                 "measure elsewhere in the image, nearer, or move the cameras apart",
             )
         )
-    if instrument.is_rig and instrument.scale_sigma == 0.0 and SCALE in certificate.sigma:
+    if instrument.is_rig and instrument.scale_sigma == 0.0 and OF_SCALE in certificate.sigma:
         found.append(
             Finding.look(
                 "nobody stated how well the boards' squares were measured, so their scale counts as exact",
@@ -146,10 +146,10 @@ def _remedy(cause: str, factor: float, share: float, scale_percent: float) -> st
     times = f"{int(np.ceil(factor)):d} times"
     root = f"{np.sqrt(factor):.1f} times"
     remedies: dict[str, str] = {
-        CORNERS: f"repeat the measurement {times} and average, or come nearer, or move the cameras apart",
-        LENSES: f"calibrate with {times} as many pictures, boards also where the bound is worst",
-        MOUNTS: f"calibrate with {times} as many pictures of boards that both cameras see",
-        SCALE: f"measure the squares {root} better than the {scale_percent:.3g} % stated, over the whole board",
-        DISTANCE: f"measure the distance {root} better",
+        OF_CORNERS: f"repeat the measurement {times} and average, or come nearer, or move the cameras apart",
+        OF_LENSES: f"calibrate with {times} as many pictures, boards also where the bound is worst",
+        OF_MOUNTS: f"calibrate with {times} as many pictures of boards that both cameras see",
+        OF_SCALE: f"measure the squares {root} better than the {scale_percent:.3g} % stated, over the whole board",
+        OF_DISTANCE: f"measure the distance {root} better",
     }
     return f"{part}: {remedies[cause]}"

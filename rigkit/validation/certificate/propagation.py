@@ -21,7 +21,7 @@ from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 
 PLANE_POINTS = 5
 """A plane is measured at so many points along either side."""
-CORNERS, LENSES, MOUNTS, SCALE, DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
+OF_CORNERS, OF_LENSES, OF_MOUNTS, OF_SCALE, OF_DISTANCE = "corners", "lenses", "mounts", "board scale", "distance"
 """Causes of error."""
 
 
@@ -124,14 +124,14 @@ def variances(
     follows = covariance[split:, :split] / known @ np.linalg.pinv(own / np.outer(known, known), hermitian=True) / known
     with_lens = lens + mount @ follows
     variance = {
-        CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),
-        LENSES: np.einsum("nmi,ij,nmj->nm", with_lens, own, with_lens),
+        OF_CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),
+        OF_LENSES: np.einsum("nmi,ij,nmj->nm", with_lens, own, with_lens),
     }
     if instrument.is_rig:
         rest = covariance[split:, split:] - follows @ covariance[:split, split:]
-        variance[MOUNTS] = np.einsum("nmi,ij,nmj->nm", mount, rest, mount)
+        variance[OF_MOUNTS] = np.einsum("nmi,ij,nmj->nm", mount, rest, mount)
     if task.quantity in (Quantity.LENGTH, Quantity.DEPTH):
         relative = instrument.scale_sigma if instrument.is_rig else task.distance_sigma_mm / task.distance_mm
-        cause = SCALE if instrument.is_rig else DISTANCE
+        cause = OF_SCALE if instrument.is_rig else OF_DISTANCE
         variance[cause] = np.full(by_calibration.shape[:2], (relative * task.size_mm) ** 2)
     return {cause: np.maximum(value, 0.0) for cause, value in variance.items()}

@@ -38,9 +38,9 @@ PARTS = 4
 WELSCH_SIGMAS = 2.985
 """Matches that lie farther off hardly count (J. E. Dennis, R. E. Welsch, 1978; of Gaussian noise 95 % is used): up to a
 quarter of them is wrong where things repeat, and not by far."""
-FIT_ROUNDS, FIT_RANK = 15, 1e-5
+FIT_ROUNDS, FIT_CUT = 15, 1e-5
 """Of the fit of everything to the matches; directions that move them by less beside others are none."""
-MIN_FREE = 1e-3
+MIN_FREE_VARIANCE = 1e-3
 """Of the variance of a match, what the fit leaves at least."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
@@ -182,13 +182,13 @@ def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> t
     for _ in range(FIT_ROUNDS):
         root = np.sqrt(weight)
         basis, values, _ = np.linalg.svd(design * root[:, None], full_matrices=False)
-        rank = int(np.count_nonzero(values > FIT_RANK * values[0]))
-        step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_RANK)[0]
+        rank = int(np.count_nonzero(values > FIT_CUT * values[0]))
+        step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_CUT)[0]
         left = residual - design @ step
         freedom = max(len(residual) - rank, 1) / len(residual)
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
         # Of a match that the fit follows, alone in its part of the image, little is left, right or wrong.
-        free = np.sqrt(np.maximum(1.0 - (basis[:, :rank] ** 2).sum(axis=1), MIN_FREE))
+        free = np.sqrt(np.maximum(1.0 - (basis[:, :rank] ** 2).sum(axis=1), MIN_FREE_VARIANCE))
         weight = np.minimum(before, _weights(left / free, sigma))
     return left, weight, sigma
 

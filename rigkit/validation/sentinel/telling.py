@@ -19,7 +19,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import KEPT, Reach, held_boards, sees_held
+from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees_held
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
@@ -119,7 +119,7 @@ class _Frames:
     def _before(cls, watched: Watched, c: int, board: Board, number: int, reach: Reach) -> _Frames:
         """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
         held = held_boards(watched.cameras[c], board, reach)
-        held = held.chosen(np.arange(min(len(held), -(-KEPT // len(watched.cameras)))))
+        held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
         back = watched.cam_from_rig[c].inverse()
         rotation, translation = back.rotation @ held.rotation, held.translation_mm @ back.rotation.T
         translation = translation + back.translation_mm
