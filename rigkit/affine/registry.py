@@ -18,7 +18,7 @@ from rigkit.core.matches import DirectionPairs
 AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 _COUNT: dict[str, int | None] = {"F2UDIR": 2, "F3UDIR": None, "DET3UDIR": None, "2SDIR": 2, "3SDIR": None}
-_AT_LEAST = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
+_MIN_COUNT = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
 
 
 def needs_epipolar(method: str) -> bool:
@@ -72,7 +72,7 @@ def affines_from_directions(
     if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
         A21 = soft_epipolar(directions, use, epipolar)
     with np.errstate(invalid="ignore"):
-        valid = (use.sum(axis=1) >= _AT_LEAST[method]) & (conditioning >= min_conditioning)
+        valid = (use.sum(axis=1) >= _MIN_COUNT[method]) & (conditioning >= min_conditioning)
     valid &= finite(A21)
     A21[~valid] = np.nan
     covariance = None
@@ -171,7 +171,7 @@ def _check(
         raise InputError(f"{method} needs the lengths of the directions, which these do not have: use F3UDIR")
     if determinant is not None:
         as_array(determinant, (n,), "determinant", finite=False)
-    if k < _AT_LEAST[method]:
-        raise InputError(f"{method} needs {_AT_LEAST[method]} directions a corner, got {k}")
+    if k < _MIN_COUNT[method]:
+        raise InputError(f"{method} needs {_MIN_COUNT[method]} directions a corner, got {k}")
     if noise is not None and noise.covariance1.shape != (n, 2 * k, 2 * k):
         raise InputError(f"direction noise: expected {n}x{2 * k}x{2 * k}, got {noise.covariance1.shape}")

@@ -24,7 +24,7 @@ MAX_PICTURE_PX = 12000
 LOOK_S = 0.06
 """A look that takes longer is had at a smaller picture next time: ten of them fit into a second then."""
 MAX_SHRINK = 4
-LEAST_WORTH = 0.05
+MIN_WORTH = 0.05
 """A frame of a recording that brings less than this part of what the outline would is left where it is."""
 
 Image = NDArray[Any]
@@ -177,7 +177,7 @@ class Coach:
             glances.append(self._glances(images, whole=True, photo=True))
         while left:
             advice = [self.guide.advise(glances[k]) for k in left]
-            if advice[0].enough or max(a.worth for a in advice) < LEAST_WORTH:
+            if advice[0].enough or max(a.worth for a in advice) < MIN_WORTH:
                 return
             best = left.pop(int(np.argmax([a.worth for a in advice])))
             with self._lock:

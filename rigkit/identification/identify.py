@@ -153,7 +153,7 @@ def _tie_note(winner: Assignment, others: Sequence[Assignment]) -> str:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _IdentifiedBoard:
+class _MatchedBoard:
     """A board of some kind: where it is, which detection shows it in image 1 and 2, and how that is placed."""
 
     located: LocatedBoard
@@ -163,7 +163,7 @@ class _IdentifiedBoard:
 
 def _identified_boards(
     winner: Assignment, views: tuple[ImageObservations, ImageObservations], kinds: Sequence[BoardKind]
-) -> tuple[list[_IdentifiedBoard], list[tuple[int, int]]]:
+) -> tuple[list[_MatchedBoard], list[tuple[int, int]]]:
     """Return the boards of the winner, then those of one image only as far as they are listed, and what is left over.
 
     What is left over: (image 0 or 1, detection).
@@ -172,7 +172,7 @@ def _identified_boards(
     for match, pose in zip(winner.matches, winner.pose.cam1_from_board, strict=True):
         name = views[0].detections[match.first].board_id or views[1].detections[match.second].board_id
         out.append(
-            _IdentifiedBoard(
+            _MatchedBoard(
                 LocatedBoard(match.kind, pose, name), (match.first, match.second), (match.placement1, match.placement2)
             )
         )
@@ -193,7 +193,7 @@ def _identified_boards(
                 continue
             vacant[k] -= 1
             located = LocatedBoard(k, cam1_from_cam[v] @ found[0][0], view.detections[n].board_id)
-            out.append(_IdentifiedBoard(located, (n, None) if v == 0 else (None, n), (where, where)))
+            out.append(_MatchedBoard(located, (n, None) if v == 0 else (None, n), (where, where)))
     return out, left_over
 
 

@@ -16,7 +16,7 @@ STRIP, STRIP_ROWS, STRIPS_FROM, HALF = (_CONSTANTS[name] for name in ("STRIP", "
 WHOLE = 16.0
 """A kernel of multiples of 1/16 smooths bytes exactly in integers of 16 bits."""
 
-MOST_SUMMED = 256
+MAX_SUMMED = 256
 """Bytes whose sum fits 16 bits."""
 
 Image = NDArray[np.float32]
@@ -62,7 +62,7 @@ class _CornerArrays(Struct):
 def shrunk(image: GreyImage, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
     height, width = image.shape
-    bytewise = image.dtype == np.uint8 and factor <= MOST_SUMMED
+    bytewise = image.dtype == np.uint8 and factor <= MAX_SUMMED
     image = image if bytewise else image.astype(np.float32, copy=False)
     sums = np.empty(width, np.uint16 if bytewise else np.float32)
     out = np.empty((height // factor, width // factor), np.float32)

@@ -39,7 +39,7 @@ class GrowthRules(Struct):
 
 
 @structure("pyramid_level_t")
-class _Level(Struct):
+class _PyramidLevel(Struct):
     """The brightness that corners are read from."""
 
 
@@ -49,11 +49,11 @@ class _Sheet(Struct):
 
 
 @structure("squares_t")
-class Squares(Struct):
+class GridBuckets(Struct):
     """Points (N, 2), N > 0, sorted into squares, to find those near a place."""
 
     @classmethod
-    def sorted(cls, points: FloatArray) -> Squares:
+    def sorted(cls, points: FloatArray) -> GridBuckets:
         points = np.ascontiguousarray(points, np.float64)
         memory = np.empty(kernels().squares_memory(len(points)), np.int32)
         squares = cls()
@@ -78,7 +78,7 @@ def grown(
     image: np.ndarray,
     scale: float,
     offset: float,
-    saddles: Squares,
+    saddles: GridBuckets,
     rules: GrowthRules,
     rings: int,
 ) -> int:
@@ -91,7 +91,7 @@ def grown(
     due = np.ones((2, rows, columns), np.uint8)
     fresh, where = np.empty((rows * columns, 3)), np.empty(rows * columns, np.int64)
     sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=due, rows=rows, columns=columns, sign=sign)
-    level = _Level.of(image=ImageOf.make(image), scale=scale, offset=offset)
+    level = _PyramidLevel.of(image=ImageOf.make(image), scale=scale, offset=offset)
     return int(kernels().grow_lattice(sheet, level, saddles, rules, rings, fresh, where))
 
 

@@ -25,7 +25,7 @@ class BoardViews(Struct):
 
 
 @structure("view_sums_t")
-class _ViewSums(Struct):
+class _ViewSumsStruct(Struct):
     """Where the kernel writes to."""
 
 
@@ -45,7 +45,7 @@ class ViewSums:
     own: FloatArray
     poses: FloatArray
     _memory: FloatArray = field(repr=False)
-    _struct: _ViewSums = field(repr=False)
+    _struct: _ViewSumsStruct = field(repr=False)
 
     @classmethod
     def of(cls, seen: BoardViews, across: int) -> ViewSums:
@@ -53,7 +53,7 @@ class ViewSums:
         v, c, r = seen.views, seen.corners, seen.released
         residuals, valid, costs = np.empty((2, v, c)), np.empty((v, c), dtype=bool), np.empty(v)
         products, own, poses = np.empty((v, across, across)), np.zeros((r, 3, across + 3)), np.zeros((v, r, 3, 6))
-        struct = _ViewSums.of(
+        struct = _ViewSumsStruct.of(
             residuals=residuals,
             valid=valid,
             costs=costs,

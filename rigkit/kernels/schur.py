@@ -10,7 +10,7 @@ from rigkit.kernels.calls import Struct, structure
 
 
 @structure("normal_equations_t")
-class _NormalEquations(Struct):
+class _BlockSystem(Struct):
     """Blocks of the normal equations."""
 
 
@@ -28,7 +28,7 @@ def schur_step(
     """
     gg, gp, pp, g, p = (np.ascontiguousarray(block, np.float64) for block in (gg, gp, pp, g, p))
     views, count, _ = gp.shape
-    normal = _NormalEquations.of(gg=gg, gp=gp, pp=pp, g=g, p=p, globals=count, views=views)
+    normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p, globals=count, views=views)
     step_g, step_p, predicted = np.empty(count), np.empty((views, 6)), np.empty(1)
     memory = np.empty(kernels().schur_memory(count, views))
     if not kernels().solve_schur(normal, damping, memory, step_g, step_p, predicted):

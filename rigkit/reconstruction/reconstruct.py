@@ -92,7 +92,7 @@ class Reconstruction:
     __repr__ = brief
     _repr_html_ = drawn
 
-    def sights(self) -> tuple[Rays, Rays, RayJacobians, RayJacobians]:
+    def measured_rays(self) -> tuple[Rays, Rays, RayJacobians, RayJacobians]:
         """Return the rays of `pixels1` and of `pixels2`, and their derivatives by the pixels."""
         (rays1, _), (rays2, _) = self.camera1.unproject(self.pixels1), self.camera2.unproject(self.pixels2)
         return rays1, rays2, self.camera1.ray_jacobian(self.pixels1), self.camera2.ray_jacobian(self.pixels2)

@@ -73,7 +73,7 @@ def boxplot_svg(groups: Sequence[tuple[str, Sequence[tuple[str, FloatArray]]]], 
 def residuals_svg(reconstruction: Reconstruction) -> str:
     """Draw how far each corner is from where the two rays would meet, magnified, in both images."""
     camera1, camera2 = reconstruction.camera1, reconstruction.camera2
-    rays1, rays2, *jacobians = reconstruction.sights()
+    rays1, rays2, *jacobians = reconstruction.measured_rays()
     _, _, moved1, moved2 = correct_rays_px(rays1, rays2, reconstruction.E21, *jacobians)
     rms = float(np.sqrt(np.mean(np.concatenate([moved1, moved2]) ** 2) * 2.0))
     width = 540.0

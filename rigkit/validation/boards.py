@@ -35,7 +35,7 @@ class BoardGrid:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Placed:
+class BoardPlace:
     """Where a board is: once, or for each of several (...) ways in which its points moved.
 
     Attributes
@@ -82,9 +82,9 @@ class BoardResult:
     right_handed: bool
 
     @property
-    def placed(self) -> Placed:
+    def placed(self) -> BoardPlace:
         """Where the board is."""
-        return Placed(self.plane.normal, np.asarray(self.plane.offset_mm), self.lattice.steps_mm)
+        return BoardPlace(self.plane.normal, np.asarray(self.plane.offset_mm), self.lattice.steps_mm)
 
     def feature(self, feature: Feature) -> tuple[FloatArray, Mat3]:
         """Return where a corner or the centre lies (3,), mm, and its covariance (3, 3) from the corners' scatter."""
@@ -121,13 +121,13 @@ def _design(places: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(places), 1)), places], axis=1)
 
 
-def place_moved(points_mm: Points, places: FloatArray, like: Plane) -> Placed:
+def place_moved(points_mm: Points, places: FloatArray, like: Plane) -> BoardPlace:
     """Return where a board is for points (M, N, 3) at `places` (N, 2) on it, in squares: M times those that `like` was
     fitted to, moved a little."""
     used = points_mm[:, like.used]
     many = np.swapaxes(used, 0, 1).reshape(used.shape[1], -1)
     steps, *_ = np.linalg.lstsq(_design(places[like.used]), many, rcond=None)
-    return Placed(*fit_moved(points_mm, like), np.swapaxes(steps.reshape(3, len(used), 3), 0, 1))
+    return BoardPlace(*fit_moved(points_mm, like), np.swapaxes(steps.reshape(3, len(used), 3), 0, 1))
 
 
 def measure_board(

@@ -27,8 +27,8 @@ def colmap_reconstruction(reconstruction: Reconstruction, pair: ColmapPair, resu
     known = (cloud.board_index[which], cloud.grid[which], reconstruction.boards)
     # COLMAP's covariance is for corners of 1 px; 4N residuals fix 3N + 5 unknowns.
     variance = max(result.rms_px**2 * 2.0 * len(which) / max(len(which) - 5, 1), BEST_CORNER_PX**2)
-    sights = (each[which] for each in reconstruction.sights())
-    spread, by_pose = point_uncertainty(unit_points, result.adjusted, *sights)
+    observed = (each[which] for each in reconstruction.measured_rays())
+    spread, by_pose = point_uncertainty(unit_points, result.adjusted, *observed)
     scale, scale_sigma, d_scale_d_points = scale_and_gradient(unit_points, *known, variance * spread)
     picked = {name: getattr(cloud, name)[which] for name in PER_POINT}
     metric = replace(

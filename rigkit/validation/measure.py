@@ -20,7 +20,7 @@ from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.triangulation import point_uncertainty
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.validation.boards import BoardResult, Placed, measure_board, place_moved, places_on
+from rigkit.validation.boards import BoardPlace, BoardResult, measure_board, place_moved, places_on
 from rigkit.validation.planes import angle_jacobian, face_angle, normal_errors
 
 Boards = dict[str, BoardResult]
@@ -38,7 +38,7 @@ class Measured:
     """
 
     boards: Boards
-    moved: Mapping[str, Placed]
+    moved: Mapping[str, BoardPlace]
 
     def with_normals(self, reconstruction: Reconstruction) -> Measured:
         """Return the same for a reconstruction that differs in its normals only."""
@@ -91,7 +91,9 @@ def measure(
     """
     cloud = reconstruction.cloud
     # Only the ratios of these covariances count, as weights across the plane: one pixel is as good a sigma as any.
-    covariance, by_pose = point_uncertainty(cloud.points_mm, reconstruction.cam2_from_cam1, *reconstruction.sights())
+    covariance, by_pose = point_uncertainty(
+        cloud.points_mm, reconstruction.cam2_from_cam1, *reconstruction.measured_rays()
+    )
     usable = weighted and bool(np.isfinite(covariance).all())
     moves = [np.zeros((0, len(cloud), 3))]
     if reconstruction.pose_covariance is not None:
@@ -101,7 +103,7 @@ def measure(
     common = np.concatenate(moves)
     points = cloud.points_mm + np.concatenate([np.zeros((1, len(cloud), 3)), common])
     boards: Boards = {}
-    moved: dict[str, Placed] = {}
+    moved: dict[str, BoardPlace] = {}
     for index, board in enumerate(reconstruction.boards):
         on = cloud.board_index == index
         if on.any():
@@ -112,7 +114,7 @@ def measure(
     return Measured(boards, moved)
 
 
-def _distance(boards: Boards, placed: Mapping[str, Placed], distance: MeasuredDistance) -> FloatArray:
+def _distance(boards: Boards, placed: Mapping[str, BoardPlace], distance: MeasuredDistance) -> FloatArray:
     """Return a distance (...), mm, between features of `boards` that are where `placed` says."""
     a, b = distance.a, distance.b
     if a.is_plane:

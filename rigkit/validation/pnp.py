@@ -49,14 +49,14 @@ def planar_pnp(reconstruction: Reconstruction) -> PnpResult:
 
     Raises DegenerateError where no board has eight corners.
     """
-    sights = _sights([reconstruction])
-    if not sights:
+    seen = _board_rays([reconstruction])
+    if not seen:
         raise DegenerateError(
             f"pair '{reconstruction.pair_id}': no board has {MIN_CORNERS_FOR_PNP} corners for its own pose; "
             "take images that show whole boards"
         )
-    poses = {b: (board_pose(s.rays1[0], s.points), board_pose(s.rays2[0], s.points)) for b, s in sights.items()}
-    counts = {b: len(s.points) for b, s in sights.items()}
+    poses = {b: (board_pose(s.rays1[0], s.points), board_pose(s.rays2[0], s.points)) for b, s in seen.items()}
+    counts = {b: len(s.points) for b, s in seen.items()}
     pose, covariance = _mean_pose([_relative(*both) for both in poses.values()], reconstruction.cam2_from_cam1)
     total = sum(counts.values())
     square = sum(counts[b] * (one.rms_rad**2 + two.rms_rad**2) / 2.0 for b, (one, two) in poses.items()) / total
@@ -80,7 +80,7 @@ def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg]
     """
     ones: dict[str, tuple[BoardPose, ...]] = {}
     twos: dict[str, tuple[BoardPose, ...]] = {}
-    for name, seen in _sights(moved).items():
+    for name, seen in _board_rays(moved).items():
         ones[name], twos[name] = (
             moved_board_poses(rays, seen.points, board_pose(rays[0], seen.points).cam_from_board)
             for rays in (seen.rays1, seen.rays2)
@@ -94,7 +94,7 @@ def moved_pnp(moved: Sequence[Reconstruction]) -> tuple[tuple[Rigid3, AnglesDeg]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Sight:
+class _BoardRays:
     """A board's corners (N, 3), mm, and the rays to them in M cameras of either view, (M, N, 3)."""
 
     points: Points
@@ -102,7 +102,7 @@ class _Sight:
     rays2: Rays
 
 
-def _sights(reconstructions: Sequence[Reconstruction]) -> dict[str, _Sight]:
+def _board_rays(reconstructions: Sequence[Reconstruction]) -> dict[str, _BoardRays]:
     """Return by id the boards with enough corners that every camera of these reconstructions of one pair sees."""
     first = reconstructions[0]
     rays1, seen1 = zip(*(r.camera1.unproject(r.pixels1) for r in reconstructions), strict=True)
@@ -113,7 +113,7 @@ def _sights(reconstructions: Sequence[Reconstruction]) -> dict[str, _Sight]:
         on = (first.cloud.board_index == index) & seen
         if int(on.sum()) >= MIN_CORNERS_FOR_PNP:
             points = board.points(first.cloud.grid[on])
-            out[board.board_id] = _Sight(points, np.array(rays1)[:, on], np.array(rays2)[:, on])
+            out[board.board_id] = _BoardRays(points, np.array(rays1)[:, on], np.array(rays2)[:, on])
     return out
 
 

@@ -108,7 +108,7 @@ def frames_of_videos(
     kept = _kept_before(folder, asked)
     if kept is not None:
         return kept
-    keeper = _Keeper(folder, FrameChoice(most))
+    keeper = _FrameFolder(folder, FrameChoice(most))
     looked_at = with_boards = 0
     with ExitStack() as stack:
         videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
@@ -227,7 +227,7 @@ def with_frames(session: Session | RigSession, progress: Progress = silent) -> S
     return replace(session, cameras=cameras) if isinstance(session, RigSession) else cameras[""]
 
 
-class _Keeper:
+class _FrameFolder:
     """Writes what the choice keeps. The newest frame is held back: a sharper one of the same view may follow."""
 
     def __init__(self, folder: Path, choice: FrameChoice) -> None:

@@ -32,7 +32,7 @@ from rigkit.workflows.folder_session import cameras_in
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Frame:
+class _VideoFrame:
     """A frame of a video, for an image's file."""
 
     video: Video
@@ -46,7 +46,7 @@ class _Frame:
         return f"{self.video.source}, frame {self.number}"
 
 
-Jobs = list[tuple[list[tuple[Path | _Frame, Path]], RectifyMap]]
+Jobs = list[tuple[list[tuple[Path | _VideoFrame, Path]], RectifyMap]]
 """Of each map: the images, and where they go."""
 _log = logging.getLogger(__name__)
 
@@ -184,7 +184,7 @@ def rectify_stereo_images(
 
 def _pairs(
     images: tuple[str | Path, str | Path] | str | Path, names: tuple[str, str], stack: ExitStack
-) -> tuple[Sequence[Sequence[Path | _Frame]], dict[str, InputError]]:
+) -> tuple[Sequence[Sequence[Path | _VideoFrame]], dict[str, InputError]]:
     """Return each camera's images, in one order, and why others have no partner."""
     if isinstance(images, (str, Path)):
         cameras = cameras_in([Path(images)])
@@ -226,7 +226,7 @@ def _pairs(
     return [[own[frame] for frame in both] for own in frames], single
 
 
-def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _Frame]:
+def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _VideoFrame]:
     """Return an image, those of a folder, or the frames of a video, which is open until `stack` ends."""
     if source.is_dir():
         return list(images_in([source]))
@@ -239,17 +239,17 @@ def _sources(source: Path, stack: ExitStack) -> Sequence[Path | _Frame]:
     if count == 0:
         raise InputError(f"rectify: no frame of video '{source}' can be decoded; convert it to MP4")
     opened = stack.enter_context(Video(source, colour=True))
-    return [_Frame(opened, number) for number in range(count)]
+    return [_VideoFrame(opened, number) for number in range(count)]
 
 
-def _file(source: Path | _Frame) -> Path:
-    return source.video.source if isinstance(source, _Frame) else source
+def _file(source: Path | _VideoFrame) -> Path:
+    return source.video.source if isinstance(source, _VideoFrame) else source
 
 
-def _require_sizes(sources: Sequence[Path | _Frame], size_px: tuple[int, int], calibration: str | Path) -> None:
+def _require_sizes(sources: Sequence[Path | _VideoFrame], size_px: tuple[int, int], calibration: str | Path) -> None:
     """Refuse a video, or an image that is alone, of another size, before the map: that takes as long as it is large."""
     first = sources[0]
-    if isinstance(first, _Frame):
+    if isinstance(first, _VideoFrame):
         require_size(first.video.size_px, f"video '{first.video.source}'", size_px, calibration)
     elif len(sources) == 1:
         read_image_of(first, size_px, calibration)
@@ -259,7 +259,7 @@ def _is_folder(output: Path) -> bool:
     return not output.suffix or output.is_dir()
 
 
-def _outputs(images: Sequence[Path | _Frame], folder: Path) -> list[tuple[Path | _Frame, Path]]:
+def _outputs(images: Sequence[Path | _VideoFrame], folder: Path) -> list[tuple[Path | _VideoFrame, Path]]:
     """Return (image, where it goes): with its name into the folder."""
     names = [one.name if cv2.haveImageWriter(one.name) else f"{Path(one.name).stem}.png" for one in images]
     return [(one, folder / name) for one, name in zip(images, names, strict=True)]
@@ -308,7 +308,7 @@ def _write(
 
 
 def _rectified(
-    source: Path | _Frame,
+    source: Path | _VideoFrame,
     to: Path,
     size_px: tuple[int, int],
     calibration: str | Path,

@@ -26,7 +26,7 @@ from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.detection.saddles.saddle import Saddles
-from rigkit.kernels.growth import FitRules, GrowthRules, Squares, grown
+from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules, grown
 
 MAX_RINGS = 60
 """More rings than any board has rows or columns."""
@@ -79,13 +79,13 @@ def grow_all(
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
     tried = fruitless = 0
-    squares: Squares | None = None
+    squares: GridBuckets | None = None
     for lattice in lattices:
         if tried == MAX_GROWN or fruitless == MAX_FRUITLESS:
             break
         if _covered(lattice, taken):
             continue
-        squares = squares or Squares.sorted(saddles.pixels)
+        squares = squares or GridBuckets.sorted(saddles.pixels)
         lattice, good = _grown(lattice, squares, level, promising)
         tried += 1
         taken = np.concatenate([taken, lattice.pixels[lattice.known]])
@@ -102,7 +102,7 @@ def _covered(lattice: Lattice, corners: FloatArray) -> bool:
 
 
 def _grown(
-    lattice: Lattice, saddles: Squares, level: Level, promising: Callable[[Lattice], bool]
+    lattice: Lattice, saddles: GridBuckets, level: Level, promising: Callable[[Lattice], bool]
 ) -> tuple[Lattice, bool]:
     """Return `lattice` with all corners that can be added one after the other, and whether it is `promising`.
 
@@ -121,7 +121,7 @@ def _grown(
     return lattice, judged or promising(lattice)
 
 
-def _grow(lattice: Lattice, saddles: Squares, level: Level, rings: int) -> int:
+def _grow(lattice: Lattice, saddles: GridBuckets, level: Level, rings: int) -> int:
     """Grow a `lattice` that nobody has looked at yet IN PLACE, by at most so many `rings`, each from all known before.
 
     Returns the rings that are left when it has reached the border of its arrays, -1 when it has grown all it can.

@@ -75,7 +75,7 @@ class FusedCloud:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Surface:
+class _MergedSurface:
     """A cloud in the world, and what later clouds add to it."""
 
     posed: PosedCloud
@@ -102,7 +102,7 @@ def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
         raise InputError("clouds: there is none to fuse")
     # The clouds that know their points best come first: they see what is merged into them.
     order = sorted(range(len(clouds)), key=lambda k: float(np.median(clouds[k].cloud.sigma_mm)))
-    surfaces: list[_Surface] = []
+    surfaces: list[_MergedSurface] = []
     for k in order:
         later = _surface(clouds[k])
         for earlier in surfaces:
@@ -111,13 +111,13 @@ def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
     return _fused(surfaces, order)
 
 
-def _surface(posed: PosedCloud) -> _Surface:
+def _surface(posed: PosedCloud) -> _MergedSurface:
     cloud, turn = posed.cloud, posed.world_from_cam.rotation
     rays = unit(cloud.points_mm)
     normals, errors = cloud.normals @ turn.T, (cloud.sigma_mm[:, None] * rays) @ turn.T
     variance = _variance(errors, normals)
     sure = _information(cloud.normal_sigma_rad)
-    return _Surface(
+    return _MergedSurface(
         posed=posed,
         points=posed.world_from_cam.apply(cloud.points_mm),
         normals=normals,
@@ -146,7 +146,7 @@ def _information(sigma: FloatArray) -> FloatArray:
     return np.asarray(1.0 / np.where(known, sigma, usual) ** 2)
 
 
-def _merge(earlier: _Surface, later: _Surface) -> None:
+def _merge(earlier: _MergedSurface, later: _MergedSurface) -> None:
     """Add to `earlier` what `later` says of its points, and keep these no more in `later`."""
     from scipy.spatial import cKDTree
 
@@ -176,7 +176,7 @@ def _merge(earlier: _Surface, later: _Surface) -> None:
     later.keep[left] = False
 
 
-def _fused(surfaces: Sequence[_Surface], order: Sequence[int]) -> FusedCloud:
+def _fused(surfaces: Sequence[_MergedSurface], order: Sequence[int]) -> FusedCloud:
     def joined(of: Sequence[FloatArray]) -> FloatArray:
         return np.concatenate([values[s.keep] for values, s in zip(of, surfaces, strict=True)])
 

@@ -150,7 +150,7 @@ def _finalists(
     if kind in (PoseType.STANDARD, PoseType.FORWARD):
         return fundamental_for(kind).solve(matches, "points").E21[None], 0
     size = _sample_size(matches, kind, sample)
-    finalists, trials = _Search(matches, rows, kind, sample, size, max_noise).run(rng)
+    finalists, trials = _ConsensusSearch(matches, rows, kind, sample, size, max_noise).run(rng)
     if not len(finalists):
         raise DegenerateError(f"no pose in {trials} samples of {len(matches)} matches; check how they were matched")
     return finalists, trials
@@ -240,7 +240,7 @@ def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Search:
+class _ConsensusSearch:
     """Sampling with local optimisation of promising hypotheses."""
 
     matches: Matches

@@ -141,7 +141,7 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
     """
     if not views:
         raise InputError("check: no board was found in the pictures; take sharp ones in which the whole board is seen")
-    found = _Placed.of(watched, views)
+    found = _PosedBoards.of(watched, views)
     for _ in range(POSE_ROUNDS):
         products = found.products(watched)
         n = watched.layout.count
@@ -175,14 +175,14 @@ def told_by(
     """
     frames = np.arange(len(rotation))
     observations = tuple(observations_of(own, (board,)) for own in seen)
-    placed = _Placed(
+    placed = _PosedBoards(
         rotation, translation_mm, frames, observations, (frames,) * len(seen), tuple(o.weight for o in observations)
     )
     return reduced_by_cluster(placed.products(watched), watched.layout.count, frames)[0]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Placed:
+class _PosedBoards:
     """Boards in frames (G of them, each with a pose rig_from_board and the number of its frame), and per camera its
     observations, which board each is of, and its weights without what is no corner."""
 
@@ -194,7 +194,7 @@ class _Placed:
     weight: tuple[FloatArray, ...]
 
     @classmethod
-    def of(cls, watched: Watched, views: Sequence[FreshView]) -> _Placed:
+    def of(cls, watched: Watched, views: Sequence[FreshView]) -> _PosedBoards:
         keys = list(dict.fromkeys((v.frame, v.view.board.board_id) for v in views))
         number = {key: k for k, key in enumerate(keys)}
         frames = {name: k for k, name in enumerate(dict.fromkeys(frame for frame, _ in keys))}
@@ -254,7 +254,7 @@ class _Placed:
             np.add.at(out, self.group[c], np.swapaxes(follow, -1, -2) @ own @ follow)
         return out
 
-    def moved(self, step: FloatArray) -> _Placed:
+    def moved(self, step: FloatArray) -> _PosedBoards:
         """Return the boards after steps (G, 6) of their poses."""
         rotation = exp_so3(step[:, :3]) @ self.rotation
         return replace(self, rotation=rotation, translation_mm=self.translation_mm + step[:, 3:])

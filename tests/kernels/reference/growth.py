@@ -39,7 +39,7 @@ from rigkit.detection.lattice.links import (
 )
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF, LocalFit, _local_fit
 from rigkit.detection.saddles.response import Level
-from rigkit.kernels.growth import FitRules, GrowthRules, Squares
+from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules
 
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
@@ -92,7 +92,7 @@ def grown(
     image: np.ndarray,
     scale: float,
     offset: float,
-    saddles: Squares,
+    saddles: GridBuckets,
     rules: GrowthRules,
     rings: int,
 ) -> int:
