@@ -93,7 +93,7 @@ def affine_rows(corners: int) -> Iterator[Row]:
     """Affine estimators and normals; remark: the largest difference to the loop's answers."""
     rng = np.random.default_rng(1)
     m = scene(rng, corners)
-    epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, essential_from_pose(POSE))
+    epipolar = EpipolarNormals.of_matches(m, essential_from_pose(POSE))
     assert m.A21 is not None
     for count in (3, 6):
         d = noisy_directions(rng, m.A21, count)

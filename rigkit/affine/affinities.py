@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, Pixels, RayJacobians, Rays, as_array, as_floats
 from rigkit.core.errors import InputError
-from rigkit.core.matches import DirectionPairs
+from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.core.printing import brief
 from rigkit.geometry.sampson import epipolar_normals
 
@@ -56,6 +56,11 @@ class EpipolarNormals:
         """Build from unit rays (N, 3), ray Jacobians (N, 3, 2) and the essential matrix: any central camera."""
         _, n1, n2 = epipolar_normals(E21, rays1, rays2, ray_jacobians1, ray_jacobians2)
         return cls(n1, n2)
+
+    @classmethod
+    def of_matches(cls, m: Matches, E21: Mat3) -> EpipolarNormals:
+        """Build from the rays of matches and the essential matrix."""
+        return cls.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
 
     @classmethod
     def from_F(cls, F21: Mat3, pixels1: Pixels, pixels2: Pixels) -> EpipolarNormals:

@@ -97,7 +97,7 @@ def run_scene(args: argparse.Namespace) -> int:
         print_json({"output": str(out), "ply": CLOUD, **done.figures()})
     else:
         print(
-            f"{out / CLOUD}: {len(r.cloud)} points ({done.unit}) of {len(done.correspondences)} correspondences, "
+            f"{out / CLOUD}: {len(r.cloud)} points ({scene.unit}) of {len(done.correspondences)} correspondences, "
             f"{scene.inliers.sum()} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
         )
     return ExitCode.WELL

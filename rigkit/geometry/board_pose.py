@@ -45,6 +45,12 @@ class BoardPose:
     covariance: FloatArray
 
 
+def facing_normal(cam_from_board: Rigid3) -> FloatArray:
+    """Return the unit normal (3,) of a board, towards the camera."""
+    normal = cam_from_board.rotation[:, 2]
+    return np.asarray(-np.sign(normal @ cam_from_board.translation_mm) * normal)
+
+
 def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
     """Return the pose of a flat target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, Mat3, RayJacobians, Rays
+from rigkit.core.matches import Matches
 
 
 def epipolar_normals(
@@ -47,3 +48,9 @@ def sampson_distances(
     c, n1, n2 = epipolar_normals(E21, rays1, rays2, jacobians1, jacobians2)
     variance = sigma1_px**2 * np.sum(n1 * n1, axis=-1) + sigma2_px**2 * np.sum(n2 * n2, axis=-1)
     return np.asarray(np.divide(c, np.sqrt(variance), out=np.zeros_like(c), where=variance > 0.0))
+
+
+def sampson_of_matches(E21: Mat3, m: Matches, *, in_sigmas: bool = False) -> FloatArray:
+    """Return the signed Sampson distance (N,) of each match, in px or in its own standard deviations."""
+    sigmas = (m.sigma1_px, m.sigma2_px) if in_sigmas else (1.0, 1.0)
+    return sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, *sigmas)

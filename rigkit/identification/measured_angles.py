@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.truth import MeasuredAngle
+from rigkit.geometry.board_pose import facing_normal
 from rigkit.geometry.rotation import angle_between
 from rigkit.identification.pair_identity import PairIdentity
 from rigkit.identification.placements import board_kinds
@@ -43,10 +44,7 @@ def ids_by_angles(
     -------
     Each entry maps present ids to new ids. Where the angles favour several, all are returned, fewest changes first.
     """
-    faces = {}
-    for board_id, pose in identity.cam1_from_board.items():
-        normal = pose.rotation[:, 2]
-        faces[board_id] = -np.sign(normal @ pose.translation_mm) * normal
+    faces = {board_id: facing_normal(pose) for board_id, pose in identity.cam1_from_board.items()}
     known = [a for a in angles if a.a in faces and a.b in faces]
     choices = list(_exchanged_ids([b for b in boards if b.board_id in faces])) if known else []
     if not choices:

@@ -19,6 +19,7 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
+from rigkit.geometry.board_pose import facing_normal
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 from rigkit.identification.joint_pose import BoardCorners, joint_residuals, moved_poses
@@ -57,9 +58,7 @@ class LatticePlanes(BoardPlanes):
 
     def normal(self, board_id: str) -> FloatArray:
         """Return the unit normal (3,) of a board, facing camera 1."""
-        pose = self.cam1_from_board[board_id]
-        normal = pose.rotation[:, 2]
-        return np.asarray(-np.sign(normal @ pose.translation_mm) * normal)
+        return facing_normal(self.cam1_from_board[board_id])
 
     def has_points(self, board: Board, grid: FloatArray) -> BoolArray:
         """Return which of the corners `grid` (N, 2) of a board are known: all, or none of a board that is not."""

@@ -130,7 +130,7 @@ def _affinities(chords: MatchedPair, method: str) -> Affinities:
     epipolar = None
     if needs_epipolar(method):
         E21 = fundamental_for("general").solve(m, "equal").E21
-        epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+        epipolar = EpipolarNormals.of_matches(m, E21)
     return affines_from_directions(
         chords.directions, method, epipolar=epipolar, scale=PAPER_SCALE, epipolar_rows="soft", min_conditioning=0.0
     )

@@ -29,7 +29,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief, drawn
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.coplanar_planes import coplanar_planes
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
@@ -244,7 +244,7 @@ def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruc
     pixels1, pixels2 = reconstruction.pixels1[placed], reconstruction.pixels2[placed]
     m = Matches.from_cameras(reconstruction.camera1, reconstruction.camera2, pixels1, pixels2)
     E21 = essential_from_pose(planes.cam2_from_cam1)
-    distances = sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+    distances = sampson_of_matches(E21, m)
     return replace(
         reconstruction,
         matches=reconstruction.matches.select(placed),
@@ -289,7 +289,7 @@ def _affinities(pair: MatchedPair, method: str, E21: Mat3, scale: str) -> Affini
     m = pair.matches
     epipolar = None
     if needs_epipolar(method):
-        epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+        epipolar = EpipolarNormals.of_matches(m, E21)
     return affines_from_directions(pair.directions, method, epipolar=epipolar, scale=scale, noise=pair.noise)
 
 

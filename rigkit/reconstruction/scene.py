@@ -33,6 +33,7 @@ from rigkit.relative_pose.solvers.weights import usable_affinities
 
 MAX_RANGE_SIGMA = 0.3
 """A point whose distance is known no better than this share of it is left out: it could be anywhere along its ray."""
+NO_DISTANCE = "no point's distance is known; the baseline is too short for this scene"
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
 PIXELS_A_SIDE = 9
@@ -65,6 +66,11 @@ class SceneReconstruction:
     sigma_A: float
 
     __repr__ = brief
+
+    @property
+    def unit(self) -> str:
+        """The unit of lengths: "mm", or "baselines" where none was measured."""
+        return "mm" if self.metric else "baselines"
 
 
 def reconstruct_scene(
@@ -217,7 +223,7 @@ def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
         A21[good] = m.A21[good]
         covariance[good] = m.sigma_A[good, None, None] ** 2 * np.eye(4)
     if found.directions is not None:
-        epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+        epipolar = EpipolarNormals.of_matches(m, E21)
         computed = affines_from_directions(found.directions, "F3UDIR", epipolar=epipolar).A21
         A21 = np.where(np.isfinite(A21), A21, computed)
     A21[~fit.inliers] = np.nan
@@ -238,7 +244,7 @@ def _cloud(
     cloud, kept = oriented_cloud(points, fit.matches, pose, covariance, affinities, colours=colours)
     sure = cloud.sigma_mm < MAX_RANGE_SIGMA * np.linalg.norm(cloud.points_mm, axis=1)
     if not sure.any():
-        raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
+        raise DegenerateError(NO_DISTANCE)
     return replace(cloud.select(sure), from_origin=True), np.flatnonzero(kept)[sure], affinities
 
 

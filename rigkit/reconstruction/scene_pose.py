@@ -12,7 +12,7 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import rotation_angle
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
 from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
@@ -195,9 +195,7 @@ def _a_contrario_test(matches: Matches, pose: Rigid3, inliers: BoolArray, freedo
 
 
 def _in_sigmas(matches: Matches, pose: Rigid3) -> FloatArray:
-    m = matches
-    E21 = essential_from_pose(pose)
-    return sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.sigma1_px, m.sigma2_px)
+    return sampson_of_matches(essential_from_pose(pose), matches, in_sigmas=True)
 
 
 def _agreeing(matches: Matches, pose: Rigid3) -> BoolArray:

@@ -82,6 +82,11 @@ class BoardResult:
     right_handed: bool
 
     @property
+    def size_ratio(self) -> float:
+        """Reconstructed over measured size of a square, its sides taken together."""
+        return float(np.sqrt(self.square_x_ratio * self.square_y_ratio))
+
+    @property
     def placed(self) -> BoardPlace:
         """Where the board is."""
         return BoardPlace(self.plane.normal, np.asarray(self.plane.offset_mm), self.lattice.steps_mm)

@@ -45,7 +45,7 @@ def contradicted_boards(boards: Mapping[str, BoardResult], layout: Mapping[str, 
 
     Of two boards that disagree nobody knows which one is wrong: both fail.
     """
-    ratio = {name: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for name, b in boards.items()}
+    ratio = {name: b.size_ratio for name, b in boards.items()}
     checks = []
     sides = _sides(boards, layout)
     for name, found in boards.items():

@@ -140,7 +140,7 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
 def _diagnose_boards(report: ValidationReport) -> list[str]:
     """Return boards whose squares do not agree with those of the others, or that are mirrored."""
     out = []
-    ratios = {b.board.board_id: float(np.sqrt(b.square_x_ratio * b.square_y_ratio)) for b in report.boards}
+    ratios = {b.board.board_id: b.size_ratio for b in report.boards}
     middle = float(np.median(list(ratios.values())))
     for result in report.boards:
         name, board = result.board.board_id, result.board

@@ -103,6 +103,7 @@ def _angle(planes: BoardPlanes | None, a: str, b: str) -> tuple[float | None, fl
 def normal_errors_against(reconstruction: Reconstruction, planes: BoardPlanes | None) -> dict[str, NormalErrors]:
     """Return the errors of a cloud's normals against those of the boards' planes, by board; none without planes."""
     cloud = reconstruction.cloud
-    of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
-    names = () if planes is None else planes.board_ids
-    return {n: normal_errors(of[n], planes.normal(n)) for n in names if planes is not None and len(of.get(n, ()))}
+    if planes is None:
+        return {}
+    of = {name: cloud.normals[cloud.on_board(name)] for name in planes.board_ids if name in cloud.board_ids}
+    return {name: normal_errors(own, planes.normal(name)) for name, own in of.items() if len(own)}

@@ -43,9 +43,8 @@ class Measured:
     def with_normals(self, reconstruction: Reconstruction) -> Measured:
         """Return the same for a reconstruction that differs in its normals only."""
         cloud = reconstruction.cloud
-        of = {board.board_id: cloud.normals[cloud.board_index == n] for n, board in enumerate(reconstruction.boards)}
         boards = {
-            name: replace(found, normal_errors=normal_errors(of[name], found.plane.normal))
+            name: replace(found, normal_errors=normal_errors(cloud.normals[cloud.on_board(name)], found.plane.normal))
             for name, found in self.boards.items()
         }
         return replace(self, boards=boards)

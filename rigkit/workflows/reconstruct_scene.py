@@ -120,11 +120,6 @@ class SceneResult:
 
     __repr__ = brief
 
-    @property
-    def unit(self) -> str:
-        """The unit of lengths: "mm", or "baselines" where none was measured."""
-        return "mm" if self.scene.metric else "baselines"
-
     def figures(self) -> dict[str, Any]:
         """Return the figures of the scene for programs, as JSON takes them."""
         r = self.scene.reconstruction
@@ -133,7 +128,7 @@ class SceneResult:
             "correspondences": len(self.correspondences),
             "inliers": int(self.scene.inliers.sum()),
             "points": len(r.cloud),
-            "unit": self.unit,
+            "unit": self.scene.unit,
             "cam2_from_cam1": r.cam2_from_cam1.matrix().tolist(),
             "pose_covariance": None if r.pose_covariance is None else r.pose_covariance.tolist(),
             "sigma_px": self.scene.sigma_px,
@@ -308,8 +303,7 @@ def _grown(
 def _files(
     options: SceneOptions, scene: SceneReconstruction, found: Correspondences, images: Images | None
 ) -> dict[str, str | bytes]:
-    r = scene.reconstruction
-    unit = "mm" if scene.metric else "baselines"
+    r, unit = scene.reconstruction, scene.unit
     files: dict[str, str | bytes] = {
         CLOUD: ply_bytes(r.cloud, unit=unit, single_precision=options.single_precision, confidence=options.confidence)
     }

@@ -37,7 +37,7 @@ def normals_of(
     """The pipeline's steps at these pixels with this pose."""
     m = Matches.from_cameras(camera, camera, pixels1, pixels2)
     E21 = skew(pose.translation_mm) @ pose.rotation
-    e = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+    e = EpipolarNormals.of_matches(m, E21)
     A21 = affines_from_directions(c.directions(), method, epipolar=e, min_conditioning=0.0).A21
     points, _ = triangulate_rays(m.rays1, m.rays2, pose, jacobians1=m.jacobians1, jacobians2=m.jacobians2)
     J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, pose)

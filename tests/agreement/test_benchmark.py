@@ -32,7 +32,7 @@ def core() -> Any:
 @pytest.mark.parametrize("method", AFFINE_METHODS)
 def test_affinities(core: Any, method: str, count: int, rng: np.random.Generator) -> None:
     m = core.scene(rng, CORNERS)
-    epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, essential_from_pose(core.POSE))
+    epipolar = EpipolarNormals.of_matches(m, essential_from_pose(core.POSE))
     d = core.noisy_directions(rng, m.A21, count)
     batched = affines_from_directions(d, method, epipolar=epipolar, min_conditioning=0.0).A21
     each = zip(d.image1, d.image2, epipolar.n1, epipolar.n2, strict=True)

@@ -85,7 +85,7 @@ def see(
                 return None
         m = Matches.from_cameras(camera1, camera2, q1, q2)
         E21 = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
-        e = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, E21)
+        e = EpipolarNormals.of_matches(m, E21)
         J1, J2 = pair_projection_jacobians(points, m.rays1, m.jacobians1, m.rays2, m.jacobians2, cam2_from_cam1)
         A21, _ = affines_from_normals(J1, J2, normals)
         steps = SQUARE_MM * np.stack([R[:, 0], R[:, 1], R[:, 0] + R[:, 1]])

@@ -120,7 +120,7 @@ def test_affinities_from_the_epipolar_geometry_tell_nothing_about_it(rng):
     """F3UDIR's affinities fulfil the geometry that they were computed with, right or wrong: using them is circular."""
     m, pose, _ = pair(rng, 40, noise_px=0.5, sigma_A=0.0)
     wrong = fundamental_for("general").solve(m, "points").E21
-    epipolar = EpipolarNormals.from_rays(m.rays1, m.jacobians1, m.rays2, m.jacobians2, wrong)
+    epipolar = EpipolarNormals.of_matches(m, wrong)
     angle = rng.uniform(0.0, np.pi, (40, 1)) + np.arange(3.0)
     d1 = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     assert m.A21 is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.epipolar_scenes import pair
 
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.relative_pose.robust.a_contrario import log_false_alarms
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
@@ -19,7 +19,7 @@ ALL = np.ones(80, dtype=bool)
 
 def fits(m, pose):
     E21 = essential_from_pose(pose)
-    r = sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.sigma1_px, m.sigma2_px)
+    r = sampson_of_matches(E21, m, in_sigmas=True)
     return np.abs(r) < GATE
 
 

@@ -19,7 +19,7 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
@@ -28,7 +28,7 @@ from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
 from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
-from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, SceneReconstruction, in_unit
+from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, NO_DISTANCE, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
 from rigkit.relative_pose.refinement.residuals import point_terms
 from rigkit.relative_pose.solvers.pose import essential_from_pose, translation_basis
@@ -237,8 +237,7 @@ def _floored(matches: Matches) -> Matches:
 
 
 def _distances(matches: Matches, pose: Rigid3) -> FloatArray:
-    m = matches
-    return sampson_distances(essential_from_pose(pose), m.rays1, m.rays2, m.jacobians1, m.jacobians2)
+    return sampson_of_matches(essential_from_pose(pose), matches)
 
 
 def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
@@ -329,7 +328,7 @@ def _cloud(
     of_normal = across @ covariance @ across / np.sum(plane**2, axis=1)[:, None, None]
     sure = np.isfinite(sigma_mm) & (sigma_mm < MAX_RANGE_SIGMA * size)
     if not sure.any():
-        raise DegenerateError("no point's distance is known; the baseline is too short for this scene")
+        raise DegenerateError(NO_DISTANCE)
     count = int(sure.sum())
     cloud = OrientedCloud(
         points_mm=points[sure],

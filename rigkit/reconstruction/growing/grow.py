@@ -88,6 +88,11 @@ class LineKnowledge:
         return replace(self, E21=self.E21.T)
 
 
+def only(keep: BoolArray, values: FloatArray) -> FloatArray:
+    """Return the values (R, C, ...) of the nodes `keep` (R, C), NaN at the others."""
+    return np.where(keep.reshape(*keep.shape, *(1,) * (values.ndim - 2)), values, np.nan)
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class GrownPatches:
     """Pairs on a grid of nodes in image 1, NaN where there is none, at its node or near it.
@@ -148,16 +153,13 @@ class GrownPatches:
     def where(self, keep: BoolArray) -> GrownPatches:
         """Return the pairs of the nodes `keep` (R, C) alone."""
 
-        def kept(values: FloatArray) -> FloatArray:
-            return np.where(keep.reshape(*keep.shape, *(1,) * (values.ndim - 2)), values, np.nan)
-
         return replace(
             self,
-            pixels2=kept(self.pixels2),
-            A21=kept(self.A21),
-            correlation=kept(self.correlation),
-            coarser=kept(self.coarser),
-            covariance=kept(self.covariance),
+            pixels2=only(keep, self.pixels2),
+            A21=only(keep, self.A21),
+            correlation=only(keep, self.correlation),
+            coarser=only(keep, self.coarser),
+            covariance=only(keep, self.covariance),
         )
 
     def correspondences(self) -> Correspondences:

@@ -24,7 +24,7 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.planes import fitted_planes
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
-from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches
+from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches, only
 
 PLANE_REACH_PX = 2.0 * HALF_WIDTH
 """To either side, of the nodes that a plane is fitted to: those further away share no texture with the middle one."""
@@ -84,9 +84,7 @@ class GrownSurface:
 
     def where(self, keep: BoolArray) -> GrownSurface:
         """Return the planes of the nodes `keep` (R, C) alone."""
-        known: dict[str, Any] = {
-            f.name: _where(keep, getattr(self, f.name)) for f in fields(self) if f.name != "at_end"
-        }
+        known: dict[str, Any] = {f.name: only(keep, getattr(self, f.name)) for f in fields(self) if f.name != "at_end"}
         return replace(self, **known)
 
 
@@ -210,19 +208,19 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         misfit = (measured.z[..., 0] - inverse) * measured.slope
     spread = np.full(normal.shape, np.nan)
     spread[keep] = _inverse(normal[keep])
-    at_end = _at_ends(_where(keep, plane), measured, step)
+    at_end = _at_ends(only(keep, plane), measured, step)
     missed = np.abs(misfit) / (measured.slope * np.sqrt(measured.covariance[..., 0, 0]))
     for alike in (keep & measured.swept, keep & ~measured.swept):
-        scale = _disagreement(_where(alike, normals), _where(alike, plane), _where(alike, spread), 2 * reach)
+        scale = _disagreement(only(alike, normals), only(alike, plane), only(alike, spread), 2 * reach)
         spread[alike] *= max(scale, 1.0) ** 2
         ends, inner = missed[alike & at_end], missed[alike & ~at_end]
         if min(ends.size, inner.size) >= MIN_COMPARED:
             spread[alike & at_end] *= max(float(np.median(ends) / np.median(inner)), 1.0) ** 2
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
-        points=_where(keep, points),
-        normals=_where(keep, normals),
-        plane=_where(keep, plane),
+        points=only(keep, points),
+        normals=only(keep, normals),
+        plane=only(keep, plane),
         covariance=spread,
         at_end=at_end,
     )
@@ -263,7 +261,3 @@ def _inverse(normal: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", normal))
     both = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.inv(normal * both) * both)
-
-
-def _where(keep: BoolArray, values: FloatArray) -> FloatArray:
-    return np.where(keep.reshape(*keep.shape, *(1,) * (values.ndim - 2)), values, np.nan)

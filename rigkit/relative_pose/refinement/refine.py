@@ -18,7 +18,7 @@ from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.geometry.sampson import epipolar_normals, sampson_distances
+from rigkit.geometry.sampson import epipolar_normals, sampson_of_matches
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.pose_problem import PoseMinimum, PoseProblem, RobustWeights
 from rigkit.relative_pose.refinement.residuals import whitened_affinities
@@ -233,7 +233,7 @@ def _result(problem: PoseProblem, end: PoseMinimum) -> RefinedPose:
     data, n = r[: len(r) - end.priors], len(matches)
     pose = Rigid3(end.R, end.t)
     E21 = essential_from_pose(pose)
-    px = sampson_distances(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
+    px = sampson_of_matches(E21, matches)
     return RefinedPose(
         cam2_from_cam1=pose,
         covariance=covariance,

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 SHIFTS = 40
@@ -62,9 +62,7 @@ def log_false_alarms(
 
 
 def _fits(m: Matches, pose: Rigid3, gate: float) -> BoolArray:
-    E21 = essential_from_pose(pose)
-    r = sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, m.sigma1_px, m.sigma2_px)
-    return np.asarray(np.abs(r) < gate)
+    return np.asarray(np.abs(sampson_of_matches(essential_from_pose(pose), m, in_sigmas=True)) < gate)
 
 
 def _log_choose(n: int, k: int) -> float:

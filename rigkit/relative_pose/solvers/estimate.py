@@ -12,7 +12,7 @@ from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.rotation import nearest_rotation, unit
-from rigkit.geometry.sampson import sampson_distances
+from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.relative_pose.solvers.weights import (
     MIN_SIGMA_A,
     RowWeights,
@@ -95,8 +95,7 @@ def finish(matches: Matches, E21: Mat3, F_rays: Mat3, weights: RowWeights) -> Ep
     if matches.K1 is not None and matches.K2 is not None:
         F21 = np.linalg.inv(matches.K2).T @ F_rays @ np.linalg.inv(matches.K1)
         F21 = F21 / np.linalg.norm(F21)
-    residuals = sampson_distances(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
-    return EpipolarEstimate(E21, F21, residuals, weights)
+    return EpipolarEstimate(E21, F21, sampson_of_matches(E21, matches), weights)
 
 
 def check_count(matches: Matches, weights: RowWeights, minimum: int, what: str) -> None:
