@@ -51,19 +51,15 @@ def homography_from_plane(K1: Mat3, K2: Mat3, cam2_from_cam1: Rigid3, normal: No
 def homography_from_affines(pixels1: Pixels, pixels2: Pixels, A21: Affines, *, affine_weight: float = 1.0) -> Mat3:
     """Return the homography (3, 3), unit Frobenius norm, of N >= 2 points with affinities on one plane.
 
+    Raises InputError: fewer than two points, shapes that do not fit, numbers that are not finite; DegenerateError: the
+    points and affinities do not determine a homography (all points equal, affinities singular).
+
     Parameters
     ----------
     pixels1, pixels2 : (N, 2)
     A21 : (N, 2, 2)
     affine_weight : of the affinities' equations against the points' in normalised coordinates; sigma_px T / sigma_A
         with T the normalisation (about sqrt(2) over the points' spread in px) is the ratio of their noise.
-
-    Raises
-    ------
-    InputError
-        Fewer than two points, shapes that do not fit, numbers that are not finite.
-    DegenerateError
-        The points and affinities do not determine a homography (all points equal, affinities singular).
 
     Notes
     -----

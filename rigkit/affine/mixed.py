@@ -28,6 +28,8 @@ def affines_from_mixed_directions(
 ) -> Affinities:
     """Return the affinities of N corners by least squares over all valid directions.
 
+    Raises InputError: shapes that do not fit.
+
     Parameters
     ----------
     directions : N corners, K directions each.
@@ -37,11 +39,6 @@ def affines_from_mixed_directions(
     epipolar : hard constraint A^T n2 + n1 = 0 where given.
     noise : of the directions; then each affinity has a covariance.
     min_conditioning : affinities whose system has a smaller smallest singular value are invalid.
-
-    Raises
-    ------
-    InputError
-        Shapes that do not fit.
 
     Notes
     -----

@@ -40,6 +40,9 @@ def affines_from_directions(
 ) -> Affinities:
     """Return the affinities of N corners from corresponding directions.
 
+    Raises InputError: unknown method or option, no epipolar geometry or no lengths where the method needs them, lengths
+    that differ.
+
     Parameters
     ----------
     directions : N corners, K directions each.
@@ -59,11 +62,6 @@ def affines_from_directions(
     -------
     Affinities
         `valid` is False, and A21 NaN, where too few directions are usable or they do not determine the affinity.
-
-    Raises
-    ------
-    InputError
-        Unknown method or option, no epipolar geometry or no lengths where the method needs them, lengths that differ.
     """
     if F21 is not None and epipolar is None and needs_epipolar(method):
         epipolar = _epipolar_of(directions, F21)

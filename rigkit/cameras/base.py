@@ -32,16 +32,14 @@ def image_center(size_px: tuple[int, int]) -> FloatArray:
 class RadialCurve:
     """How far from its centre a lens images what lies off its axis, in samples.
 
+    Raises InputError: fewer than four samples off the axis, angles or radii that do not increase, or angles of 180
+    degrees and more.
+
     Attributes
     ----------
     centre_px : (2,) where the optical axis meets the image.
     theta_rad, radius_px : (N,) angles from the axis and distances from the centre, both increasing; samples on the
         axis are left out.
-
-    Raises
-    ------
-    InputError
-        Fewer than four samples off the axis, angles or radii that do not increase, or angles of 180 degrees and more.
     """
 
     centre_px: FloatArray
@@ -141,15 +139,12 @@ class Camera(ABC):
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         """Return the camera of this model nearest to a sampled radial curve: where every calibration starts.
 
+        Raises InputError: a model of this kind cannot follow the curve (a pinhole beyond 90 degrees).
+
         Parameters
         ----------
         curve : where the optical axis meets the image, and radii over angles.
         order : for models of several sizes: Brown's number of distortion terms, Scaramuzza's degree.
-
-        Raises
-        ------
-        InputError
-            A model of this kind cannot follow the curve (a pinhole beyond 90 degrees).
         """
 
     @abstractmethod

@@ -84,6 +84,9 @@ def compare_cameras(
 ) -> CameraDifference:
     """Return the difference of camera `b` from camera `a` over the image of `a`, at infinity.
 
+    Raises InputError: the sizes differ, the grid is no pair of numbers, or `mask` or `weights` have another shape than
+    it; DegenerateError: the cameras have fewer than 20 pixels of the grid in common.
+
     Parameters
     ----------
     a, b : cameras of any models and of one image size.
@@ -91,13 +94,6 @@ def compare_cameras(
     mask : (rows, columns) where the boards of the calibration were: elsewhere both cameras extrapolate.
     fit_rotation : take out the rotation that makes the sum of the squared differences least.
     weights : (rows, columns) of the squared differences in that fit, such as the inverse variances predicted.
-
-    Raises
-    ------
-    InputError
-        The sizes differ, the grid is no pair of numbers, or `mask` or `weights` have another shape than it.
-    DegenerateError
-        The cameras have fewer than 20 pixels of the grid in common.
     """
     if a.size_px != b.size_px:
         raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")

@@ -47,6 +47,9 @@ def identify_pair(
 ) -> PairIdentity:
     """Return the boards of two images named and turned alike, and the relative pose that they imply.
 
+    Raises InputError: no boards, unknown names in `layout`, one name for two detections of an image; DegenerateError:
+    no listed board is seen in both images.
+
     Parameters
     ----------
     detections1, detections2 : what was found in either image; a board id that is given is kept.
@@ -55,13 +58,6 @@ def identify_pair(
     layout : where boards that look alike hang, by board id: "left", "right", "floor", "ceiling" or "back" (see
         `rigkit.identification.board_ids`, which also states the rule without it).
     angles : between boards, as measured: where no layout does, they identify boards that look alike.
-
-    Raises
-    ------
-    InputError
-        No boards, unknown names in `layout`, one name for two detections of an image.
-    DegenerateError
-        No listed board is seen in both images.
 
     Notes
     -----

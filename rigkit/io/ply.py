@@ -60,17 +60,14 @@ def write_ply(
 ) -> None:
     """Write `cloud` to `path`: lengths in mm, the frame of camera 1.
 
+    Raises InputError: nothing to write, the file exists, or it cannot be written.
+
     Parameters
     ----------
     path : file; an existing one is refused unless `force`.
     cloud : oriented cloud; an empty one is refused.
     single_precision : 32-bit coordinates, for programs that know no other.
     comments : lines for the header, such as where the cloud comes from.
-
-    Raises
-    ------
-    InputError
-        Nothing to write, the file exists, or it cannot be written.
     """
     write_atomic(path, ply_bytes(cloud, single_precision=single_precision, comments=comments), force=force)
 

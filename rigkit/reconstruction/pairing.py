@@ -93,6 +93,9 @@ def match_pair(
 ) -> MatchedPair:
     """Identify the boards, match their corners, and take directions.
 
+    Raises InputError: no board is seen in both images; DegenerateError: `chain` is "rectified" and a corner lies too
+    far off the axis.
+
     Parameters
     ----------
     pair_id : for messages.
@@ -103,13 +106,6 @@ def match_pair(
     angles : between boards, as measured: they identify boards that look alike where no layout does.
     chain : coordinates to work in.
     support, window : what a direction is estimated from, see `direction_field`.
-
-    Raises
-    ------
-    InputError
-        No board is seen in both images.
-    DegenerateError
-        `chain` is "rectified" and a corner lies too far off the axis.
     """
     _check_sizes(pair_id, (*detections1, *detections2), boards)
     identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout, angles=angles)

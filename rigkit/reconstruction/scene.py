@@ -88,6 +88,9 @@ def reconstruct_scene(
 ) -> SceneReconstruction:
     """Reconstruct two views of any scene from point correspondences with affinities or directions.
 
+    Raises InputError: too few correspondences, neither affinities nor directions, or a baseline that is not positive;
+    DegenerateError: too few of them agree with any pose; no baseline.
+
     Parameters
     ----------
     correspondences, camera1, camera2 : some may be wrong, their sigmas only count relative to each other; calibrated.
@@ -96,13 +99,6 @@ def reconstruct_scene(
     baseline_mm : length of the baseline where it was measured: then the cloud is in mm.
     known_pose : the pose where it was measured: it is used as it is, and gives the baseline.
     image1 : image of camera 1, for colours.
-
-    Raises
-    ------
-    InputError
-        Too few correspondences, neither affinities nor directions, or a baseline that is not positive.
-    DegenerateError
-        Too few of them agree with any pose; no baseline.
     """
     baseline_mm = baseline_mm if known_pose is None else known_pose.baseline_mm
     matches, seen = _matches(correspondences, camera1, camera2, baseline_mm, pair_id)

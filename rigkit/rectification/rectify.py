@@ -177,14 +177,11 @@ class RectifyMap:
 def rectify_map(camera: Camera, target: Camera, *, target_from_cam: ArrayLike | None = None) -> RectifyMap:
     """Return the map from images of `camera` to images of `target`.
 
+    Raises InputError: `target_from_cam` is not a rotation.
+
     Parameters
     ----------
     target_from_cam : (3, 3) rotation, by default none: x_in_target = target_from_cam @ x_in_cam.
-
-    Raises
-    ------
-    InputError
-        `target_from_cam` is not a rotation.
     """
     matrix = as_array(np.eye(3) if target_from_cam is None else target_from_cam, (3, 3), "target_from_cam")
     rotation = nearest_rotation(matrix)

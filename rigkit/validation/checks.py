@@ -148,6 +148,9 @@ def validate(
 ) -> ValidationReport:
     """Judge a reconstruction against measured truth.
 
+    Raises InputError: nothing was measured, or nothing that was measured is about a board that was reconstructed;
+    DegenerateError: a board has too few points for a plane.
+
     Parameters
     ----------
     reconstruction : of one pair.
@@ -156,13 +159,6 @@ def validate(
     fitted : planes fitted to both images, to stand beside those of the points, or to be judged in their place.
     coverage : largest |difference| / combined sigma that passes.
     weighted : planes by what is known of each point's noise; else by principal components of the points, all alike.
-
-    Raises
-    ------
-    InputError
-        Nothing was measured, or nothing that was measured is about a board that was reconstructed.
-    DegenerateError
-        A board has too few points for a plane.
     """
     if truth is None:
         raise InputError("validate: nothing was measured of this pair, so nothing can be checked; give its PairTruth")

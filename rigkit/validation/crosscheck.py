@@ -150,6 +150,8 @@ def crosscheck(
 ) -> CrossCheckReport:
     """Compare a reconstruction with pycolmap, planar PnP, and the same pair through another chain if given.
 
+    Raises InputError: none of the methods could be used.
+
     Parameters
     ----------
     reconstruction : of one pair.
@@ -157,11 +159,6 @@ def crosscheck(
     shifts : from `calibration_shifts`: a wrong calibration moves the methods apart; None: exact intrinsics.
     coverage : largest |difference| / its sigma that passes.
     seed : of COLMAP's RANSAC.
-
-    Raises
-    ------
-    InputError
-        None of the methods could be used.
     """
     methods: list[IndependentMethod] = []
     skipped: list[str] = []

@@ -77,12 +77,8 @@ def calibrate_session(
 ) -> SessionCalibration:
     """Calibrate the camera of a session, given its file or the session as loaded, and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        No image shows a board of the session, or a file cannot be written (said before the work).
-    DegenerateError
-        The views do not determine the camera.
+    Raises InputError: no image shows a board of the session, or a file cannot be written (said before the work);
+    DegenerateError: the views do not determine the camera.
     """
     options = options or CalibrateOptions()
     if not isinstance(session, Session):

@@ -110,12 +110,8 @@ def calibrate_folders(
     `options.force`. Where nothing comes out, all is as before, but for the corners kept for the next try
     (`options.cache`).
 
-    Raises
-    ------
-    InputError
-        No board told, no images, a file that cannot be written, and as `calibrate_session_file`.
-    DegenerateError
-        The views do not determine a camera.
+    Raises InputError: no board told, no images, a file that cannot be written, and as `calibrate_session_file`;
+    DegenerateError: the views do not determine a camera.
     """
     given = [inside for folder in folders for inside in _videos_inside(Path(folder))]
     boards = _boards(given, folder_options, progress)

@@ -69,13 +69,9 @@ def calibrate_rig_session(
 ) -> RigSessionCalibration:
     """Calibrate the rig of a session, given its file or the session as loaded, and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        A camera's images show no board, nothing says which were taken together, boards cannot be identified, or a file
-        cannot be written (said before the work).
-    DegenerateError
-        The views do not determine a camera.
+    Raises InputError: a camera's images show no board, nothing says which were taken together, boards cannot be
+    identified, or a file cannot be written (said before the work); DegenerateError: the views do not determine a
+    camera.
     """
     options = options or CalibrateOptions()
     if not isinstance(session, RigSession):

@@ -54,12 +54,8 @@ class CertifiedFile:
 def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = None) -> CertifiedFile:
     """Certify what a calibration, or a rig, measures `task` to, and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        No calibration, one without a covariance, a camera that the rig does not have, or a file that cannot be written.
-    DegenerateError
-        Nowhere do all cameras see what is measured.
+    Raises InputError: no calibration, one without a covariance, a camera that the rig does not have, or a file that
+    cannot be written; DegenerateError: nowhere do all cameras see what is measured.
     """
     options = options or CertifyOptions()
     targets = [target for target in (options.report, options.pdf) if target is not None]

@@ -87,12 +87,8 @@ def detect_in_images(
     An image that cannot be read is among the failures and does not end the rest; its error is raised where there is no
     other image.
 
-    Raises
-    ------
-    InputError
-        No such file, no image in a folder, or a file that cannot be written: said before the work.
-    CheckFailed
-        No image shows a board.
+    Raises InputError: no such file, no image in a folder, or a file that cannot be written: said before the work;
+    CheckFailed: no image shows a board.
     """
     options = options or DetectOptions()
     if options.min_corners < MIN_BOARD_CORNERS:

@@ -47,12 +47,8 @@ def export_cloud(
 ) -> Reconstruction:
     """Reconstruct one pair of a data set, write its cloud, and return the reconstruction.
 
-    Raises
-    ------
-    InputError
-        No such pair, or none named of several; a file that cannot be read or written.
-    DegenerateError
-        The corners do not determine the pose.
+    Raises InputError: no such pair, or none named of several; a file that cannot be read or written; DegenerateError:
+    the corners do not determine the pose.
     """
     known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if options.pair is None and len(known.pairs) != 1:

@@ -88,15 +88,11 @@ def calibrate_hand_eye(
 ) -> HandEyeCalibration:
     """Return the hand-eye calibration from the robot's poses (CSV, by image) and images of a board, or folders of them.
 
-    Raises
-    ------
-    InputError
-        Files that cannot be read or written, images without a pose, a board that looks the same turned, poses and
-        images that do not belong together. One image of many that cannot be read does not end the rest.
-    CheckFailed
-        No image shows the board.
-    DegenerateError
-        Too few images, or turns about one axis only.
+    One image of many that cannot be read does not end the rest.
+
+    Raises InputError: files that cannot be read or written, images without a pose, a board that looks the same turned,
+    poses and images that do not belong together; CheckFailed: no image shows the board; DegenerateError: too few
+    images, or turns about one axis only.
     """
     paths = list(images_in([Path(path) for path in images]))
     if options.output is not None:

@@ -56,12 +56,8 @@ class IdentifiedBoard:
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
     """Return the board that images, or frames of videos, show.
 
-    Raises
-    ------
-    InputError
-        No image, or none that can be read.
-    CheckFailed
-        No board is seen, or none that tells its size: the frame cuts a chessboard in every image.
+    Raises InputError: no image, or none that can be read; CheckFailed: no board is seen, or none that tells its size:
+    the frame cuts a chessboard in every image.
     """
     if not paths:
         raise InputError("board identify: no images; give some, or a folder")

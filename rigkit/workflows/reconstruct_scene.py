@@ -141,12 +141,8 @@ class SceneResult:
 def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> SceneResult:
     """Reconstruct two views of a scene and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        A file cannot be read or written, an image is of another size than its camera's, both images are the same.
-    DegenerateError
-        The correspondences do not determine the pose.
+    Raises InputError: a file cannot be read or written, an image is of another size than its camera's, both images are
+    the same; DegenerateError: the correspondences do not determine the pose.
     """
     name = options.name
     if options.output is not None:

@@ -19,15 +19,12 @@ def over_items(
 ) -> Iterator[tuple[int, Outcome]]:
     """Yield (place, function(item)) of every item, in any order.
 
+    Raises InputError: a cluster is asked for but joblib or distributed are not installed, or it cannot be reached.
+
     Parameters
     ----------
     jobs : processes on this machine.
     cluster : address of a Dask scheduler to use instead, such as "tcp://host:8786".
-
-    Raises
-    ------
-    InputError
-        A cluster is asked for but joblib or distributed are not installed, or it cannot be reached.
     """
     if not items:
         return

@@ -124,17 +124,14 @@ def run_study(
 ) -> list[Errors]:
     """Return the errors of every chunk of a study; the numbers do not depend on who computes them.
 
+    Raises InputError: Dask is asked for but not installed, or a cluster cannot be reached.
+
     Parameters
     ----------
     jobs : processes on this machine.
     dask : address of a Dask scheduler to use instead, such as "tcp://host:8786".
     parts : folder for finished chunks. What an earlier run of the same study left there is used; everything is removed
         when the study is complete.
-
-    Raises
-    ------
-    InputError
-        Dask is asked for but not installed, or a cluster cannot be reached.
     """
     total = chunk_count(study)
     key = study_key(study)

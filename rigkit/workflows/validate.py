@@ -105,12 +105,8 @@ def validate_dataset(
 ) -> DatasetValidation:
     """Validate the pairs of a data set, given its folder or the data set as loaded, and write what `options` ask for.
 
-    Raises
-    ------
-    InputError
-        Nothing was measured, or something asked for cannot be: all said before the work.
-    RigkitError
-        No pair could be reconstructed; a pair that could not is else among the failures.
+    Raises InputError: nothing was measured, or something asked for cannot be: all said before the work; RigkitError: no
+    pair could be reconstructed; a pair that could not is else among the failures.
     """
     started = time.monotonic()
     options = options or ValidateOptions()
