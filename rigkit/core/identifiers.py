@@ -11,6 +11,12 @@ MAX_IDENTIFIER = 60
 IDENTIFIER = re.compile(r"\w([\w .+()-]*[\w.+()-])?")
 
 
+def last_number(name: str) -> str:
+    """Return the last number in a name, without leading zeros; the name itself where it has none."""
+    numbers = re.findall(r"\d+", name)
+    return str(int(numbers[-1])) if numbers else name
+
+
 def check_identifier(name: str, what: str) -> str:
     """Return `name`; raises InputError, which calls it `what`, where it is not one.
 

@@ -27,7 +27,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import freedom, positive, read_json, real, reals, whole
-from rigkit.io.reading import usable_path
+from rigkit.io.reading import damage, usable_path
 from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
 CALIBRATION_SCHEMA = "rigkit.calibration/1"
@@ -138,9 +138,8 @@ def damage_named(path: str | Path) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, InputError) as error:
-        words = " ".join(str(error).split())
         # What we say ends with what to do.
-        words = words if isinstance(error, InputError) else words[:200]
+        words = " ".join(str(error).split()) if isinstance(error, InputError) else damage(error)
         if str(path) not in words:
             # What a value's own reader says to do is said once.
             told = f"damaged: {words}" if words.endswith("calibrate again") else f"damaged ({words}); calibrate again"

@@ -26,7 +26,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.corner_cache import kept_corners
 from rigkit.io.files import write_atomic
 from rigkit.io.json_reader import parse_json
-from rigkit.io.reading import csv_rows, read_text
+from rigkit.io.reading import csv_rows, damage, read_text
 
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
 
@@ -105,8 +105,7 @@ def _from_json(source: Path, text: str) -> dict[str, tuple[BoardDetection, ...]]
     try:
         return {image: found.detections for image, found in kept_corners(parse_json(text)).items()}
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, InputError) as error:
-        words = " ".join(str(error).split())[:200]
-        raise InputError(f"corners file '{source}': damaged ({words}); detect the corners again") from error
+        raise InputError(f"corners file '{source}': damaged ({damage(error)}); detect the corners again") from error
 
 
 def _from_vnl(source: Path, text: str, boards: Sequence[Board]) -> dict[str, tuple[BoardDetection, ...]]:

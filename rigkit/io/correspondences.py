@@ -34,7 +34,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
 from rigkit.io.files import write_atomic
-from rigkit.io.reading import MAX_NUMBER, csv_table, is_number, read_bytes
+from rigkit.io.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")
@@ -184,9 +184,8 @@ def _from_npz(source: Path, payload: bytes) -> Correspondences:
         table = _arrays(payload)
     except (ValueError, TypeError, OSError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError,
             RuntimeError, SyntaxError, struct.error) as error:  # fmt: skip
-        words = " ".join(str(error).split())[:200]
         raise InputError(
-            f"correspondences '{source}': damaged NPZ, or not of numbers ({words}); write it again"
+            f"correspondences '{source}': damaged NPZ, or not of numbers ({damage(error)}); write it again"
         ) from error
     try:
         matched = _from_matcher(table)

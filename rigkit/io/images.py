@@ -130,6 +130,11 @@ def announced_sizes(data: bytes) -> list[tuple[int, int]]:
         Pillow.MAX_IMAGE_PIXELS = limit
 
 
+def images_of_folder(folder: Path) -> list[Path]:
+    """Return the images of a folder, by name."""
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+
+
 def to_grey(image: Image) -> Image:
     """Return (H, W) of the same type; a grey image comes back as it is."""
     if image.ndim == 2:

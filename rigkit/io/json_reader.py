@@ -1,4 +1,4 @@
-"""A strict reader for the JSON files that the program writes: no key twice, no number without end, no bare NaN."""
+"""JSON as the program writes it, and a strict reader: no key twice, no number without end, no bare NaN."""
 
 from __future__ import annotations
 
@@ -26,6 +26,11 @@ def parse_json(text: str) -> Any:
         )
     except RecursionError as error:
         raise ValueError("nested too deep") from error
+
+
+def json_text(data: Any) -> str:
+    """Return a file's content; raises ValueError for what is not finite."""
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
 
 
 def json_schema(path: str | Path) -> str | None:

@@ -136,6 +136,11 @@ def about(*paths: str | Path) -> Iterator[None]:
         raise type(error)(" and ".join(f"'{path}'" for path in paths) + f": {error}") from error
 
 
+def damage(error: Exception) -> str:
+    """Return what is wrong with a file in one line, of a reader's error that may quote much of it."""
+    return " ".join(str(error).split())[:200]
+
+
 def _named(path: str | Path, what: str) -> str:
     """Return what the file is and its name."""
     return f"{what} '{path}'" if what else f"'{path}'"

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
-from rigkit.io.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
+from rigkit.io.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 from rigkit.kernels.departures import DISPLACEMENTS
 
@@ -57,6 +56,13 @@ class SavedRig:
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     departures: tuple[LensModes, ...] = ()
+
+    def stated(self, path: str | Path) -> tuple[tuple[Camera, ...], FloatArray, float]:
+        """Return `with_departures` and the corners' sigma; raises InputError where the file at `path` lacks them."""
+        cameras, covariance = self.with_departures
+        if covariance is None or self.sigma_px is None:
+            raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
+        return cameras, covariance, self.sigma_px
 
     @property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:
@@ -94,7 +100,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
         "covariance": rig.covariance.tolist(),
         "boards": [{"board_id": b.board_id, "target": board_values(b)} for b in _boards_of(rig)],
     }
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+    return json_text(data)
 
 
 def _boards_of(rig: RigCalibration) -> tuple[Board, ...]:
@@ -213,7 +219,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
             for rig in rigs
         ],
     }
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+    return json_text(data)
 
 
 def load_board_rigs(path: str | Path) -> tuple[BoardRig, ...]:

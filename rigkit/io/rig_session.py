@@ -31,7 +31,6 @@ number at the end of that name ("number": left07 and right07), or the same place
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -39,6 +38,7 @@ from pathlib import Path, PurePath
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import last_number
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.io.session import ONE_CAMERA_KEYS, SESSION_FILE, Session, beside_session, boards_of, images_of, options_of
@@ -199,13 +199,10 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
     )
 
 
-def _number(image: str) -> str:
-    """Return the last number in the name, without leading zeros; the name itself where it has none."""
-    numbers = re.findall(r"\d+", PurePath(image).stem)
-    return str(int(numbers[-1])) if numbers else image
-
-
-FRAME_KEYS: dict[str, Callable[[str], str]] = {"name": lambda image: PurePath(image).stem, "number": _number}
+FRAME_KEYS: dict[str, Callable[[str], str]] = {
+    "name": lambda image: PurePath(image).stem,
+    "number": lambda image: last_number(PurePath(image).stem),
+}
 
 
 def _twice(frames: Mapping[str, Mapping[str, str]]) -> str | None:

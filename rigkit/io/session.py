@@ -108,6 +108,11 @@ class Session:
     __repr__ = brief
 
     @property
+    def whose(self) -> str:
+        """Of which camera, in words that follow what it is about; "" where there is one only."""
+        return "" if self.camera is None else f" of camera '{self.camera}'"
+
+    @property
     def calibration_path(self) -> Path:
         """Where the calibration goes: beside the session, see `beside_session`."""
         return beside_session(self.path, "calibration.json")

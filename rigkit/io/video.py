@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.errors import InputError
+from rigkit.core.identifiers import last_number
 from rigkit.io.images import Image, quiet_opencv, require_pixels
 from rigkit.io.reading import csv_table
 
@@ -136,7 +137,7 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
     head, lines = csv_table(path, "timestamps")
     if not set(TIMESTAMPS) <= set(head):
         raise InputError(f"'{path}': the first line must name the columns {', '.join(TIMESTAMPS)}, a row a frame")
-    named = {_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
+    named = {last_number(name): name for name in reversed(cameras)} | {name: name for name in cameras}
     moments: dict[int, dict[str, int]] = {}
     for line, row in lines:
         try:
@@ -158,8 +159,3 @@ def read_timestamps(path: Path, cameras: Sequence[str]) -> dict[int, Mapping[str
             if camera in frames:
                 frames[camera] -= min(own)
     return {moment: moments[moment] for moment in sorted(moments)}
-
-
-def _number(name: str) -> str:
-    numbers = re.findall(r"\d+", name)
-    return str(int(numbers[-1])) if numbers else name

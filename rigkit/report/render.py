@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.report.tables import below, column_label, measured_words
+from rigkit.report.tables import below, column_label, in_words, measured_words
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -42,10 +42,9 @@ def drawing(svg: str) -> Any:
 
 def shown_table(table: Table, pictures: Sequence[str | None] = ()) -> dict[str, Any]:
     """Return a table in words, as the template `table.html` shows it; `pictures`: a source for each row, or none."""
-    words = [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
     return {
         "title": table.title,
-        "head": [(column_label(column), text) for column, text in zip(table.columns, words, strict=True)],
+        "head": [(column_label(column), text) for column, text in zip(table.columns, in_words(table), strict=True)],
         "rows": [[_shown_cell(c, column) for c, column in zip(row, table.columns, strict=True)] for row in table.rows],
         "pictures": list(pictures) if any(pictures) else [],
         "below": below(table),

@@ -47,7 +47,7 @@ def tables_to_markdown(tables: Sequence[Table]) -> str:
             f"## {_escape_markdown(table.title)}",
             "",
             _bar(head),
-            _bar([":--" if left else "--:" for left in _left(table)]),
+            _bar([":--" if left else "--:" for left in in_words(table)]),
         ]
         for row in table.rows:
             cells = []
@@ -100,7 +100,7 @@ def tables_to_latex(tables: Sequence[Table]) -> str:
             rf"\caption{{{_escape_latex((table.title + '. ' + below(table)).strip())}}}",
             rf"\label{{tab:{table.key}}}",
             r"\resizebox{\textwidth}{!}{%",
-            rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in _left(table))}}}",
+            rf"\begin{{tabular}}{{{''.join('l' if left else 'r' for left in in_words(table))}}}",
             r"\toprule",
             head + r" \\",
             r"\midrule",
@@ -148,7 +148,7 @@ def tables_to_text(tables: Sequence[Table]) -> str:
             [_one_line(_text(c, column)) for c, column in zip(row, table.columns, strict=True)] for row in table.rows
         ]
         widths = [max(len(line[j]) for line in grid) for j in range(len(table.columns))]
-        pad = [str.ljust if left else str.rjust for left in _left(table)]
+        pad = [str.ljust if left else str.rjust for left in in_words(table)]
         lines = ["  ".join(p(t, w) for p, t, w in zip(pad, line, widths, strict=True)).rstrip() for line in grid]
         parts.append("\n".join([table.title, *lines, *filter(None, [below(table)])]))
     return "\n\n".join(parts)
@@ -216,7 +216,7 @@ def rounded_words(value: float, sigma: float) -> str:
     return f"({words})e{power}" if power else words
 
 
-def _left(table: Table) -> list[bool]:
+def in_words(table: Table) -> list[bool]:
     """Return which columns hold words: those are set to the left."""
     return [any(isinstance(row[j].value, str) for row in table.rows) for j in range(len(table.columns))]
 

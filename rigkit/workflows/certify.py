@@ -97,9 +97,7 @@ def load_instrument(
             freedom=calibration.freedom,
         )
     saved = load_saved_rig(path)
-    lenses, covariance = saved.with_departures
-    if covariance is None or saved.sigma_px is None:
-        raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
+    lenses, covariance, known_px = saved.stated(path)
     names = list(saved.cameras)
     if len(names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
@@ -109,7 +107,7 @@ def load_instrument(
         [pose for _, pose in saved.cameras.values()],
         covariance,
         cameras or (names[0], names[1]),
-        sigma_px=sigma_px or saved.sigma_px,
+        sigma_px=sigma_px or known_px,
         scale_sigma=saved.scale_sigma,
         freedom=saved.freedom,
     )

@@ -25,6 +25,7 @@ from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_ca
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
 from rigkit.io.images import read_image_of
+from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
@@ -151,15 +152,13 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
             boards = tuple(shape.board for shape in calibration.boards)
         return watched_camera(calibration, source.stem), boards
     rig = load_saved_rig(source)
-    lenses, covariance = rig.with_departures
-    if covariance is None or rig.sigma_px is None:
-        raise InputError(f"'{source}': the file does not say how sure the rig is; calibrate it with rigkit")
+    lenses, covariance, sigma_px = rig.stated(source)
     return Watched(
         names=tuple(rig.cameras),
         cameras=lenses,
         cam_from_rig=tuple(pose for _, pose in rig.cameras.values()),
         covariance=covariance,
-        sigma_px=rig.sigma_px,
+        sigma_px=sigma_px,
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
     ), rig.boards
@@ -315,4 +314,4 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
         data["frame_covariance"] = with_block(frame, covariance, 1.0).tolist()
     data["covariance"] = covariance.tolist()
     data["verdicts"] = [*findings_to_json([said]), *data.get("verdicts", [])]
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+    return json_text(data)

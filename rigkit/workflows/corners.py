@@ -89,11 +89,10 @@ def session_views(
         raise InputError(f"{session.path}: {wrong}; correct columns and rows in --board or the board file")
     if not views:
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
-        camera = "" if session.camera is None else f" of camera '{session.camera}'"
         # A first calibration that fails is asked for no reason.
         shown = explained(session.images, session.boards) if corners.source else None
         raise InputError(
-            f"{session.path}: no board can be used in {counted(len(found), 'image')}{camera}; "
+            f"{session.path}: no board can be used in {counted(len(found), 'image')}{session.whose}; "
             + (shown or f"{reasons[1]} times: {reasons[0]}; check columns and rows in the board file")
         )
     return views, size_px, dropped
@@ -122,7 +121,7 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     kept = CornerCache(None if cache is Cache.OFF else session.corners_path, session.boards)
     if not session.images:
         return _kept_alone(session, kept)
-    paths = dict(zip(image_names(session), session.images, strict=True))
+    paths = named_images(session)
     hashes = {name: image_hash(path) for name, path in paths.items()}
     first = {name: item for name, digest in hashes.items() if (item := kept.get(name, digest)) is not None}
     fresh = [name for name in paths if name not in first]
@@ -183,9 +182,9 @@ def _kept_alone(session: Session, kept: CornerCache) -> SessionCorners:
     """Return the corners kept beside a session whose images are gone."""
     first = {name: item for name in kept.images if (item := kept.get(name, None)) is not None}
     if not first:
-        whose = "" if session.camera is None else f" of camera '{session.camera}'"
         raise InputError(
-            f"{session.path}: no image matches 'images'{whose}, and no corners are kept beside it; correct the pattern"
+            f"{session.path}: no image matches 'images'{session.whose}, and no corners are kept beside it; "
+            "correct the pattern"
         )
     lens = _lens_of(session, {name: kept.digest(name) for name in first})
     through = {name: item for name in first if (item := kept.get(name, None, lens)) is not None}
@@ -215,10 +214,8 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
         return None
 
 
-def image_names(session: Session) -> list[str]:
-    """Return a name for each image: of two that are called alike in several folders, with the folder."""
+def named_images(session: Session) -> dict[str, Path]:
+    """Return the images by name: of two that are called alike in several folders, with the folder."""
     common = Counter(path.name for path in session.images)
     home = session.path.resolve().parent
-    return [
-        path.name if common[path.name] == 1 else Path(os.path.relpath(path, home)).as_posix() for path in session.images
-    ]
+    return {p.name if common[p.name] == 1 else Path(os.path.relpath(p, home)).as_posix(): p for p in session.images}

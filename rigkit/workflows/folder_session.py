@@ -13,7 +13,7 @@ from rigkit.core.identifiers import check_identifier
 from rigkit.core.progress import Progress, silent
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
-from rigkit.io.images import IMAGE_ENDINGS
+from rigkit.io.images import IMAGE_ENDINGS, images_of_folder
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
@@ -210,7 +210,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
 def _images(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"'{folder}' is not a folder; give folders of images, or one session file")
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    return images_of_folder(folder)
 
 
 def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:

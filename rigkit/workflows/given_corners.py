@@ -13,7 +13,7 @@ from rigkit.io.corner_cache import FoundCorners
 from rigkit.io.corners_file import read_corners
 from rigkit.io.images import read_image
 from rigkit.io.session import Session
-from rigkit.workflows.corners import SessionCorners, image_names
+from rigkit.workflows.corners import SessionCorners, named_images
 
 _log = logging.getLogger(__name__)
 
@@ -28,15 +28,14 @@ def given_corners(session: Session, path: Path) -> SessionCorners:
     Raises InputError for a damaged file, or one that names no image of the session.
     """
     listed = read_corners(path, session.boards)
-    named = dict(zip(image_names(session), session.images, strict=True))
+    named = named_images(session)
     entries = _entries_of(named, listed, path.parent)
     if not entries:
-        whose = "" if session.camera is None else f" of camera '{session.camera}'"
         first = next(iter(listed), None)
         ours = next(iter(named), None)
         raise InputError(
-            f"corners file '{path}' names none of the {len(named)} images{whose} of '{session.path}' (there '{ours}', "
-            f"here '{first}'); give the corners of these images"
+            f"corners file '{path}' names none of the {len(named)} images{session.whose} of '{session.path}' "
+            f"(there '{ours}', here '{first}'); give the corners of these images"
         )
     found, unreadable = {}, {}
     for name, image in named.items():

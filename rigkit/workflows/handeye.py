@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from rigkit.io.board_words import board_of_words
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import read_image_of
+from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
@@ -207,4 +207,4 @@ def hand_eye_text(result: HandEye, options: HandEyeOptions) -> str:
         "median_apart_deg": float(np.degrees(np.median(result.apart_rad))),
         "left_out_deg": {name: float(np.degrees(value)) for name, value in result.left_out.items()},
     }
-    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+    return json_text(data)

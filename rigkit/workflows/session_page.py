@@ -15,7 +15,7 @@ from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
-from rigkit.workflows.corners import SessionCorners, image_names
+from rigkit.workflows.corners import SessionCorners, named_images
 from rigkit.workflows.next_views import next_views
 from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
 
@@ -71,7 +71,7 @@ def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
     for view in calibration.views:
         views.setdefault(view.image, []).append(view)
     out = {}
-    for path, name in zip(session.images, image_names(session), strict=True):
+    for name, path in named_images(session).items():
         if name in views:
             try:
                 out[name] = thumbnail_jpeg(read_image(path), views[name], count=len(session.images))

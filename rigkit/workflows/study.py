@@ -21,6 +21,7 @@ from rigkit.core.processes import process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.io.corner_cache import source_hash
 from rigkit.io.files import ensure_writable, write_atomic, write_together
+from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.study_file import load_study
 from rigkit.report.study_figure import study_figure
@@ -90,7 +91,7 @@ def run_studies(
             if places:
                 contents: dict[str, str | bytes] = {
                     "csv": tables_to_csv([cell_table(table)]),
-                    "json": json.dumps(table.to_dict(), indent=1, allow_nan=False) + "\n",
+                    "json": json_text(table.to_dict()),
                     "md": tables_to_markdown(study_tables(table)),
                     options.figure: study_figure(table, options.figure),
                     "html": study_page(table, software_facts()),
