@@ -15,7 +15,6 @@ import numpy as np
 from rigkit.coach.guide import WORTH_TAKING, Advice, CaptureGuide, GuideOptions, held_view
 from rigkit.coach.look import Glance
 from rigkit.core.arrays import Pixels
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import held_boards, outline_mm
 from rigkit.planning.information import HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
@@ -168,23 +167,18 @@ class RigGuide:
         if shared is None:
             return words, targets
         motions = [shared.in_b.pose(k) @ shared.in_a.pose(k).inverse() for k in range(len(shared.in_a))]
-        b_from_a = mean_motion(motions)
         board = self.options.boards[0]
         in_a = held_boards(shared.a, board, self.options.reach)
-        moved = Rigid3(b_from_a.rotation, b_from_a.translation_mm)
-        rotation = moved.rotation @ in_a.rotation
-        translation = in_a.translation_mm @ moved.rotation.T + moved.translation_mm
-        paper = outline_mm(board) @ np.swapaxes(rotation, -1, -2) + translation[:, None, :]
-        pixels, valid = shared.b.project(paper)
+        in_b = in_a.carried(mean_motion(motions))
+        pixels, valid = shared.b.project(in_b.in_cam(outline_mm(board)))
         both = np.all(valid & shared.b.on_image(pixels), axis=1)
         if not both.any():
             return words, targets
-        chosen = in_a.chosen(np.flatnonzero(both))
-        in_b = HeldBoards(in_a.points_mm, rotation[both], translation[both], in_a.seen[both])
-        told = mount_information(SharedViews(shared.a, shared.b, chosen, in_b, shared.error))
+        in_a, in_b = in_a.chosen(both), in_b.chosen(both)
+        told = mount_information(SharedViews(shared.a, shared.b, in_a, in_b, shared.error))
         known = mount_information(shared).sum(axis=0)
         best = int(np.argmin(mount_error_px(shared, known + told)))
-        where = placement(shared.a, board, chosen.pose(best))
+        where = placement(shared.a, board, in_a.pose(best))
         targets[a], targets[c] = where.outline_px, placement(shared.b, board, in_b.pose(best)).outline_px
         return f"{words}: {where} of {self.names[a]}", targets
 

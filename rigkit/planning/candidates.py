@@ -70,28 +70,25 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     middle = paper.mean(axis=0)
     spot = np.stack([u * width, v * height], axis=-1) - 0.5
     for _ in range(MOVES):
-        rotation, translation, seen = _placed(camera, board, spot, facing, square_px, middle)
-        points = _in_cam(paper, rotation, translation)
+        held, seen = _placed(camera, board, spot, facing, square_px, middle)
+        points = held.in_cam(paper)
         pixels, valid = camera.project(points)
         spot = spot + _back_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
-    rotation, translation, good = _placed(camera, board, spot, facing, square_px, middle)
-    good &= _inside(camera, _in_cam(paper, rotation, translation), reach.field_deg)
-    good &= _plain(camera, board, rotation, translation)
-    distance = np.linalg.norm(rotation @ middle + translation, axis=-1)
+    held, good = _placed(camera, board, spot, facing, square_px, middle)
+    good &= sees_held(camera, board, held, reach)
+    distance = np.linalg.norm(held.rotation @ middle + held.translation_mm, axis=-1)
     good &= (distance >= reach.nearest_mm) & (distance <= reach.farthest_mm)
     if not good.any():
         raise DegenerateError(
             f"plan: board '{board.board_id}' ({board.columns}x{board.rows} corners) can be held nowhere wholly in view "
             "at the distances allowed; take a smaller board, or allow other distances"
         )
-    chosen = np.flatnonzero(good)[:CANDIDATES_KEPT]
-    return HeldBoards(board.points(), rotation[chosen], translation[chosen], np.tile(board.exists(), (len(chosen), 1)))
+    return held.chosen(np.flatnonzero(good)[:CANDIDATES_KEPT])
 
 
-def sees_held(camera: Camera, board: Board, rotation: FloatArray, translation_mm: Points, reach: Reach) -> BoolArray:
-    """Say in which of C poses cam_from_board a camera sees all of a board, and plainly."""
-    paper = _in_cam(outline_mm(board), rotation, translation_mm)
-    return _inside(camera, paper, reach.field_deg) & _plain(camera, board, rotation, translation_mm)
+def sees_held(camera: Camera, board: Board, held: HeldBoards, reach: Reach) -> BoolArray:
+    """Say in which of C poses a camera sees all of a board, and plainly."""
+    return _inside(camera, held.in_cam(outline_mm(board)), reach.field_deg) & _plain(camera, board, held)
 
 
 def _even(count: int, dimensions: int) -> FloatArray:
@@ -115,7 +112,7 @@ def _tilted(tilt_rad: FloatArray, way_rad: FloatArray) -> FloatArray:
 
 def _placed(
     camera: Camera, board: Board, spot: Pixels, facing: FloatArray, square_px: FloatArray, middle: FloatArray
-) -> tuple[FloatArray, Points, BoolArray]:
+) -> tuple[HeldBoards, BoolArray]:
     """Return the poses in which the middle of the board is seen at `spot` (C, 2) and a facing square is `square_px`
     wide, and where the lens sees there."""
     rays, seen = camera.unproject(spot)
@@ -128,11 +125,9 @@ def _placed(
     x = unit(np.cross(down, rays))
     towards = np.stack([x, np.cross(rays, x), rays], axis=-1)
     rotation = towards @ facing
-    return rotation, rays * distance[:, None] - rotation @ middle, np.asarray(seen & np.isfinite(distance))
-
-
-def _in_cam(points: Points, rotation: FloatArray, translation: Points) -> Points:
-    return np.asarray(points @ np.swapaxes(rotation, -1, -2) + translation[:, None, :])
+    translation = rays * distance[:, None] - rotation @ middle
+    held = HeldBoards(board.points(), rotation, translation, np.tile(board.exists(), (len(rays), 1)))
+    return held, np.asarray(seen & np.isfinite(distance))
 
 
 def _back_inside(camera: Camera, pixels: Pixels, valid: BoolArray) -> FloatArray:
@@ -162,16 +157,15 @@ def _in_field(points: Points, field_deg: float | None) -> BoolArray:
     return np.asarray(points[..., 2] >= limit * np.linalg.norm(points, axis=-1))
 
 
-def _plain(camera: Camera, board: Board, rotation: FloatArray, translation: Points) -> BoolArray:
+def _plain(camera: Camera, board: Board, held: HeldBoards) -> BoolArray:
     """Say of which boards all squares are large enough, and no line of sight too slanting."""
     columns, rows = board.size
     lattice = board.points().reshape(rows, columns, 3)[[0, 0, -1, -1], [0, -1, 0, -1]]
     step = np.array([board.square_x_mm, board.square_y_mm, 0.0]) * np.eye(3)[:2]
-    ends = np.concatenate([lattice, lattice + step[0], lattice + step[1]])
-    points = _in_cam(ends, rotation, translation)
+    points = held.in_cam(np.concatenate([lattice, lattice + step[0], lattice + step[1]]))
     pixels, valid = camera.project(points)
     sides = np.concatenate([pixels[:, 4:8] - pixels[:, :4], pixels[:, 8:] - pixels[:, :4]], axis=1)
     with np.errstate(invalid="ignore"):
         large = (np.linalg.norm(sides, axis=-1) >= MIN_SQUARE_PX).all(axis=1)
-    slant = np.einsum("cnx,cx->cn", unit(points[:, :4]), rotation[..., 2])
+    slant = np.einsum("cnx,cx->cn", unit(points[:, :4]), held.rotation[..., 2])
     return np.asarray(large & valid.all(axis=1) & (slant >= np.cos(np.radians(MAX_SLANT_DEG))).all(axis=1))

@@ -78,6 +78,15 @@ class HeldBoards:
         """Return some of them."""
         return HeldBoards(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
 
+    def carried(self, other_from_cam: Rigid3) -> HeldBoards:
+        """Return them in another frame; which corners are seen stays."""
+        rotation, translation = other_from_cam.rotation @ self.rotation, other_from_cam.apply(self.translation_mm)
+        return HeldBoards(self.points_mm, rotation, translation, self.seen)
+
+    def in_cam(self, points_mm: Points) -> Points:
+        """Return where points (K, 3) of the board are, (C, K, 3)."""
+        return np.asarray(points_mm @ np.swapaxes(self.rotation, -1, -2) + self.translation_mm[:, None, :])
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Knowledge:

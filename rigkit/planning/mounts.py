@@ -27,12 +27,16 @@ class SharedViews:
     in_b: HeldBoards
     error: CornerError
 
+    def carried(self) -> tuple[FloatArray, FloatArray]:
+        """Return the rotations (C, 3, 3) of b_from_a, and the origins of the boards in a turned by them, (C, 3) mm."""
+        turn = self.in_b.rotation @ np.swapaxes(self.in_a.rotation, -1, -2)
+        return turn, np.einsum("cij,cj->ci", turn, self.in_a.translation_mm)
+
 
 def mount_information(shared: SharedViews) -> FloatArray:
     """Return what each of C shared boards tells of b_from_a, (C, 6, 6): of a turn about the origin of b (rad), and of
     a shift (mm)."""
-    turn = shared.in_b.rotation @ np.swapaxes(shared.in_a.rotation, -1, -2)
-    swung = np.einsum("cij,cj->ci", turn, shared.in_a.translation_mm)
+    turn, swung = shared.carried()
     by_a, by_b = np.zeros((len(turn), 6, 6)), np.zeros((len(turn), 6, 6))
     # With b_from_a = B A^-1, errors (w, v) of either pose, x -> exp(w) R x + t + v, make w = w_b - R_ba w_a and
     # v = v_b - R_ba v_a - w x (R_ba t_a).
@@ -48,8 +52,7 @@ def mount_information(shared: SharedViews) -> FloatArray:
 def mount_error_px(shared: SharedViews, information: FloatArray) -> FloatArray:
     """Return how wrong (...), rms px, the boards' corners appear in b if they are taken over from a: by what each of
     `information` (..., 6, 6) leaves open of the mount."""
-    turn = shared.in_b.rotation @ np.swapaxes(shared.in_a.rotation, -1, -2)
-    lever = np.einsum("cij,cj->ci", turn, shared.in_a.translation_mm)
+    turn, lever = shared.carried()
     # A turn about the origin of b moves the board's origin, too.
     as_pose = np.tile(np.eye(6), (len(turn), 1, 1))
     as_pose[:, 3:, :3] = -skew(lever)

@@ -17,7 +17,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import Reach, sees_held
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.plan_page import plan_words
 from rigkit.validation.sentinel.causes import causes_of
@@ -113,8 +113,9 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
     for_left, _ = views_that_tell(replace(left, covariance=rig.covariance[:8, :8]), [BOARD], FRESH)
     poses = [view.cam_from_board for view in for_left.views]
     rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
-    whole = sees_held(rig.cameras[1], BOARD, MOUNT.rotation @ rotation, MOUNT.apply(shift), Reach())
-    seen = [np.tile(BOARD.exists(), (FRESH, 1)), whole[:, None] & BOARD.exists()]
+    held = HeldBoards(BOARD.points(), rotation, shift, np.tile(BOARD.exists(), (FRESH, 1)))
+    whole = sees_held(rig.cameras[1], BOARD, held.carried(MOUNT), Reach())
+    seen = [held.seen, whole[:, None] & held.seen]
     others = _powers(rig, told_by(rig, BOARD, rotation, shift, seen))
     assert min(p.chance for p in others) < 0.9 * min(p.chance for p in promised)
 

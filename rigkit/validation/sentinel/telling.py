@@ -120,12 +120,10 @@ class _Frames:
         """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
         held = held_boards(watched.cameras[c], board, reach)
         held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
-        back = watched.cam_from_rig[c].inverse()
-        rotation, translation = back.rotation @ held.rotation, held.translation_mm @ back.rotation.T
-        translation = translation + back.translation_mm
+        in_rig = held.carried(watched.cam_from_rig[c].inverse())
         seen = np.stack(
             [
-                sees_held(camera, board, pose.rotation @ rotation, pose.apply(translation), reach)
+                sees_held(camera, board, in_rig.carried(pose), reach)
                 for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
             ],
             axis=1,
@@ -133,8 +131,8 @@ class _Frames:
         seen[:, c] = True
         corners = [own[:, None] & board.exists() for own in seen.T]
         count = np.ones(len(held), dtype=np.int64)
-        told = told_by(watched, board, rotation, translation, corners)
-        return cls(rotation, translation, number * count, seen, c * count, told)
+        told = told_by(watched, board, in_rig.rotation, in_rig.translation_mm, corners)
+        return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, told)
 
     def proposal(self, index: int, watched: Watched, board: Board, error: float) -> Proposal:
         """Return one as a view of the camera for which it was thought of."""
