@@ -78,9 +78,13 @@ class MeasuredAngle:
     def __post_init__(self) -> None:
         if self.a == self.b:
             raise InputError(f"angle: '{self.a}' has no angle with itself; name two boards")
-        _check(f"angle {self.a}-{self.b}", self.value_deg, self.sigma_deg, "deg")
+        _check(self.name, self.value_deg, self.sigma_deg, "deg")
         if self.value_deg > 180.0:
-            raise InputError(f"angle {self.a}-{self.b}: {self.value_deg} deg is more than 180; write the angle itself")
+            raise InputError(f"{self.name}: {self.value_deg} deg is more than 180; write the angle itself")
+
+    @property
+    def name(self) -> str:
+        return f"angle {self.a}-{self.b}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +98,13 @@ class MeasuredDistance:
     how: str
 
     def __post_init__(self) -> None:
-        _check(f"distance {self.a} to {self.b}", self.value_mm, self.sigma_mm, "mm")
+        _check(self.name, self.value_mm, self.sigma_mm, "mm")
         if self.a.is_plane and self.b.is_plane:
-            raise InputError(f"distance {self.a} to {self.b}: two planes have no one distance; name a corner of one")
+            raise InputError(f"{self.name}: two planes have no one distance; name a corner of one")
+
+    @property
+    def name(self) -> str:
+        return f"distance {self.a} to {self.b}"
 
 
 @dataclass(frozen=True, slots=True)

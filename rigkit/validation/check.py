@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
@@ -82,3 +84,18 @@ def compare(
         passed=bool(k <= coverage),
         count=count,
     )
+
+
+def compare_baseline(name: str, known: MeasuredLength, ours: tuple[float, float], coverage: float, count: int) -> Check:
+    """Return the check of a baseline (value and sigma, mm) against what a person measured."""
+    return compare(name, "baseline", "mm", (known.value_mm, known.sigma_mm, known.how), ours, coverage, count)
+
+
+def compare_angle(known: MeasuredAngle, ours: tuple[float, float], coverage: float, count: int) -> Check:
+    """Return the check of an angle of boards (value and sigma, deg) against what a person measured."""
+    return compare(known.name, "angle", "deg", (known.value_deg, known.sigma_deg, known.how), ours, coverage, count)
+
+
+def compare_distance(known: MeasuredDistance, ours: tuple[float, float], coverage: float, count: int) -> Check:
+    """Return the check of a distance on boards (value and sigma, mm) against what a person measured."""
+    return compare(known.name, "distance", "mm", (known.value_mm, known.sigma_mm, known.how), ours, coverage, count)

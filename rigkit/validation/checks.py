@@ -23,7 +23,7 @@ from rigkit.core.truth import PairTruth
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.boards import BoardResult
-from rigkit.validation.check import Check, compare
+from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.declarations import DECLARED, contradicted_boards, declaration_checks
 from rigkit.validation.fitted_planes import AngleResult, FittedPlanes, normal_errors_against
 from rigkit.validation.measure import Measured, measure
@@ -204,8 +204,7 @@ def _report(
     angles = {frozenset(two): measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
     checks: list[Check] = []
     if truth.baseline is not None:
-        known = (truth.baseline.value_mm, truth.baseline.sigma_mm, truth.baseline.how)
-        checks.append(compare("baseline", "baseline", "mm", known, baseline, coverage, len(cloud)))
+        checks.append(compare_baseline("baseline", truth.baseline, baseline, coverage, len(cloud)))
     of_boards, unchecked = _checks_of_boards(measured, truth, angles, fitted, coverage)
     held, unheld = declaration_checks(reconstruction)
     checks += [*of_boards, *held, *contradicted_boards(measured.boards, layout or {})]
@@ -246,25 +245,21 @@ def _checks_of_boards(
     checks: list[Check] = []
     unchecked: list[str] = []
     for angle in truth.angles:
-        name, both = f"angle {angle.a}-{angle.b}", (angle.a, angle.b)
+        both = (angle.a, angle.b)
         if measured.absent(*both):
-            unchecked.append(f"{name}: {measured.absent(*both)}")
+            unchecked.append(f"{angle.name}: {measured.absent(*both)}")
             continue
         judged = fitted.judged_angle(*both, angles[frozenset(both)])
         if judged is None:
-            unchecked.append(f"{name}: too few corners in both images for {fitted.planes} planes")
+            unchecked.append(f"{angle.name}: too few corners in both images for {fitted.planes} planes")
             continue
-        known = (angle.value_deg, angle.sigma_deg, angle.how)
-        checks.append(compare(name, "angle", "deg", known, judged, coverage, measured.count(*both)))
+        checks.append(compare_angle(angle, judged, coverage, measured.count(*both)))
     for distance in truth.distances:
-        name, ends = f"distance {distance.a} to {distance.b}", (distance.a.board_id, distance.b.board_id)
+        ends = (distance.a.board_id, distance.b.board_id)
         if measured.absent(*ends):
-            unchecked.append(f"{name}: {measured.absent(*ends)}")
+            unchecked.append(f"{distance.name}: {measured.absent(*ends)}")
             continue
-        known = (distance.value_mm, distance.sigma_mm, distance.how)
-        checks.append(
-            compare(name, "distance", "mm", known, measured.distance_mm(distance), coverage, measured.count(*ends))
-        )
+        checks.append(compare_distance(distance, measured.distance_mm(distance), coverage, measured.count(*ends)))
     return checks, unchecked
 
 

@@ -22,10 +22,10 @@ from rigkit.io.reading import about
 from rigkit.io.rig_file import board_rigs_text, rig_text
 from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
 from rigkit.io.session import load_session
-from rigkit.validation.check import Check, compare
+from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
-from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
+from rigkit.workflows.corners import SessionCorners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
 from rigkit.workflows.identify_board import misread
 from rigkit.workflows.known_cameras import known_cameras, with_known, with_known_first
@@ -143,17 +143,17 @@ def _boards_file(target: Path) -> Path:
     return target.with_name(f"{target.stem}-boards.json")
 
 
-def calibrate_camera(path: Path, *, cache: Cache = Cache.READ, progress: Progress = silent) -> Calibration:
-    """Return the calibration of one camera from its session, with boards on one mount or without; nothing is written
-    but what `cache` says.
+def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
+    """Return the calibration of one camera from its session, with boards on one mount or without; nothing is written.
 
     Raises InputError for a session of several cameras, and as `calibrate_rig_session`.
     """
     session = load_rig_session(path) if is_rig_session(path) else None
     if session is None or len(session.cameras) > 1:
         own = load_session(path)
-        return calibration_from(own, session_corners(own, cache=cache, progress=progress), progress=progress)
-    corners = rig_corners(session, cache=cache, progress=progress)
+        return calibration_from(own, session_corners(own, progress=progress), progress=progress)
+    require_distinct(session)
+    corners = {name: session_corners(own, progress=progress) for name, own in session.cameras.items()}
     return judged(rig_from(session, corners, progress=progress).cameras[0].calibration)
 
 
@@ -169,14 +169,6 @@ def judged(calibration: Calibration) -> Calibration:
     """Return a camera's calibration with the verdicts on it as it is in the rig: there it has another held-out error
     than alone, and is surer."""
     return replace(calibration, verdicts=judge(calibration))
-
-
-def rig_corners(
-    session: RigSession, *, cache: Cache = Cache.READ, progress: Progress = silent
-) -> dict[str, SessionCorners]:
-    """Return the corners of every camera of a rig; raises InputError where its boards cannot be identified."""
-    require_distinct(session)
-    return {name: session_corners(own, cache=cache, progress=progress) for name, own in session.cameras.items()}
 
 
 def rig_from(
@@ -241,18 +233,12 @@ def measured_checks(session: RigSession, rig: RigCalibration) -> list[Check]:
     """Return what a person measured beside what came out: baselines, angles and distances of boards on one mount."""
     out = []
     for b in session.baselines:
-        known = (b.length.value_mm, b.length.sigma_mm, b.length.how)
         ours = rig.baseline_mm(b.a, b.b)
-        out.append(compare(f"baseline {b.a}-{b.b}", "baseline", "mm", known, ours, COVERAGE, rig.corner_count))
+        out.append(compare_baseline(f"baseline {b.a}-{b.b}", b.length, ours, COVERAGE, rig.corner_count))
     for group, solved in zip(session.rigid_boards, rig.board_rigs, strict=True):
         count = sum(b.board.corner_count for b in solved.boards)
         for angle in group.truth.angles:
-            known = (angle.value_deg, angle.sigma_deg, angle.how)
-            ours = solved.angle_deg(angle.a, angle.b)
-            out.append(compare(f"angle {angle.a}-{angle.b}", "angle", "deg", known, ours, COVERAGE, count))
+            out.append(compare_angle(angle, solved.angle_deg(angle.a, angle.b), COVERAGE, count))
         for distance in group.truth.distances:
-            known = (distance.value_mm, distance.sigma_mm, distance.how)
-            ours = solved.distance_mm(distance.a, distance.b)
-            name = f"distance {distance.a} to {distance.b}"
-            out.append(compare(name, "distance", "mm", known, ours, COVERAGE, count))
+            out.append(compare_distance(distance, solved.distance_mm(distance.a, distance.b), COVERAGE, count))
     return out
