@@ -33,7 +33,6 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
-from rigkit.io.files import write_atomic
 from rigkit.io.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
@@ -101,11 +100,6 @@ def correspondences_text(found: Correspondences) -> str:
     for row in zip(*columns.values(), strict=True):
         writer.writerow(["" if np.isnan(value) else repr(float(value)) for value in row])
     return stream.getvalue()
-
-
-def write_correspondences(path: str | Path, found: Correspondences, *, force: bool = False) -> None:
-    """Write CSV; raises InputError as `write_atomic` does."""
-    write_atomic(path, correspondences_text(found), force=force)
 
 
 def _from_csv(source: Path) -> Correspondences:

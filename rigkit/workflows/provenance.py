@@ -48,9 +48,8 @@ def digest_of(source: Path | str | bytes) -> str:
     return hashlib.sha256(source.encode() if isinstance(source, str) else source).hexdigest()
 
 
-def digest_of_many(hashes: Mapping[str, str] | Sequence[tuple[str, str]]) -> str:
+def digest_of_many(pairs: Sequence[tuple[str, str]]) -> str:
     """Return one SHA-256 of several files, given (name, SHA-256) of each, in words that say how to compute it."""
-    pairs = list(hashes.items()) if isinstance(hashes, Mapping) else list(hashes)
     return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}"
 
 

@@ -96,10 +96,7 @@ def renamed(rig: RigCalibration, names: Mapping[str, str]) -> RigCalibration:
     boards = {b.board.board_id: b.board for target in rig.board_rigs for b in target.boards}
 
     def target(old: BoardRig) -> BoardRig:
-        placed = tuple(
-            replace(b, board=boards[names.get(b.board.board_id, b.board.board_id)]) if b.board.board_id in names else b
-            for b in old.boards
-        )
+        placed = tuple(replace(b, board=boards[names.get(b.board.board_id, b.board.board_id)]) for b in old.boards)
         return replace(old, boards=placed)
 
     def calibration(old: Calibration) -> Calibration:

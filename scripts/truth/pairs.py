@@ -15,7 +15,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import save_camera
-from rigkit.io.correspondences import write_correspondences
+from rigkit.io.correspondences import correspondences_text
 from rigkit.io.images import read_image
 from rigkit.workflows.reconstruct_scene import SceneOptions, reconstruct_views
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
@@ -161,8 +161,7 @@ def cylinder(bench: Bench) -> Iterator[Row]:
         cameras.append(peers.opencv_fit(views, found.camera.size_px, False).camera)
     keys, pixels1, pixels2, A21 = lattice_affinities(marks[0], marks[1])
     path = bench.work / "cylinder-marks.npz"
-    path.unlink(missing_ok=True)
-    write_correspondences(path, Correspondences(pixels1, pixels2, A21=A21))
+    path.write_text(correspondences_text(Correspondences(pixels1, pixels2, A21=A21)))
     first, second = (bench.work / f"{bench.name}-{name}.json" for name in CYLINDER_SEEN)
     scene = reconstruct_views(SceneOptions(camera=first, camera2=second, correspondences=path, pictures=False)).scene
     kept = [keys[k] for k in scene.kept]

@@ -18,7 +18,7 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import save_camera
-from rigkit.io.correspondences import read_correspondences, write_correspondences
+from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import read_ply
 
 SMALL = Pinhole((320, 240), np.array([280.0, 280.0, 159.5, 119.5]))
@@ -31,7 +31,7 @@ def files(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, Rigid3]:
     """A folder with a camera and correspondences; the true pose."""
     m, pose, _ = pair(rng, 60, noise_px=0.3, sigma_A=0.03)
     save_camera(tmp_path / "camera.json", REGULAR)
-    write_correspondences(tmp_path / "found.csv", Correspondences(m.pixels1, m.pixels2, m.A21))
+    (tmp_path / "found.csv").write_text(correspondences_text(Correspondences(m.pixels1, m.pixels2, m.A21)))
     return tmp_path, pose
 
 

@@ -44,7 +44,7 @@ from rigkit.interop.ros import read_camera_info, write_camera_info
 from rigkit.io.board_file import board_text, load_board
 from rigkit.io.calibration_file import load_camera, save_camera
 from rigkit.io.corners_file import read_corners, write_corners
-from rigkit.io.correspondences import read_correspondences, write_correspondences
+from rigkit.io.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import read_ply, write_ply
 from rigkit.report.tables import tables_to_csv, tables_to_json
 
@@ -301,7 +301,7 @@ def test_correspondences(folder: Path, data: Any) -> None:
     values = np.array(data.draw(st.lists(st.floats(-100.0, 100.0), min_size=4 * n, max_size=4 * n)))
     sigma = np.array(data.draw(st.lists(positive, min_size=n, max_size=n)))
     found = Correspondences(pixels[0], pixels[1], values.reshape(n, 2, 2), None, sigma, 2.0 * sigma)
-    write_correspondences(folder / "pairs.csv", found, force=True)
+    (folder / "pairs.csv").write_text(correspondences_text(found))
     arrays = {name: getattr(found, name) for name in ("pixels1", "pixels2", "A21", "sigma_px", "sigma_A")}
     np.savez(folder / "pairs.npz", **arrays)
     for name in ("pairs.csv", "pairs.npz"):
