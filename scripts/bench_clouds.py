@@ -87,7 +87,7 @@ def reconstructed(case: Case, known: bool, pose_type: str | None) -> tuple[Dense
     start = time.process_time()
     seeds = match_affine_features(*case.images)
     matched = time.process_time()
-    pose = KnownPose(case.pose, np.zeros((6, 6))) if known else None
+    pose = KnownPose(case.pose) if known else None
     length = float(np.linalg.norm(case.pose.translation_mm))
     sparse = reconstruct_scene(
         seeds,

@@ -132,8 +132,9 @@ def _again(
     return estimated, found
 
 
-def with_calibrations(r: Reconstruction, shifts: CalibrationShifts) -> Reconstruction:
-    """Return the reconstruction with the share of the calibrations in the sigmas of its cloud's points and normals.
+def with_calibrations(r: Reconstruction, shifts: CalibrationShifts | None) -> Reconstruction:
+    """Return the reconstruction with the share of the calibrations in the sigmas of its cloud's points and normals; the
+    same one where nothing is known of them (None).
 
     Along each axis of `shifts` a point moves, and its normal turns: by the moved point, pose and cameras, from the same
     affinity in the image, or where affinities follow from the epipolar geometry from the same directions. Sigmas of
@@ -141,6 +142,8 @@ def with_calibrations(r: Reconstruction, shifts: CalibrationShifts) -> Reconstru
 
     Raises InputError for points on fitted planes, which have that share.
     """
+    if shifts is None:
+        return r
     if r.boards and r.kept is None:
         raise InputError(f"pair '{r.pair_id}': the calibrations' share is for free points of boards")
     cloud, known = r.cloud, shifts.known

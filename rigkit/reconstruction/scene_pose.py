@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -54,10 +54,11 @@ class ScenePose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KnownPose:
-    """A measured pose, mm, and its covariance (6, 6) of (left rotation perturbation rad, translation mm)."""
+    """A measured pose, mm, and its covariance (6, 6) of (left rotation perturbation rad, translation mm): exact where
+    none is given."""
 
     cam2_from_cam1: Rigid3
-    covariance: FloatArray
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
     def baseline_mm(self) -> float:

@@ -86,8 +86,8 @@ def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     planes = options.planes or pair.planes
     if planes != "free":
         r = reconstruct_on_planes(r, planes, camera1, camera2)
-    elif (shifts := shifts_of(r, camera1, camera2)) is not None:
-        r = with_calibrations(r, shifts)
+    else:
+        r = with_calibrations(r, shifts_of(r, camera1, camera2))
     ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:

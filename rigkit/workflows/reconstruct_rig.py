@@ -182,7 +182,7 @@ def _views(options: RigSceneOptions) -> list[_View]:
 
 def _dense(one: _View, other: _View) -> DenseScene:
     """Return the cloud of two views; raises DegenerateError where they do not see the same surfaces."""
-    pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse(), np.zeros((6, 6)))
+    pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse())
     try:
         seeds = match_affine_features(one.image, other.image)
         name = f"{one.name}-{other.name}"

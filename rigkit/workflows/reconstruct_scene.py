@@ -167,8 +167,7 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
         scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known, of=of)
     if of is not None and not maps:
         shifts = calibration_shifts(scene.reconstruction, *of, pose_is_known=known)
-        sparse = with_calibrations(scene.reconstruction, shifts)
-        scene = replace(scene, reconstruction=sparse)
+        scene = replace(scene, reconstruction=with_calibrations(scene.reconstruction, shifts))
     r = scene.reconstruction
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
     files = _files(options, scene, found, images)
@@ -187,12 +186,12 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
         if options.camera or options.camera2 or options.pose:
             raise InputError("a scene of a rig: the rig's file has the cameras and their pose; leave the others out")
         _, cameras, cam2_from_cam1 = import_pair(options.rig, options.rig_names)
-        return *cameras, KnownPose(cam2_from_cam1, np.zeros((6, 6))), []
+        return *cameras, KnownPose(cam2_from_cam1), []
     if options.camera is None:
         raise InputError("a scene needs a calibration: of its camera, or of the rig that took both images")
     camera1 = import_camera(options.camera)
     camera2 = import_camera(options.camera2) if options.camera2 else camera1
-    known = None if options.pose is None else KnownPose(_read_pose(options.pose), np.zeros((6, 6)))
+    known = None if options.pose is None else KnownPose(_read_pose(options.pose))
     notes = []
     if options.camera2 is None:
         notes.append("one calibration is used for both images: right if one camera was moved, else name the other's")

@@ -173,7 +173,7 @@ def _judge(
     reports = validate_each(list(reconstructions.values()), pair.truth, known, fitted, pair.layout)
     best = best_report(reports)
     files: dict[str, bytes] = {
-        f"{pair.pair_id}/{method}.ply": ply_bytes(_with_sigmas(r, shifts[method]).cloud)
+        f"{pair.pair_id}/{method}.ply": ply_bytes(with_calibrations(r, shifts[method]).cloud)
         for method, r in reconstructions.items()
     }
     shown = reconstructions[best.affine_method]
@@ -211,11 +211,6 @@ def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlan
     return FittedPlanes(found.get("coplanar"), found.get("lattice"), judging)
 
 
-def _with_sigmas(reconstruction: Reconstruction, shifts: CalibrationShifts | None) -> Reconstruction:
-    """Return the reconstruction with the calibrations in its cloud's sigmas, where they are known."""
-    return reconstruction if shifts is None else with_calibrations(reconstruction, shifts)
-
-
 def _shifts(
     reconstructions: Mapping[str, Reconstruction], job: PairJob[ValidateOptions]
 ) -> dict[str, CalibrationShifts | None]:
@@ -223,14 +218,10 @@ def _shifts(
 
     The likelihood sees the corners, not the affinities: estimators that kept the same corners share the answer.
     """
-    cameras = job.cameras.of(job.pair)
-    known: list[tuple[Reconstruction, CalibrationShifts | None]] = []
     out: dict[str, CalibrationShifts | None] = {}
-    for method, reconstruction in reconstructions.items():
-        same = [shifts for first, shifts in known if first.same_points(reconstruction)]
-        out[method] = same[0] if same else shifts_of(reconstruction, *cameras)
-        if not same:
-            known.append((reconstruction, out[method]))
+    for method, r in reconstructions.items():
+        same = next((first for first in out if reconstructions[first].same_points(r)), None)
+        out[method] = shifts_of(r, *job.cameras.of(job.pair)) if same is None else out[same]
     return out
 
 

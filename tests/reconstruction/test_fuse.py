@@ -35,7 +35,7 @@ def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
     for i, j in ((0, 1), (0, 2), (2, 1)):
         pose = CAM_FROM_WORLD[j] @ CAM_FROM_WORLD[i].inverse()
         seeds = match_affine_features(images[i], images[j])
-        known = KnownPose(pose, np.zeros((6, 6)))
+        known = KnownPose(pose)
         sparse = reconstruct_scene(seeds, CAMERA, CAMERA, known_pose=known, image1=images[i])
         dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True)
         clouds.append(PosedCloud.of(dense, CAM_FROM_WORLD[i].inverse()))

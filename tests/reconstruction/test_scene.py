@@ -191,7 +191,7 @@ def test_colours_of_deep_images_are_no_darker(rng, bits):
 def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_known):
     """Points and normals of a sparse cloud through cameras drawn from their covariance, against the right one."""
     found, _, pose, _, _ = contaminated(rng, count=60, outliers=0.0)
-    known = KnownPose(pose, np.zeros((6, 6))) if pose_is_known else None
+    known = KnownPose(pose) if pose_is_known else None
     exact = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=300.0, known_pose=known)
     # A pose that is known contradicts cameras that are far off.
     covariance = (0.01 if pose_is_known else 1.0) * np.diag([4.0, 4.0, 3.0, 3.0]) ** 2

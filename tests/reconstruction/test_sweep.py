@@ -151,7 +151,7 @@ def cloud_of_the_card() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     images = [card_before_a_wall(p, camera, rng) for p in (Rigid3.identity(), pose)]
     seeds = match_affine_features(*images)
     length = float(np.linalg.norm(pose.translation_mm))
-    known = KnownPose(pose, np.zeros((6, 6)))
+    known = KnownPose(pose)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=length, known_pose=known, image1=images[0])
     r = grow_scene(sparse, seeds, *images, pose_is_known=True).scene.reconstruction
     half = CARD_HALF_MM / CARD_MM * 380.0
