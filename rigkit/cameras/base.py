@@ -125,10 +125,12 @@ class Camera(ABC):
             self._prepare()
 
     def __repr__(self) -> str:
-        values = ", ".join(
-            f"{name}={value:.6g}" for name, value in zip(self.parameter_names(), self.parameters.tolist(), strict=True)
-        )
+        values = ", ".join(f"{name}={value:.6g}" for name, value in self.named(self.parameters).items())
         return f"{type(self).__name__}({self.size_px[0]}x{self.size_px[1]} px: {values})"
+
+    def named(self, values: FloatArray) -> dict[str, float]:
+        """Return values (P,) of the parameters, or their standard deviations, by the parameters' names."""
+        return dict(zip(self.parameter_names(), values.tolist(), strict=True))
 
     def _prepare(self) -> None:
         """Check the values of the parameters and compute what the formulas need of them."""

@@ -28,13 +28,12 @@ def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
 
 def summary(calibration: Calibration) -> dict[str, Any]:
     """Return the figures for programs."""
+    from rigkit.io.calibration_file import camera_to_json
+
     camera = calibration.camera
-    names = camera.parameter_names()
     return {
-        "model": camera.model,
-        "size_px": list(camera.size_px),
-        "parameters": dict(zip(names, camera.parameters.tolist(), strict=True)),
-        "sigmas": dict(zip(names, calibration.parameter_sigmas.tolist(), strict=True)),
+        **camera_to_json(camera),
+        "sigmas": camera.named(calibration.parameter_sigmas),
         "heldout_rms_px": calibration.heldout_rms_px,
         "rms_px": calibration.rms_px,
         "sigma_px": calibration.sigma_px,
@@ -47,9 +46,9 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 
 def describe(calibration: Calibration) -> str:
     """Return the result for a person: the headline first."""
-    camera = calibration.camera
-    from rigkit.report.tables import rounded_words
+    from rigkit.report.tables import rounded_parameters
 
+    camera = calibration.camera
     held = calibration.heldout_rms_px
     headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
     lines = [
@@ -58,9 +57,8 @@ def describe(calibration: Calibration) -> str:
         f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {calibration.images_left_out} images "
         "dropped",
     ]
-    sigmas = calibration.parameter_sigmas
-    for name, value, sigma in zip(camera.parameter_names(), camera.parameters, sigmas, strict=True):
-        lines.append(f"  {name:>4} = {rounded_words(float(value), float(sigma))}")
+    words = rounded_parameters(camera, calibration.parameter_sigmas)
+    lines += [f"  {name:>4} = {value}" for name, value in words.items()]
     lines += left_out(calibration)
     lines += _choices(calibration.candidates)
     return "\n".join([*lines, *map(str, gravest_first(calibration.verdicts))])

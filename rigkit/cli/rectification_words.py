@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 def image_to_dict(one: RectifiedImage, projection: str) -> dict[str, Any]:
     """Return what a program needs to know."""
+    from rigkit.io.calibration_file import camera_to_json
+
     target = one.map.target
     return {
         "image": str(one.path),
         "projection": projection,
-        "model": target.model,
-        "size_px": list(target.size_px),
-        "parameters": dict(zip(target.parameter_names(), target.parameters.tolist(), strict=True)),
+        **camera_to_json(target),
         "target_from_cam": one.map.target_from_cam.tolist(),
         "covered": one.covered,
     }
@@ -34,7 +34,7 @@ def alike(images: Sequence[RectifiedImage], projection: str) -> list[tuple[str, 
 
 def _words(one: RectifiedImage, projection: str) -> str:
     target = one.map.target
-    (width, height), focal = target.size_px, target.parameters[target.parameter_names().index("fx")]
+    (width, height), focal = target.size_px, target.named(target.parameters)["fx"]
     return (
         f"{projection}, {width} x {height} px, focal length {focal:.2f} px, "
         f"{100.0 * one.covered:.1f} % of it seen by the camera"

@@ -41,12 +41,8 @@ def summary(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
                 "heldout_rms_px": camera.calibration.heldout_rms_px,
                 "rms_px": camera.rms_px,
                 "cam_from_rig": camera.cam_from_rig.matrix()[:3].tolist(),
-                "parameters": dict(
-                    zip(camera.camera.parameter_names(), camera.camera.parameters.tolist(), strict=True)
-                ),
-                "sigmas": dict(
-                    zip(camera.camera.parameter_names(), camera.calibration.parameter_sigmas.tolist(), strict=True)
-                ),
+                "parameters": camera.camera.named(camera.camera.parameters),
+                "sigmas": camera.camera.named(camera.calibration.parameter_sigmas),
                 "alone": calibration_words.summary(alone),
             }
             for camera, alone in zip(rig.cameras, rig.single, strict=True)

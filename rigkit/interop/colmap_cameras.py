@@ -51,7 +51,7 @@ def write_colmap_cameras(
         name = {"pinhole": "PINHOLE", "kannala_brandt": "OPENCV_FISHEYE", "eucm": "EUCM"}.get(c.model)
         if name is None:
             name = "OPENCV" if c.parameters.size == 8 else "FULL_OPENCV"
-        ours = dict(zip(c.parameter_names(), c.parameters.tolist(), strict=True))
+        ours = c.named(c.parameters)
         ours["cx"] += HALF_PIXEL
         ours["cy"] += HALF_PIXEL
         values = " ".join(repr(ours.get(key, 0.0)) for key in LAYOUTS[name][1])

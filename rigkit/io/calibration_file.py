@@ -168,8 +168,8 @@ def _field(data: dict[str, Any], key: str, path: str | Path) -> Any:
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
     """Return the camera as it stands in files."""
-    values = dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True))
-    return {"model": camera.model, "size_px": list(camera.size_px), "parameters": values}
+    parameters = camera.named(camera.parameters)
+    return {"model": camera.model, "size_px": list(camera.size_px), "parameters": parameters}
 
 
 def camera_from_json(data: Any, path: str | Path) -> Camera:

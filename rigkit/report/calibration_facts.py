@@ -18,7 +18,7 @@ from rigkit.report.calibration_drawings import MAP_GRID
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.plan_page import plan_table, plan_words
 from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
-from rigkit.report.tables import rounded_words
+from rigkit.report.tables import rounded_parameters
 from rigkit.validation.check import Check
 
 IN_PX = ("fx", "fy", "cx", "cy")
@@ -105,8 +105,8 @@ def _reach(c: Calibration) -> str:
 
 def _parameters(c: Calibration) -> Table:
     rows = tuple(
-        cells(name, rounded_words(float(value), float(sigma)), "px" if name in IN_PX else "")
-        for name, value, sigma in zip(c.camera.parameter_names(), c.camera.parameters, c.parameter_sigmas, strict=True)
+        cells(name, words, "px" if name in IN_PX else "")
+        for name, words in rounded_parameters(c.camera, c.parameter_sigmas).items()
     )
     heads = columns("name | value and standard deviation | unit")
     return Table("parameters", "Parameters", heads, rows, "The file has every digit.")

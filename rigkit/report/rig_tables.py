@@ -13,7 +13,7 @@ from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
-from rigkit.report.tables import rounded_words
+from rigkit.report.tables import rounded_parameters, rounded_words
 from rigkit.validation.check import Check
 
 
@@ -51,12 +51,9 @@ def _intrinsics(rig: RigCalibration) -> Table:
     own_words: list[dict[str, str]] = []
     start = 0
     for camera in rig.cameras:
-        names, values = camera.camera.parameter_names(), camera.camera.parameters
-        own = sigmas[start : start + values.size]
-        start += values.size
-        own_words.append(
-            {name: rounded_words(float(v), float(s)) for name, v, s in zip(names, values, own, strict=True)}
-        )
+        end = start + camera.camera.parameters.size
+        own_words.append(rounded_parameters(camera.camera, sigmas[start:end]))
+        start = end
     rows = tuple(
         cells(name, *(words.get(name, "–") for words in own_words))
         for name in dict.fromkeys(name for words in own_words for name in words)

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.reading import is_number
 
@@ -214,6 +216,12 @@ def rounded_words(value: float, sigma: float) -> str:
     decimals = max(1 - int(np.floor(np.log10(sigma))), 0)
     words = f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
     return f"({words})e{power}" if power else words
+
+
+def rounded_parameters(camera: Camera, sigmas: FloatArray) -> dict[str, str]:
+    """Return the camera's parameters with their standard deviations (P,) in words, by their names."""
+    values, spreads = camera.named(camera.parameters), camera.named(sigmas)
+    return {name: rounded_words(value, spreads[name]) for name, value in values.items()}
 
 
 def in_words(table: Table) -> list[bool]:

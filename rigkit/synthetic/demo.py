@@ -168,11 +168,7 @@ def _manifest_toml(scenes: dict[str, StereoScene]) -> str:
 def _truth(camera: Camera, targets: list[PlacedBoard], scenes: dict[str, StereoScene]) -> dict[str, Any]:
     """Return everything exactly, for comparison only."""
     return {
-        "camera": {
-            "model": camera.model,
-            "size_px": camera.size_px,
-            "parameters": dict(zip(camera.parameter_names(), camera.parameters.tolist(), strict=True)),
-        },
+        "camera": {"model": camera.model, "size_px": camera.size_px, "parameters": camera.named(camera.parameters)},
         "calibration": {
             f"{k + 1:02d}.png": {
                 "cam_from_board": target.world_from_board.matrix().tolist(),
