@@ -12,7 +12,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import Pixels
-from rigkit.core.findings import Finding, gravest_first
+from rigkit.core.findings import gravest_first
 from rigkit.core.printing import brief
 from rigkit.core.tables import Table
 from rigkit.io.images import Image
@@ -20,7 +20,7 @@ from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
 from rigkit.report.calibration_facts import IMAGES_KEY, LEFT_OUT_KEY, NEXT_KEY, camera_facts, next_words, rig_facts
-from rigkit.report.page_facts import told
+from rigkit.report.page_facts import PageFacts, told
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.scene_view import boards_scene, rig_scene
@@ -104,11 +104,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     """Return what the cameras share, as the template shows it."""
     facts = rig_facts(rig, checks, {})
     return {
-        "heldout": "not available (too few frames)" if rig.heldout_rms_px is None else f"{rig.heldout_rms_px:.3f} px",
-        "training": f"{rig.rms_px:.3f} px",
-        "findings": _findings(rig.verdicts),
-        "told": told(facts),
-        "basis": facts.basis,
+        **_said(rig, facts, "frames"),
         "scene": rig_scene(rig),
         "tables": [shown_table(table) for table in facts.tables],
     }
@@ -121,11 +117,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
     sources = {name: data_uri("image/jpeg", data) for name, data in section.thumbnails.items()}
     return {
         "name": section.name,
-        "heldout": "not available (too few images)" if c.heldout_rms_px is None else f"{c.heldout_rms_px:.3f} px",
-        "training": f"{c.rms_px:.3f} px",
-        "basis": facts.basis,
-        "findings": _findings(c.verdicts),
-        "told": told(facts),
+        **_said(c, facts, "images"),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
@@ -146,6 +138,14 @@ def _kept(c: Calibration) -> Pixels:
     return np.concatenate([view.pixels[view.kept] for view in c.views])
 
 
-def _findings(found: Sequence[Finding]) -> list[tuple[str, str, str]]:
-    """Return severity, colour and words of each finding, the gravest first."""
-    return [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(found)]
+def _said(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:
+    """Return what is said first, of a camera or a rig alike: how good it is, severity, colour and words of each
+    finding, the gravest first, and what it rests on."""
+    held = c.heldout_rms_px
+    return {
+        "heldout": f"not available (too few {taken})" if held is None else f"{held:.3f} px",
+        "training": f"{c.rms_px:.3f} px",
+        "findings": [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(c.verdicts)],
+        "told": told(facts),
+        "basis": facts.basis,
+    }

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.reading import is_number
 
@@ -165,7 +165,7 @@ def table_files(tables: Sequence[Table], stem: str, *endings: str) -> dict[str, 
 
 
 def _cell_dict(cell: Cell) -> Any:
-    value = None if isinstance(cell.value, float) and not np.isfinite(cell.value) else cell.value
+    value = without_nan(cell.value)
     marks = {name: True for name in ("best", "failed") if getattr(cell, name)}
     more: dict[str, Any] = {} if cell.paper is None else {"paper": float(cell.paper)}
     if cell.sigma is not None and np.isfinite(cell.sigma):
@@ -180,12 +180,13 @@ def column_label(column: Column) -> str:
 
 def _text(cell: Cell, column: Column) -> str:
     """Return the cell as a person reads it."""
-    if cell.value is None or (isinstance(cell.value, float) and not np.isfinite(cell.value)):
+    value = without_nan(cell.value)
+    if value is None:
         text = "" if cell.paper is None else "-"
-    elif isinstance(cell.value, str):
-        text = cell.value
+    elif isinstance(value, str):
+        text = value
     else:
-        text = measured_words(cell.value, cell.sigma, column.decimals)
+        text = measured_words(value, cell.sigma, column.decimals)
     return text if cell.paper is None else f"{text} ({cell.paper})"
 
 
@@ -242,7 +243,8 @@ def _extra(table: Table, j: int) -> tuple[bool, bool]:
 
 
 def _exact(value: float | str | None) -> str:
-    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+    value = without_nan(value)
+    if value is None:
         return ""
     if isinstance(value, str):
         return _in_cell(value)
