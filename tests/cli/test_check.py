@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.calibration_scenes import noisy_view
+from helpers.sentinel_scenes import best_held
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.base import Camera
@@ -25,9 +26,6 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.board_words import board_of_words
 from rigkit.io.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.images import read_image
-from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, Knowledge
-from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -39,14 +37,9 @@ FOCUS_PERCENT = 0.5
 NOISE_PX = 0.03
 
 
-def _poses(count: int) -> list[Rigid3]:
-    known = Knowledge.guessed(CAMERA, CornerError(0.1))
-    return [view.cam_from_board for view in plan_views(known, [BOARD], projection_goal(CAMERA), count).views]
-
-
 def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: PlacedBoard) -> Path:
     folder.mkdir()
-    for k, pose in enumerate(_poses(3)):
+    for k, pose in enumerate(best_held(CAMERA, BOARD, 3, 0.1)):
         placed = [PlacedBoard(BOARD, pose), *others]
         optics, photometry = Optics(0.6, supersample=2), Photometry(noise_levels=1.0)
         image = render(placed, camera, Rigid3.identity(), optics=optics, photometry=photometry, rng=rng)
@@ -58,7 +51,10 @@ def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: P
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A calibration, fresh pictures of the same camera, and of one whose focus changed."""
     root, rng = tmp_path_factory.mktemp("check"), np.random.default_rng(6)
-    views = [noisy_view(CAMERA, pose, f"{k}", rng, NOISE_PX, board=BOARD) for k, pose in enumerate(_poses(14))]
+    views = [
+        noisy_view(CAMERA, pose, f"{k}", rng, NOISE_PX, board=BOARD)
+        for k, pose in enumerate(best_held(CAMERA, BOARD, 14, 0.1))
+    ]
     save_calibration(root / "cam.json", calibrate(views, CAMERA.size_px, model="brown", degree=5, board="flat"))
     _pictures(root / "same", CAMERA, rng)
     moved = CAMERA.parameters.copy()

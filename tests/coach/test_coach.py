@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.sentinel_scenes import best_held
 
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
@@ -25,8 +26,6 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, Knowledge
-from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
@@ -52,8 +51,7 @@ def picture(pose: Rigid3, rng: np.random.Generator, *, blur_px: float = 0.5) -> 
 
 @pytest.fixture(scope="module")
 def poses() -> list[Rigid3]:
-    known = Knowledge.guessed(CAMERA, CornerError(0.1))
-    return [v.cam_from_board for v in plan_views(known, [BOARD], projection_goal(CAMERA), FRAMES).views]
+    return best_held(CAMERA, BOARD, FRAMES, 0.1)
 
 
 @pytest.fixture(scope="module")

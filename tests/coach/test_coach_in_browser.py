@@ -14,6 +14,7 @@ from coach.test_coach import BOARD, CAMERA, SIZE, picture
 from coach.test_rig import shared_boards
 from helpers.browser import chromium
 from helpers.driven import DrivenPage
+from helpers.sentinel_scenes import best_held
 
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.look import glance_at
@@ -22,8 +23,6 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.images import read_image
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, Knowledge
-from rigkit.planning.plan import plan_views
 
 POSES, HELD_FRAMES, MOVING_FRAMES, RATE = 13, 14, 2, 10
 """A person holds each pose for a second and a half, and takes a fifth of a second to the next."""
@@ -38,12 +37,9 @@ EXACT_PX = 0.05
 def person_like_video(path: Path, poses: int) -> Path:
     """Write a session as Y4M: boards held where a plan asks, within a hand's error, and moved between."""
     rng = np.random.default_rng(4)
-    known = Knowledge.guessed(CAMERA, CornerError(0.1))
-    plan = plan_views(known, [BOARD], projection_goal(CAMERA), poses)
     with path.open("wb") as out:
         out.write(_head(SIZE[0]))
-        for view in plan.views:
-            pose = view.cam_from_board
+        for pose in best_held(CAMERA, BOARD, poses, 0.1):
             turned = exp_so3(np.radians(2.0) * rng.standard_normal(3)) @ pose.rotation
             held = Rigid3(turned, pose.translation_mm * (1.0 + 0.02 * rng.standard_normal()))
             for k in range(MOVING_FRAMES):

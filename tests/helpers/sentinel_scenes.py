@@ -10,6 +10,7 @@ import numpy as np
 from helpers.calibration_scenes import BOARD, lens, noisy_view
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import projection_goal
@@ -24,13 +25,17 @@ CHANGED_PX = 0.25
 """Change of the projection, rms after the best rotation: what three views show beyond doubt."""
 
 
+def best_held(camera: Camera, board: Board, count: int, sigma_px: float, reach: Reach | None = None) -> list[Rigid3]:
+    """Return where a board is best held before a lens that nobody knows yet."""
+    known = Knowledge.guessed(camera, CornerError(sigma_px))
+    plan = plan_views(known, [board], projection_goal(camera), count, reach=reach)
+    return [view.cam_from_board for view in plan.views]
+
+
 @cache
 def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3]:
-    """Return where boards are best held before a lens of `calibration_scenes`."""
-    camera = lens(name)
-    known = Knowledge.guessed(camera, CornerError(NOISE_PX))
-    plan = plan_views(known, [BOARD], projection_goal(camera), count, reach=reach)
-    return [view.cam_from_board for view in plan.views]
+    """Return where the board is best held before a lens of `calibration_scenes`."""
+    return best_held(lens(name), BOARD, count, NOISE_PX, reach)
 
 
 def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:

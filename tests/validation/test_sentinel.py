@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, lens, noisy_view, random_views
-from helpers.sentinel_scenes import NOISE_PX, changed_lens, checked, poses_held
+from helpers.sentinel_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import DisplacedCamera, lens_of
@@ -22,8 +22,6 @@ from rigkit.io.calibration_file import calibration_text, load_calibration, save_
 from rigkit.io.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
-from rigkit.planning.information import CornerError, Knowledge
-from rigkit.planning.plan import plan_views
 from rigkit.report.check_page import check_facts, check_page
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
@@ -219,11 +217,9 @@ def test_what_moves_nothing_is_no_other_camera(calibration: Calibration) -> None
 def test_a_declared_board_of_another_size_is_accepted(calibration: Calibration, rng: np.random.Generator) -> None:
     camera, name = lens("reg"), calibration.boards[0].board_id
     larger = Board(name, 12, 9, 20.0, 20.0)
-    known = Knowledge.guessed(camera, CornerError(NOISE_PX))
     views = []
-    for k, proposal in enumerate(plan_views(known, [larger], projection_goal(camera), 3).views):
-        view = noisy_view(camera, proposal.cam_from_board, f"{k}", rng, NOISE_PX, board=larger)
-        views.append(FreshView(f"{k}", 0, view))
+    for k, pose in enumerate(best_held(camera, larger, 3, NOISE_PX)):
+        views.append(FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX, board=larger)))
     assert check_views(watched_camera(calibration, "cam"), views).holds
 
 
