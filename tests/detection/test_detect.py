@@ -7,7 +7,16 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.detection_scenes import corner_scene, errors_by_position, fisheye, match, regular, single
+from helpers.detection_scenes import (
+    corner_scene,
+    dots,
+    errors_by_position,
+    fisheye,
+    match,
+    printed_text,
+    regular,
+    single,
+)
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -229,18 +238,7 @@ def test_same_answer_twice_and_the_image_unchanged(rng: np.random.Generator) -> 
 
 def _no_boards() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    text = np.full((300, 500), 230, np.uint8)
-    for line in range(13):
-        cv2.putText(text, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
-    dots = np.full((300, 400), 220, np.uint8)
-    for v in range(20, 300, 30):
-        for u in range(20, 400, 30):
-            cv2.circle(dots, (u, v), 9, 30, -1, cv2.LINE_AA)
     row, column = np.arange(300) // 24 % 2, np.arange(400) // 24 % 2
-    large = np.full((600, 800), 220, np.uint8)
-    for v in range(20, 600, 30):
-        for u in range(20, 800, 30):
-            cv2.circle(large, (u, v), 11, 30, -1, cv2.LINE_AA)
     cloth = (120 + 50 * row[:, None] + 50 * column).astype(np.uint8)
     tiles = np.full((300, 400), 60, np.uint8)
     for v in range(0, 300, 40):
@@ -252,9 +250,9 @@ def _no_boards() -> dict[str, np.ndarray]:
             cv2.fillConvexPoly(triangles, np.array([[u, v], [u + 34, v], [u + 17, v + 30]]), 30, cv2.LINE_AA)
     return {
         "noise": (rng.random((300, 400)) * 255).astype(np.uint8),
-        "text": text,
-        "dots": dots,
-        "large dots": large,
+        "text": printed_text(),
+        "dots": dots((400, 300), 9),
+        "large dots": dots((800, 600), 11),
         "gingham cloth": cv2.GaussianBlur(cloth, (0, 0), 0.8),
         "tiles": tiles,
         "triangles": triangles,

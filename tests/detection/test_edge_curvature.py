@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from rigkit.cameras.kannala_brandt import KannalaBrandt
@@ -23,11 +25,22 @@ def circles(side_px: float, radius_px: float) -> np.ndarray:
     return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
 
 
+def curvature_of_rows(see: Callable[..., np.ndarray], column: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """Return by differences how rows bend that are seen at `see(column, row)`, (..., 2)."""
+    before, here, after = (see(column + step, row) for step in (-0.01, 0.0, 0.01))
+    first, second = (after - before) / 0.02, (after - 2.0 * here + before) / 1e-4
+    return (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / np.linalg.norm(first, axis=-1) ** 3
+
+
+def sides_of(pixels: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    shape = fit_cells(pixels, cells)
+    return np.linalg.norm(np.stack([shape.along_column, shape.along_row], axis=1), axis=2)
+
+
 def curvature(pixels: np.ndarray, sigma_px: float) -> np.ndarray:
     cells = np.ones(pixels.shape[:2], bool)
-    shape = fit_cells(pixels, cells)
-    sides = np.linalg.norm(np.stack([shape.along_column, shape.along_row], axis=1), axis=2)
-    return line_curvature(pixels, np.full(cells.shape, sigma_px), cells, sides)[0].reshape(*cells.shape, 2)
+    found, _ = line_curvature(pixels, np.full(cells.shape, sigma_px), cells, sides_of(pixels, cells))
+    return found.reshape(*cells.shape, 2)
 
 
 def test_circles_and_straight_lines() -> None:
@@ -47,13 +60,9 @@ def test_sigmas_are_honest_where_squares_turn_far(rng: np.random.Generator) -> N
         radius = np.hypot(x, y)
         return 190.0 * (np.arctan(radius) / radius)[..., None] * np.stack([x, y], axis=-1)
 
-    pixels = see(column, row)
-    before, after = see(column - 0.01, row), see(column + 0.01, row)
-    first, second = (after - before) / 0.02, (after - 2.0 * pixels + before) / 1e-4
-    true = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / np.linalg.norm(first, axis=-1) ** 3
+    pixels, true = see(column, row), curvature_of_rows(see, column, row)
     cells = np.ones(pixels.shape[:2], bool)
-    shape = fit_cells(pixels, cells)
-    sides = np.linalg.norm(np.stack([shape.along_column, shape.along_row], axis=1), axis=2)
+    sides = sides_of(pixels, cells)
     for noise in (1e-3, 1e-2, 5e-2):
         z = []
         for _ in range(20):
@@ -81,10 +90,7 @@ def test_ends_of_rows_in_a_fisheye() -> None:
         return camera.project(points)[0]
 
     row, column = np.mgrid[:6, :8].astype(float)
-    pixels = see(column, row)
-    before, after = see(column - 0.01, row), see(column + 0.01, row)
-    first, second = (after - before) / 0.02, (after - 2.0 * pixels + before) / 1e-4
-    true = (first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]) / np.linalg.norm(first, axis=-1) ** 3
+    pixels, true = see(column, row), curvature_of_rows(see, column, row)
     assert np.abs(true).max() > 1e-3
     ours = np.abs(curvature(pixels, 1e-3)[..., 0] - true)
     cubic = np.abs(fit_cells(pixels, np.ones((6, 8), bool)).curvature()[:, 0].reshape(6, 8) - true)

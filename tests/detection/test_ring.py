@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from helpers.detection_scenes import single
+from helpers.detection_scenes import dots, single
 
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
@@ -61,11 +61,7 @@ def test_ring_beyond_the_squares_is_refused() -> None:
 
 
 def test_dots_and_noise_have_hardly_any_corners(rng: np.random.Generator) -> None:
-    dots = np.full((300, 400), 220, np.uint8)
-    for v in range(20, 300, 30):
-        for u in range(20, 400, 30):
-            cv2.circle(dots, (u, v), 9, 30, -1, cv2.LINE_AA)
-    corners, saddles = find_corners(pyramid(grey_image(dots)))
+    corners, saddles = find_corners(pyramid(grey_image(dots((400, 300), 9))))
     assert len(saddles.pixels) > 200
     assert len(corners) < 0.02 * len(saddles.pixels)
     corners, saddles = find_corners(pyramid(grey_image((rng.random((480, 640)) * 255).astype(np.uint8))))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
@@ -95,3 +96,20 @@ def match(found: tuple[BoardDetection, ...], truth: list[tuple[np.ndarray, np.nd
     return [
         min(found, key=lambda d: np.linalg.norm(d.pixels.mean(axis=0) - pixels.mean(axis=0))) for _, pixels in truth
     ]
+
+
+def printed_text() -> np.ndarray:
+    """Return an image of letters and signs, which have corners like boards'."""
+    image = np.full((300, 500), 230, np.uint8)
+    for line in range(13):
+        cv2.putText(image, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
+    return image
+
+
+def dots(size_px: tuple[int, int], radius_px: int) -> np.ndarray:
+    """Return an image of dots, 30 px from one to the next."""
+    image = np.full(size_px[::-1], 220, np.uint8)
+    for v in range(20, size_px[1], 30):
+        for u in range(20, size_px[0], 30):
+            cv2.circle(image, (u, v), radius_px, 30, -1, cv2.LINE_AA)
+    return image

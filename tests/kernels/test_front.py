@@ -8,7 +8,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
-from helpers.detection_scenes import corner_scene, fisheye, regular
+from helpers.detection_scenes import corner_scene, fisheye, printed_text, regular
 from helpers.opencv import exact_interpolation
 from helpers.real_images import real_images
 from kernels.reference import front as reference
@@ -33,15 +33,12 @@ SAME_SHARE = 0.998
 @functools.cache
 def _images() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(5)
-    text = np.full((300, 500), 230, np.uint8)
-    for line in range(13):
-        cv2.putText(text, "HHH ### xxx 8888 +++ %%% mmm " * 2, (3, 20 + 22 * line), 0, 0.5, 20, 1, cv2.LINE_AA)
     images = {
         "boards": corner_scene(rng, regular(), 1250.0).image(rng),
         "fisheye": corner_scene(rng, fisheye(), 480.0).image(rng, noise_levels=6.0),
         "noise": (rng.random((301, 403)) * 255).astype(np.uint8),
         "small": (rng.random((17, 16)) * 255).astype(np.uint8),
-        "text": text,
+        "text": printed_text(),
         "black": np.zeros((60, 80), np.uint8),
         **real_images(),
     }

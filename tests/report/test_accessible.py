@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from helpers.rig_scenes import rig_views
 from report.test_first_screen import page_of, reported
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.report.calibration_charts import images_svg
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
@@ -52,18 +54,20 @@ def validation_page() -> str:
     return page_of(reported(88.0))
 
 
-def rig_page() -> str:
+def two_cameras(**options: Any) -> RigCalibration:
     views = {name: own for name, own in rig_views(np.random.default_rng(3), 8).items() if name != "fish"}
     sizes = {name: lens(name).size_px for name in views}
-    rig = calibrate_rig(views, sizes, model={"reg": "brown", "wide": "kannala_brandt"})
+    return calibrate_rig(views, sizes, model={"reg": "brown", "wide": "kannala_brandt"}, **options)
+
+
+def rig_page() -> str:
+    rig = two_cameras()
     sections = [CalibrationSection(c.name, c.calibration) for c in rig.cameras]
     return build_calibration_page("A rig", "lead", sections, {"rigkit": "x"}, rig)
 
 
 def facts_page() -> str:
-    views = {name: own for name, own in rig_views(np.random.default_rng(3), 8).items() if name != "fish"}
-    sizes = {name: lens(name).size_px for name in views}
-    rig = calibrate_rig(views, sizes, model={"reg": "brown", "wide": "kannala_brandt"}, folds=0)
+    rig = two_cameras(folds=0)
     table = Table("t", "A table", (Column("what"), Column("how much", "mm")), ((Cell("a length"), Cell(3.2)),))
     return build_facts_page(
         "Facts",
