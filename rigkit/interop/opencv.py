@@ -109,7 +109,7 @@ def read_opencv_matrix(data: dict[str, Any], key: str, name: str) -> FloatArray:
 def _core(K: FloatArray, name: str) -> FloatArray:
     """Return fx, fy, cx, cy."""
     if K.size != 9 or K[1] != 0.0:
-        raise InputError(f"'{name}': camera_matrix must be 3x3 without skew")
+        raise InputError(f"'{name}': camera_matrix must be 3x3 without skew, which no model has; calibrate without it")
     return K[[0, 4, 2, 5]]
 
 

@@ -19,17 +19,19 @@ from rigkit.interop.exchange import (
     Accepted,
     Written,
     best_accepted,
-    camera_of,
     field,
     numbers,
     written_size,
 )
+from rigkit.interop.opencv import camera_from_arrays
 from rigkit.interop.yaml_text import flow, parse_yaml
 
 Rectification = tuple[Mat3, FloatArray]
 """Rotation from the camera into the rectified view (3, 3), and the rectified view's projection matrix (3, 4), whose
 last column is in pixels times metres."""
 
+COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+"""How many numbers each distortion model has."""
 ROS_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"))
 
 
@@ -54,7 +56,7 @@ def write_camera_info(
     if c.model == "brown" and distortion.size == 4:
         # plumb_bob has five numbers; without k3 the last one is 0.
         distortion = np.append(distortion, 0.0)
-    model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[distortion.size]
+    model = next(name for name, count in COEFFICIENTS.items() if count == distortion.size)
     K = camera_matrix(*p[:4])
     R, P = (np.eye(3), np.hstack([K, np.zeros((3, 1))])) if rectification is None else rectification
     text = (
@@ -73,26 +75,15 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
     data = parse_yaml(text, name)
     size = written_size(data, name)
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
-    if K[1] != 0.0:
-        raise InputError(f"'{name}': camera_matrix has skew {K[1]:g}, which no model here has; calibrate without skew")
-    core = K[[0, 4, 2, 5]]
     distortion = numbers(field(field(data, "distortion_coefficients", name), "data", name), name, "distortion")
-    model = field(data, "distortion_model", name)
-    ours, count = {
-        "plumb_bob": ("brown", 5),
-        "rational_polynomial": ("brown", 8),
-        "equidistant": ("kannala_brandt", 4),
-    }.get(str(model), ("", 0))
-    if not ours:
-        raise InputError(
-            f"'{name}': distortion_model '{model}' is unknown; known: plumb_bob, rational_polynomial, equidistant"
-        )
+    model = str(field(data, "distortion_model", name))
+    if model not in COEFFICIENTS:
+        raise InputError(f"'{name}': distortion_model '{model}' is unknown; known: {', '.join(COEFFICIENTS)}")
+    count = COEFFICIENTS[model]
     if distortion.size > count and distortion[count:].any():
         raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}; is the file whole?")
     distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
-    if ours == "brown" and not distortion.any():
-        return camera_of("pinhole", size, core, name)
-    return camera_of(ours, size, np.concatenate([core, distortion]), name)
+    return camera_from_arrays(size, K, distortion, fisheye=model == "equidistant", name=name)
 
 
 def _matrix(array: FloatArray) -> str:
