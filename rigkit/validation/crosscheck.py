@@ -191,10 +191,8 @@ def crosscheck(
 
 def compare_chains(reconstruction: Reconstruction, other: Reconstruction, name: str) -> IndependentMethod:
     """Return another reconstruction of the same pair as one of the methods."""
-    covariance = np.full((6, 6), np.nan) if other.pose_covariance is None else other.pose_covariance
-    angles = _angles(measure(other))
-    rms = other.sampson_rms_px
-    return _method(name, reconstruction, other.cam2_from_cam1, covariance, angles, rms, len(other.cloud), 0)
+    angles, rms = _angles(measure(other)), other.sampson_rms_px
+    return _method(name, reconstruction, other.cam2_from_cam1, _covariance(other), angles, rms, len(other.cloud), 0)
 
 
 def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[IndependentMethod]:
@@ -210,8 +208,7 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     adjusted = colmap_reconstruction(reconstruction, pair, result)
     baseline = adjusted.baseline_mm
     two_view = Rigid3(result.two_view.rotation, result.two_view.translation_mm * baseline)
-    unknown = np.full((6, 6), np.nan)
-    covariance = unknown if adjusted.pose_covariance is None else adjusted.pose_covariance
+    covariance = _covariance(adjusted)
     # What the adjustment leaves in place is as certain as its end, but for a length that it never had.
     own_sigma = np.array(_pose_sigmas(adjusted.cam2_from_cam1, covariance)[:2])
     own = adjusted.cam2_from_cam1
@@ -220,7 +217,7 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
     step = np.r_[log_so3(two_view.rotation @ own.rotation.T), two_view.translation_mm - own.translation_mm]
-    of_two_view = covariance + np.outer(step, step) if settled else unknown
+    of_two_view = covariance + np.outer(step, step) if settled else np.full((6, 6), np.nan)
     counts = result.inliers, excluded
     return [
         _method(TWO_VIEW, reconstruction, two_view, of_two_view, {}, np.nan, *counts),
@@ -274,6 +271,12 @@ def _method(
     )
 
 
+def _covariance(reconstruction: Reconstruction) -> FloatArray:
+    """Return the covariance (6, 6) of its pose; NaN where nobody knows it."""
+    known = reconstruction.pose_covariance
+    return np.full((6, 6), np.nan) if known is None else known
+
+
 def _angles(measured: Measured) -> AnglesDeg:
     return {two: measured.angle_deg(*two) for two in combinations(measured.boards, 2)}
 
@@ -295,9 +298,7 @@ def _checks(
     apart = _apart(measured, shifts) if shifts is not None and method.name == PNP else {}
     sigma = _pose_sigmas(method.cam2_from_cam1, method.covariance)
     if all(np.isfinite(value) for value in sigma):
-        unknown = np.full((6, 6), np.nan)
-        covariance = unknown if reconstruction.pose_covariance is None else reconstruction.pose_covariance
-        own = _pose_sigmas(reconstruction.cam2_from_cam1, covariance)
+        own = _pose_sigmas(reconstruction.cam2_from_cam1, _covariance(reconstruction))
         rows = (
             ("rotation", "deg", 0.0, method.rotation_difference_deg),
             ("translation direction", "deg", 0.0, method.direction_difference_deg),
