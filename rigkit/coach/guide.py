@@ -134,7 +134,7 @@ class CaptureGuide:
         target = plan.views[0]
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth = self._worth(glance.view, plan)
-        take = glance.view is not None and glance.still and glance.sharp and glance.exposed and worth >= least_worth
+        take = not glance.complaint and worth >= least_worth
         error = plan.error if self.calibration is not None else None
         enough = (
             error is not None

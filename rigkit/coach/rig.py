@@ -67,7 +67,7 @@ class RigGuide:
         """Return what to do, and whether to take these frames: they must be worth at least so much."""
         lenses = tuple(lens.advise(glance, least_worth) for lens, glance in zip(self.lenses, glances, strict=True))
         seeing = [g for g in glances if g.view is not None]
-        good = bool(seeing) and all(g.still and g.sharp and g.exposed for g in seeing)
+        good = bool(seeing) and not any(g.complaint for g in seeing)
         # Nobody knows an error: the lens with the fewest frames goes first.
         badly = [
             (advice.enough, -(np.inf if advice.error is None else advice.error), len(lens.views))
@@ -76,9 +76,8 @@ class RigGuide:
         speaks = min(range(len(lenses)), key=lambda c: badly[c])
         mounts = {c: self._mount_px(c) for c in range(1, len(lenses))}
         open_mounts = [c for c, px in mounts.items() if px is None or px > self.options.goal_px]
-        mount_px = (
-            None if not mounts or None in mounts.values() else max(px for px in mounts.values() if px is not None)
-        )
+        known_px = [px for px in mounts.values() if px is not None]
+        mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
         enough = all(advice.enough for advice in lenses) and not open_mounts
         worth = max([a.worth for a, g in zip(lenses, glances, strict=True) if not a.enough and g.view], default=0.0)
         words, targets = lenses[speaks].words, [a.target_px if c == speaks else None for c, a in enumerate(lenses)]
