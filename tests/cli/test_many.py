@@ -56,6 +56,8 @@ def test_many_data_sets_are_one_table(captures: Path, tmp_path: Path, capsys: py
     assert "two data sets are called 'one'" in capsys.readouterr().err
     assert main([*command[:2], *QUICK, "--cluster", "tcp://127.0.0.1:1", "-o", str(tmp_path / "d")]) == 2
     assert "several data sets" in capsys.readouterr().err
+    assert main([*command, "-j", "0", "-o", str(tmp_path / "e")]) == 2
+    assert "--jobs 0: at least one process" in capsys.readouterr().err
 
 
 def test_by_processes_it_is_the_same_table(captures: Path, tmp_path: Path) -> None:
