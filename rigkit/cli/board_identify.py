@@ -24,8 +24,7 @@ def identify(args: argparse.Namespace) -> int:
     if path is not None and args.square_mm is None:
         raise InputError("board identify: images cannot tell the scale; give --square-mm, the side of a square or tag")
     images = [one for path in map(Path, args.images) for one in ([path] if is_video(path) else images_in([path]))]
-    if path is not None:
-        ensure_writable(path, force=args.force, inputs=images)
+    ensure_writable(path, force=args.force, inputs=images)
     found = identify_board(images, progress=progress_on_stderr())
     board = found.board
     print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))

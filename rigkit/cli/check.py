@@ -44,8 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.check import CheckOptions, check_pictures
 
     length = length_of(args, "check")
-    results = [path for path in (args.fix, args.report) if path is not None]
-    ensure_writable(results, force=args.force, inputs=board_files(args.board))
+    ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
     options = CheckOptions(
         boards=tuple(board_of_words(words) for words in args.board),
         scene=args.scene,

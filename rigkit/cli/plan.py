@@ -81,8 +81,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
     size_px = size_of_words(args.size)
-    if args.report is not None:
-        ensure_writable(args.report, force=args.force, inputs=board_files(args.board))
+    ensure_writable(args.report, force=args.force, inputs=board_files(args.board))
     sigma = USUAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
     if not 0.0 < sigma < float("inf"):
         raise InputError(f"--sigma-px {sigma}: it must be positive")

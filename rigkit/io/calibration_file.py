@@ -61,7 +61,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
         "dropped": [list(v) for v in c.dropped],
         "outliers": [asdict(v) for v in c.outliers],
         "overdispersion": c.overdispersion,
-        "freedom": c.freedom if math.isfinite(c.freedom) else None,
+        "freedom": c.freedom,
         "covariance": c.covariance.tolist(),
         "frame_covariance": c.frame_covariance.tolist(),
         "boards": [
@@ -91,7 +91,9 @@ def load_camera(path: str | Path) -> Camera:
     Raises InputError for a missing or damaged file, another schema, an unknown key or model, or wrong parameters.
     """
     data = _read(path)
-    return camera_from_json(_field(data, "camera", path), path)
+    if "camera" not in data:
+        raise InputError(f"'{path}': 'camera' is missing; calibrate again")
+    return camera_from_json(data["camera"], path)
 
 
 def is_calibration(path: str | Path) -> bool:
@@ -158,12 +160,6 @@ def _read(path: str | Path) -> dict[str, Any]:
         "calibration file",
         remedy="calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`",
     )
-
-
-def _field(data: dict[str, Any], key: str, path: str | Path) -> Any:
-    if key not in data:
-        raise InputError(f"'{path}': '{key}' is missing; calibrate again")
-    return data[key]
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

@@ -21,17 +21,19 @@ FORCE = "use --force (force=True in Python)"
 
 
 def ensure_writable(
-    paths: str | Path | Iterable[str | Path], *, force: bool = False, inputs: Iterable[str | Path] = ()
+    paths: str | Path | Iterable[str | Path | None] | None, *, force: bool = False, inputs: Iterable[str | Path] = ()
 ) -> None:
-    """Raise InputError if one of `paths` could not be written: call it before work that takes long.
+    """Raise InputError if one of `paths` (None: not asked for) could not be written: call it before work that takes
+    long.
 
     A path that exists is refused without `force`; so is a folder in its place, and a parent that is a file. With force
     too, no file is written over one of `inputs`, which the work reads, nor two to the same path, nor over a pipe or a
     device.
     """
-    read = {usable_path(path).resolve() for path in inputs}
+    asked = [p for p in ([paths] if paths is None or isinstance(paths, str | Path) else paths) if p is not None]
+    read = {usable_path(path).resolve() for path in inputs} if asked else set()
     written: set[Path] = set()
-    for path in [paths] if isinstance(paths, str | Path) else paths:
+    for path in asked:
         target = usable_path(path)
         whole = target.resolve()
         if whole in read:

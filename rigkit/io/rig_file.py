@@ -18,7 +18,7 @@ from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance
+from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
@@ -82,7 +82,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
         "rms_px": rig.rms_px,
         "sigma_px": rig.sigma_px,
         "overdispersion": rig.overdispersion,
-        "freedom": rig.freedom if math.isfinite(rig.freedom) else None,
+        "freedom": without_nan(rig.freedom),
         "scale_sigma": rig.scale_sigma,
         "verdicts": findings_to_json(rig.verdicts),
         "baselines": [{"from": a, "to": b, "value_mm": v, "sigma_mm": s} for a, b, v, s in pairs],
@@ -196,7 +196,7 @@ def board_rigs_text(rigs: Sequence[BoardRig]) -> str:
             {
                 "image_count": rig.image_count,
                 "scale_sigma": rig.scale_sigma,
-                "freedom": rig.freedom if math.isfinite(rig.freedom) else None,
+                "freedom": without_nan(rig.freedom),
                 "angles": [
                     {"a": a, "b": b, "value_deg": value, "sigma_deg": sigma}
                     for a, b in combinations(rig.names, 2)

@@ -83,10 +83,10 @@ def calibrate_session(
     options = options or CalibrateOptions()
     if not isinstance(session, Session):
         session = load_session(session)
-    targets = [path for path in (options.output, options.report) if path is not None]
-    if options.output is not None:
-        targets += foreign_paths(options.output, options.exports)
-    ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
+    foreign = [] if options.output is None else foreign_paths(options.output, options.exports)
+    ensure_writable(
+        [options.output, options.report, *foreign], force=options.force, inputs=session_inputs(session, options)
+    )
     with about(session.path):
         corners = corners_of(session, options, progress=progress)
     calibration = calibration_from(session, corners, progress=progress)

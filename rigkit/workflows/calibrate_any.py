@@ -81,8 +81,7 @@ def calibrate_session_file(
     options = replace(options, output=output, report=report)
     if session is not listed:
         # The videos are read as well as the frames in their place.
-        results = [file for file in (output, report) if file is not None]
-        ensure_writable(results, force=options.force, inputs=session_inputs(listed, options))
+        ensure_writable((output, report), force=options.force, inputs=session_inputs(listed, options))
     if isinstance(session, Session) and options.known.files:
         raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
     with about(options.corners) if options.corners else nullcontext():

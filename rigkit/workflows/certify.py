@@ -58,8 +58,7 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     cannot be written; DegenerateError: nowhere do all cameras see what is measured.
     """
     options = options or CertifyOptions()
-    targets = [target for target in (options.report, options.pdf) if target is not None]
-    ensure_writable(targets, force=options.force, inputs=[path])
+    ensure_writable((options.report, options.pdf), force=options.force, inputs=[path])
     if options.limit is not None and not (np.isfinite(options.limit) and options.limit > 0.0):
         raise InputError(f"certificate: the limit must be positive, got {options.limit}")
     with about(path):

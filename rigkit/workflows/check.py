@@ -97,8 +97,7 @@ def check_pictures(
     watched, known = load_watched(source)
     frames = _frames(watched, [Path(image) for image in images])
     inputs = [source, *(image for frame in frames for image in frame)]
-    outputs = [target for target in (options.fix, options.report) if target is not None]
-    ensure_writable(outputs, force=options.force, inputs=inputs)
+    ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
         ensure_register(options.history, inputs)
     cost = [] if options.length is None else length_costs(watched, options.length)

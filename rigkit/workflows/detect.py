@@ -109,9 +109,8 @@ def detect_in_images(
         raise InputError("--camera helps to find boards of known size only; give them, such as --board a9x6.toml")
     camera = None if options.camera is None else import_camera(options.camera)
     overlays = _overlay_paths(images, options.overlay)
-    outputs = [path for path in (options.output, *overlays) if path is not None]
     read = [*images, *options.boards, *([options.camera] if options.camera else [])]
-    ensure_writable(outputs, force=options.force, inputs=read)
+    ensure_writable([options.output, *overlays], force=options.force, inputs=read)
     tasks = [
         _DetectJob(image, overlay, boards, camera, options) for image, overlay in zip(images, overlays, strict=True)
     ]

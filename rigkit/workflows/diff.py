@@ -81,8 +81,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     Raises InputError for files of two kinds, rigs of other cameras or boards, or a map that cannot be written.
     """
     options = options or DiffOptions()
-    if options.report is not None:
-        ensure_writable(options.report, force=options.force, inputs=(a, b))
+    ensure_writable(options.report, force=options.force, inputs=(a, b))
     boards = [is_board_rigs_file(path) for path in (a, b)]
     if any(boards):
         if not all(boards):
@@ -106,8 +105,7 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
     if any(rigs):
         other = b if rigs[0] else a
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
-    if options.output is not None:
-        ensure_writable(options.output, force=options.force, inputs=(a, b))
+    ensure_writable(options.output, force=options.force, inputs=(a, b))
     with about(a, b):
         pair = _cameras(a, b)
     if options.output is not None:

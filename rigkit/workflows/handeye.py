@@ -95,8 +95,7 @@ def calibrate_hand_eye(
     images, or turns about one axis only.
     """
     paths = list(images_in([Path(path) for path in images]))
-    if options.output is not None:
-        ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
+    ensure_writable(options.output, force=options.force, inputs=[poses, *paths, options.camera, options.board])
     robot = read_robot_poses(poses, [path.name for path in paths])
     missing = [path.name for path in paths if path.name not in robot]
     if missing:

@@ -38,8 +38,7 @@ def show_history(
 
     Raises InputError for another file, or a page that cannot be written.
     """
-    if report is not None:
-        ensure_writable([report], force=force, inputs=[register])
+    ensure_writable(report, force=force, inputs=[register])
     kept = load_history(register)
     earlier = sum(one.moment - two.moment > CLOCKS_APART for one, two in pairwise(kept))
     if earlier:

@@ -101,8 +101,7 @@ def plan_session(
             f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, "
             "rig-CAMERA.json, or ask for pictures to check the rig with: --check"
         )
-    if options.report is not None:
-        ensure_writable([options.report], force=options.force, inputs=[source])
+    ensure_writable(options.report, force=options.force, inputs=[source])
     if rig:
         watched, boards = load_watched(source)
         if not boards:
@@ -111,9 +110,7 @@ def plan_session(
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
-        if options.report is not None:
-            inputs = [source, *session_inputs(session, calibrating)]
-            ensure_writable([options.report], force=options.force, inputs=inputs)
+        ensure_writable(options.report, force=options.force, inputs=[source, *session_inputs(session, calibrating)])
         calibration = calibrate_session(session, calibrating, progress=progress).calibration
         boards = session.boards
     else:
@@ -143,8 +140,7 @@ def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
 
     Raises as `plan_session`.
     """
-    if options.report is not None:
-        ensure_writable([options.report], force=options.force)
+    ensure_writable(options.report, force=options.force)
     camera = guessed_camera(lens.hfov_deg, lens.size_px, lens.model)
     knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, USUAL_RHO))
     plan = plan_views(

@@ -270,8 +270,7 @@ def _ensure_all(outputs: list[Path], options: RectifyOptions, inputs: tuple[str 
     for path in outputs:
         if not cv2.haveImageWriter(str(path)):
             raise InputError(f"'{path}': images of the kind '{path.suffix}' cannot be written; take .png, .tif or .jpg")
-    maps = [] if options.maps is None else [options.maps]
-    ensure_writable([*outputs, *maps], force=options.force, inputs=inputs)
+    ensure_writable([*outputs, options.maps], force=options.force, inputs=inputs)
 
 
 def _coverage(jobs: Jobs) -> list[float]:
