@@ -26,7 +26,8 @@ EXPORT void fit_edges(
     ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, tilts, count, 2, 2),
     ARRAY(const double, reach, count, 2, 2),
     ARRAY(const double, paper, count, 2, 2), ARRAY(const double, single, count, 2), ARRAY(const double, sign, count),
-    ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
+    ARRAY(const double, blur, count), ARRAY(const double, window_blur, count), ARRAY(const double, contrast, count),
+    ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
     ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
 
 /* bends.c */

@@ -95,10 +95,11 @@ static void move(double *values, const double *step, int n, const edge_rules_t *
 /* What is known of a corner's parameters before its pixels are looked at: one over the variances of the first `count`. */
 typedef struct {
     double mean[PARAMETERS], information[PARAMETERS];
-    int count, papered;
+    int count, papered, levelled;
 } prior_t;
 
-static prior_t prior_of(const window_t *window, const geometry_t at, double blur, const edge_rules_t *rules)
+static prior_t prior_of(
+    const window_t *window, const geometry_t at, double blur, double contrast, const edge_rules_t *rules)
 {
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
@@ -108,7 +109,8 @@ static prior_t prior_of(const window_t *window, const geometry_t at, double blur
         .mean = {0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0,
                  at.curvature[0], at.curvature[1]},
         .information = {0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light, 1.0 / (bend1 * bend1), 1.0 / (bend2 * bend2)},
-        .count = bend1 > 0.0 && bend2 > 0.0 ? PARAMETERS : FEWER, .papered = at.single[0] != 0.0};
+        .count = bend1 > 0.0 && bend2 > 0.0 ? PARAMETERS : FEWER,
+        .papered = at.single[0] != 0.0, .levelled = isfinite(contrast) != 0};
     for (int k = 0; k < 4; k++)
         prior.papered |= isfinite(at.paper[k]) != 0;
     return prior;
@@ -153,7 +155,8 @@ static void descend(
         move(values, step, n, rules);
         for (int k = 0; k < n; k++)
             out->last[k] += values[k];
-        if (fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
+        /* What was left before a first step that found the brightness is no residual. */
+        if ((turns > 0 || !prior->levelled) && fabs(step[X]) <= rules->converged_px && fabs(step[Y]) <= rules->converged_px
             && fabs(step[S]) <= rules->blur_lag * rules->converged_px * values[S])
             return;
     }
@@ -165,14 +168,14 @@ static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
     const edge_rules_t *rules, double *out)
 {
-    const prior_t prior = prior_of(window, at, blur, rules);
+    const prior_t prior = prior_of(window, at, blur, contrast, rules);
     const int64_t more = window->count - FEWER;
     double values[PARAMETERS];
     minimum_t found;
     memcpy(values, prior.mean, sizeof values);
     values[X] = pixel[0] - window->centre_u;
     values[Y] = pixel[1] - window->centre_v;
-    if (isfinite(contrast))
+    if (prior.levelled)
         level(values, window, 0.5 * contrast * sign);
     else
         set_brightness(values, window, at, rules, sign);
@@ -222,12 +225,12 @@ int64_t edges_scratch(const edge_rules_t *rules)
 }
 
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
- * and single (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur and contrast (N), out (N, OUTCOMES); scratch as `edges_scratch`
- * says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
+ * and single (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur, that of its window and contrast (N), out (N, OUTCOMES);
+ * scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper, const double *single,
-    const double *sign, const double *blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
+    const double *sign, const double *blur, const double *window_blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
     float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
@@ -244,7 +247,7 @@ void fit_edges(
         const geometry_t at = {
             sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n, single + 2 * n,
             ends + 4 * n};
-        collect_window(&window, image, pixels + 2 * n, at, blur[n], rules);
+        collect_window(&window, image, pixels + 2 * n, at, window_blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }
 }

@@ -39,13 +39,15 @@ def fit_corners(
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
+    window_blur: FloatArray,
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
     """Return the `OUTCOMES` of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
     library = kernels()
-    parts = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, single, sign, blur, contrast)
-    known = [np.ascontiguousarray(part, np.float64) for part in parts]
+    corners = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, single, sign)
+    starts = (blur, window_blur, contrast)
+    known = [np.ascontiguousarray(part, np.float64) for part in (*corners, *starts)]
     out = np.empty((len(pixels), OUTCOMES))
     scratch = np.zeros(library.edges_scratch(rules), np.float32)
     library.fit_edges(

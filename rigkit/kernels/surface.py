@@ -17,6 +17,11 @@ SURFACE_DEGREE = header().constants["SURFACE_DEGREE"]
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(SURFACE_DEGREE + 1))
 """How many terms x^i y^j there are up to a degree."""
 
+HARDLY_MORE = 1.25
+"""Times the least miss: what is beyond such a degree is less than what points scatter, and over a board so many
+windows wide it bends no line within one. But the 8th, where it misses by a tenth less than the 3rd, bends lines at the
+rim by up to 8 px within a window (REAL)."""
+
 
 def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, float]:
     """Return the homography (3, 3) that takes `places` (N, 2) nearest to `pixels` (N, 2), of depth 1 at their mean, and
@@ -52,6 +57,7 @@ class Polynomials:
     misses : (D,) how far off points usually lie where the others have them, by degree; infinite where that was not
         tried, for there are too few points, or from degree 6 on no better ones among the two degrees before.
     best : degree with the smallest.
+    plain : the lowest degree that misses by hardly more: what further terms add is noise, which bends lines at the rim.
     foretold : (N, 2) how far the points lie off where the others have them, by that degree.
     leverage : (N,) of each point on its own value.
     """
@@ -62,6 +68,7 @@ class Polynomials:
     told: FloatArray
     misses: FloatArray
     best: int
+    plain: int
     foretold: FloatArray
     leverage: FloatArray
 
@@ -85,15 +92,16 @@ class Polynomials:
             told=told,
             misses=misses,
             best=int(best),
+            plain=int(np.argmax(misses <= HARDLY_MORE * misses[best])),
             foretold=foretold,
             leverage=leverage,
         )
 
     def at(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the values at `wanted` (M, 2) by the best degree, and their first and second derivatives along x and
+        """Return the values at `wanted` (M, 2) by the plain degree, and their first and second derivatives along x and
         along y, (M, 2, 2)."""
         out = np.empty((5, len(wanted), 2))
-        kernels().polynomial_at(*self._asked(wanted), self.best, self.triangle, self.told, out)
+        kernels().polynomial_at(*self._asked(wanted), self.plain, self.triangle, self.told, out)
         return _parted(out)
 
     def surest(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:

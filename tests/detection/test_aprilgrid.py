@@ -101,6 +101,20 @@ def test_tags_with_borders_narrower_than_windows_are_fitted_whole(squares: bool)
     assert 0.8 < np.sqrt((np.concatenate(relative) ** 2).mean()) < 1.3
 
 
+@pytest.mark.parametrize(
+    ("pattern", "seed"), [(AprilGrid(0.25, "tag16h5", 1, numbering="opencv"), 1), (AprilGrid(0.5, "tag25h9", 1), 111)]
+)
+def test_tags_at_the_rim_of_a_fisheye_are_read_where_the_others_have_them(pattern: AprilGrid, seed: int) -> None:
+    """Their codes lie in the windows of their corners, which fit badly for that, but in the right places."""
+    board, rng = replace(KALIBR, pattern=pattern), np.random.default_rng(seed)
+    scene = one_board(rng, lens="fisheye", board=board)
+    (found,) = detect_boards(scene.render(blur_px=0.7, noise_levels=2.0, rng=rng), [board])
+    assert len(found.grid) == 80
+    off = errors(found, scene.truth()[0])
+    assert np.abs(off).max() < 0.15
+    assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
+
+
 def test_tags_alone_with_narrow_borders_are_completed() -> None:
     """Corners that no first look finds are foretold by those around them."""
     board, rng = replace(KALIBR, pattern=AprilGrid(0.3, corner_squares=False)), np.random.default_rng(1)

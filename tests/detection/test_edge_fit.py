@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from kernels.reference.edge_model import PARAMETERS, _edge, collect, linearise, pattern_of
@@ -105,6 +106,28 @@ def test_finds_its_own_corners(rng: np.random.Generator) -> None:
             image, start, straight, np.ones(6), np.full(6, 1.2), radius_px=18.0, iterations=12, curvature_sigma=loose
         )
         assert np.abs(free.pixels - pixels).max() < EXACT_PX, "a curvature known to be uncertain is fitted"
+
+
+def test_brightness_told_wrong_leaves_no_residual(rng: np.random.Generator) -> None:
+    """A fit that starts where it ends takes a step for the brightness all the same, and then looks at what is left."""
+    shape, pixels = geometry(4), corners(4, rng)
+    image, _ = image_of(pixels, shape, 0.8)
+    known = {"contrast": np.full(4, 60.0), "mirrored": False, "converged_px": 0.05}
+    fit = fit_edges(image, pixels, shape, np.ones(4), np.full(4, 0.8), radius_px=18.0, iterations=8, **known)
+    assert fit.valid.all()
+    assert fit.residual.max() < 0.5
+
+
+def test_windows_are_narrower_than_edges_ask_where_that_is_wanted(rng: np.random.Generator) -> None:
+    shape, pixels = geometry(4), corners(4, rng)
+    image, _ = image_of(pixels, shape, 0.8)
+    wide, narrow = (
+        fit_edges(image, pixels, shaped, np.ones(4), np.full(4, 0.8), radius_px=18.0, iterations=8)
+        for shaped in (shape, replace(shape, window_blur=np.full(4, 0.3)))
+    )
+    assert (narrow.used < 0.75 * wide.used).all()
+    assert np.abs(narrow.pixels - pixels).max() < EXACT_PX
+    assert np.abs(narrow.blur - 0.8).max() < 0.01
 
 
 def test_neighbouring_edges_in_the_blur_do_not_pull() -> None:

@@ -10,7 +10,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import homographies
 from rigkit.detection.tags.surface import MAX_LEVERAGE, SmoothMap
-from rigkit.kernels.surface import TERMS_OF_DEGREE, Polynomials, perspective, projected, read_modules
+from rigkit.kernels.surface import HARDLY_MORE, TERMS_OF_DEGREE, Polynomials, perspective, projected, read_modules
 
 SAME = 1e-7
 """px: two ways to solve for 45 powers of numbers up to 1 agree so well."""
@@ -58,10 +58,11 @@ def test_polynomials(bend: float, rng: np.random.Generator) -> None:
     whole = reference.Polynomials(places, pixels, middle, size, tried - 1)
     assert ours.best == int(whole.misses.argmin())
     np.testing.assert_allclose(ours.misses[:tried], whole.misses, rtol=1e-6)
+    assert ours.plain == int(np.argmax(whole.misses <= HARDLY_MORE * whole.misses.min()))
     np.testing.assert_allclose(ours.foretold, whole.foretold[ours.best], atol=SAME)
     np.testing.assert_allclose(ours.leverage, whole.leverage[:, TERMS_OF_DEGREE[ours.best] - 1], atol=1e-9)
     wanted = rng.uniform([-2.0, -2.0], [13.0, 11.0], (50, 2))
-    for one, two in zip(ours.at(wanted), whole.at(wanted, ours.best), strict=True):
+    for one, two in zip(ours.at(wanted), whole.at(wanted, ours.plain), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
     for one, two in zip(ours.surest(wanted), whole.surest(wanted, tried), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)

@@ -132,7 +132,6 @@ def fit_edges(
     """
     expected = np.full(len(pixels), np.nan) if contrast is None else contrast
     loose = np.zeros((len(pixels), 2)) if curvature_sigma is None else curvature_sigma
-    least = ROUNDING_VARIANCE if image.dtype == np.uint8 else MIN_VARIANCE
     fitted = fit_corners(
         image,
         pixels,
@@ -147,8 +146,9 @@ def fit_edges(
         geometry.ends,
         sign,
         blur,
+        blur if geometry.window_blur is None else geometry.window_blur,
         expected,
-        _rules(radius_px, iterations, converged_px, mirrored, least),
+        _rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8),
     )
     _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
     return EdgeFit(
@@ -166,7 +166,7 @@ def fit_edges(
 
 
 @functools.cache
-def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, least: float) -> Rules:
+def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, rounded: bool) -> Rules:
     return Rules(
         reach=WINDOW_REACH,
         end_sigmas=END_SIGMAS,
@@ -186,7 +186,7 @@ def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: boo
         most_turn=MAX_TURN_RAD,
         most_blur_change=MAX_BLUR_CHANGE,
         most_light_change=MAX_LIGHT_CHANGE,
-        least_variance=least,
+        least_variance=ROUNDING_VARIANCE if rounded else MIN_VARIANCE,
         ridge=FIT_RIDGE,
         converged_px=converged_px,
         blur_lag=BLUR_LAG,

@@ -66,6 +66,8 @@ class Geometry:
     paper : (N, 2, 2) how bright it is beyond that line, relative to the corner's mean and in units of the model's b;
         NaN where squares go on there, or where it is not known. None: everywhere.
     tilts : (N, 2, 2) by how much that line is turned against this one, towards +90 degrees, rad; None: nowhere.
+    window_blur : (N,) s that windows are made for: a smaller one where other things are near the lines. None:
+        the expected one.
     single : (N, 2) of the corner of one square alone, on which side of line 1 and 2 that lies, +1 towards +90 degrees
         or -1; 0 where four squares meet. None: everywhere.
     """
@@ -79,10 +81,12 @@ class Geometry:
     paper: FloatArray | None = None
     tilts: FloatArray | None = None
     single: FloatArray | None = None
+    window_blur: FloatArray | None = None
 
     def of(self, which: BoolArray) -> Geometry:
         """Return that of the corners `which` (N,)."""
         optional = {"reach": self.reach, "paper": self.paper, "tilts": self.tilts, "single": self.single}
+        optional["window_blur"] = self.window_blur
         known = {name: part[which] for name, part in optional.items() if part is not None}
         return Geometry(self.sides[which], self.curvature[which], self.gaps[which], self.ends[which], **known)
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
@@ -34,9 +35,10 @@ from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
+from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, TagSurface, seen_surface
-from rigkit.detection.tags.whole import WHOLE_ROUNDS, with_whole_tags
+from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
@@ -58,6 +60,21 @@ NOTHING_NEAR_PX, LEAST_CONTRAST = 1e4, 10.0
 """Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
 starts from at least."""
 
+AROUND_NEW = np.ones((5, 5), np.uint8)
+"""A corner that was not seen where it was foretold is sought again when one so near is found: of its tag, or of one
+beside it."""
+
+FEW_CORNERS = 12
+"""Corners that say how blurred the image is, to a few hundredths."""
+
+ROUGH_PX = 0.25
+"""Saddles are nearer to corners than this, corners of outlines are not: where it is usual that a fit goes further, what
+it started from said too little of the lines."""
+
+BENT_SIGMAS = 0.3
+"""Corners are fitted again where their lines bend otherwise by this part of their sigmas: left alone it would add a
+twentieth to their errors."""
+
 TAG_OUTLIER, JUDGING_GAIN = 6.0, 1.5
 """A corner that lies off where those around have it by more than this, times what is usual and its own standard
 deviation together, is covered in part; where their prediction has no larger gain: at the ends of a board it errs."""
@@ -73,8 +90,7 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
     if np.count_nonzero(state.known) < MIN_TAG_CORNERS:
         return None
     # What the lattice lacks is added before all corners are fitted again; what only finer ones foretell, after that.
-    state = fitter.completed(fitter.again(fitter.completed(state)))
-    state = fitter.without_outliers(state)
+    state = fitter.without_outliers(fitter.completed(fitter.again(fitter.completed(state))))
     row, column = np.nonzero(state.known)
     if len(row) < MIN_TAG_CORNERS:
         return None
@@ -104,7 +120,9 @@ class _Fitter:
         self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
         self.signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
         self._mapped: tuple[BoardState, SmoothMap] | None = None
-        self._fitted: tuple[BoardState, EdgeFit, FloatArray] | None = None
+        self._fitted: tuple[EdgeFit, FloatArray, bool] | None = None
+        self._vain = np.zeros(self.signs.shape, np.bool_)
+        self.curvature = np.full(self.places.shape, np.nan)
 
     def map_of(self, state: BoardState) -> SmoothMap:
         """Return the map through the known corners; that of the last state asked for is kept."""
@@ -129,6 +147,7 @@ class _Fitter:
     ) -> EdgeFit:
         """Fit the edge model at the `cells`; arguments else as of `fit_edges`."""
         heights, steps = surface.heights(), self.steps[cells]
+        self.curvature[cells] = curvature = surface.curvature()
         gaps = steps * heights[:, :, None]
         pattern, side = self.tags.pattern, self.tags.codes.modules
         single = contrast = None
@@ -140,15 +159,16 @@ class _Fitter:
             inwards = (np.stack([column, row], axis=1)[:, None] @ surface.sides)[:, 0]
             ink, paper = start + 0.5 * pattern.border / side * inwards, start - 0.25 * pattern.spacing * inwards
             contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), LEAST_CONTRAST)
-        border = pattern.border / side * heights.min(axis=1)
-        narrow = np.minimum(blur, (border - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS)
+        narrow = (self.borders(surface) - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS
+        expected = np.broadcast_to(np.clip(blur, *BLUR_RANGE), narrow.shape)
         geometry = Geometry(
             surface.sides,
-            surface.curvature(),
+            curvature,
             gaps,
             np.zeros(gaps.shape, np.bool_),
             reach=np.minimum(0.5 * steps, WINDOW_REACH),
             single=single,
+            window_blur=np.minimum(np.maximum(narrow, BLUR_RANGE[0]), expected),
         )
         radius_px, iterations, converged_px = stage
         return fit_edges(
@@ -156,7 +176,7 @@ class _Fitter:
             start,
             geometry,
             self.signs[cells],
-            np.minimum(np.maximum(narrow, BLUR_RANGE[0]), BLUR_RANGE[1]),
+            expected,
             radius_px=radius_px,
             iterations=iterations,
             converged_px=converged_px,
@@ -165,14 +185,18 @@ class _Fitter:
         )
 
     def first(self, pixels: FloatArray) -> BoardState:
-        """Return the rough corners fitted quickly, those that failed left out."""
-        state = BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan))
-        cells = state.known
-        fit = self.fit(
-            cells, self.map_of(state).at(self.places[cells]), pixels[cells], FIRST_BLUR, FIRST_PASS, mirrored=False
-        )
+        """Return the rough corners fitted, those that failed left out."""
+        return self.fitted(BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan)), None)
+
+    def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
+        """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
+        few = np.zeros(len(pixels), np.bool_)
+        few[:: max(len(few) // FEW_CORNERS, 1)] = True
+        some = cells.copy()
+        some[cells] = few
+        fit = self.fit(some, surface.of(few), pixels[few], FIRST_BLUR, FIRST_PASS, mirrored=False)
         good = fit.valid & (fit.contrast > 0.0)
-        return state.without(np.ones_like(cells)).with_fit(cells, fit, good)
+        return known_median(fit.blur[good]) if good.any() else FIRST_BLUR
 
     def completed(self, state: BoardState) -> BoardState:
         """Return the state with the missing corners that are seen, each round of them foretold by those before."""
@@ -183,22 +207,45 @@ class _Fitter:
             state = more
         return state
 
-    def again(self, state: BoardState) -> BoardState:
-        """Return the known corners fitted with lines that bend as the corners have it; the fit is kept."""
+    def fitted(self, state: BoardState, blur: float | None) -> BoardState:
+        """Return the state with all its corners fitted, with lines that bend as they have it themselves, without those
+        that failed; the fit is kept. Where `blur` is not known, a quick fit tells it."""
         cells = state.known
         surface = self.map_of(state).at(self.places[cells])
         seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
         cells = cells.copy()
         cells[cells] = seen
+        surface = surface.of(seen)
+        start = state.pixels[cells]
+        blur = self._blur(cells, surface, start) if blur is None else blur
+        fit = self.fit(cells, surface, start, blur, LAST_PASS)
+        moved = known_median(np.linalg.norm(fit.pixels - state.pixels[cells], axis=1)[fit.valid])
+        self._fitted = fit, surface.sides, moved > ROUGH_PX
+        self._vain[:] = False
+        return state.without(np.ones_like(cells)).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
+
+    def again(self, state: BoardState) -> BoardState:
+        """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted."""
+        cells, smooth = state.known, self.map_of(state)
+        surface = smooth.at(self.places[cells])
+        steps = np.minimum(0.5 * self.steps[cells].max(axis=2), WINDOW_REACH)
+        half = np.minimum(steps * np.linalg.norm(surface.sides, axis=2), LAST_PASS[0])
+        # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
+        off = np.abs(surface.curvature() - self.curvature[cells]).max(axis=1) * half.max(axis=1) ** 2 / 6.0
+        assert self._fitted is not None
+        bent = self._fitted[2] | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], smooth.scatter()))
+        if not bent.any():
+            return state
         blur = known_median(state.blur)
-        fit = self.fit(cells, surface.of(seen), state.pixels[cells], blur, LAST_PASS)
-        good = fit.valid & (fit.contrast > 0.0)
-        self._fitted = state.without(cells).with_fit(cells, fit, good), fit, surface.of(seen).sides
-        return self._fitted[0]
+        if 2 * np.count_nonzero(bent) > len(bent):
+            return self.fitted(state, blur)
+        cells[cells] = bent
+        fit = self.fit(cells, surface.of(bent), state.pixels[cells], blur, LAST_PASS)
+        return state.without(cells).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def added(self, state: BoardState) -> BoardState | None:
         """Return the state with those missing corners that can be added now, None where there are none."""
-        missing = ~state.known
+        missing = ~(state.known | self._vain)
         if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
             return None
         surface = self.map_of(state).beyond(self.places[missing])
@@ -211,17 +258,49 @@ class _Fitter:
         cells = missing.copy()
         cells[missing] = usable
         surface = surface.of(usable)
-        gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
         blur = known_median(state.blur)
-        rough = self.fit(cells, surface, surface.pixels, np.maximum(blur, WIDE_BLUR * gap), LAST_PASS)
-        start = np.where(rough.valid[:, None], rough.pixels, surface.pixels)
+        start = surface.pixels
+        if (self.map_of(state).scatter() * surface.gain > blur).any():
+            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.heights().min(axis=1))
+            rough = self.fit(cells, surface, start, wide, LAST_PASS, mirrored=False)
+            start = np.where(rough.valid[:, None], rough.pixels, start)
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
+        good = self._there(state, cells, surface, fit, blur)
+        more = state.with_fit(cells, fit, good)
+        self._vain |= cells
+        # What is new foretells those around it better.
+        self._vain &= cv2.dilate((cells & more.known).astype(np.uint8), AROUND_NEW) == 0
+        return more if good.any() else None
+
+    def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
+        """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
+        gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
         moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
         contrast, residual = known_median(state.contrast), known_median(state.residual)
-        good = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
-        good &= (fit.contrast > MIN_ADDED_CONTRAST * contrast) & (fit.sigma_px < MAX_SIGMA_CELLS * gap)
-        good &= fit.residual < MAX_ADDED_RESIDUAL_MARKED * residual * np.maximum(1.0, fit.contrast / contrast)
-        return state.with_fit(cells, fit, good) if good.any() else None
+        seen = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
+        seen &= fit.contrast > MIN_ADDED_CONTRAST * contrast
+        clean = fit.residual < MAX_ADDED_RESIDUAL_MARKED * residual * np.maximum(1.0, fit.contrast / contrast)
+        clean &= fit.sigma_px < MAX_SIGMA_CELLS * gap
+        # The code is in the windows of narrow borders, but says itself that the tag is there.
+        coded = seen & ~clean & (self.borders(surface) < NARROW_BLURS * blur)
+        if coded.any():
+            pixels = state.pixels.copy()
+            pixels[cells] = np.where(seen[:, None], fit.pixels, surface.pixels)
+            coded &= self.read(pixels)[cells]
+        return np.asarray(seen & (clean | coded))
+
+    def borders(self, surface: TagSurface) -> FloatArray:
+        """Return how wide the borders of tags are at places of the map, (M,) px."""
+        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.heights().min(axis=1))
+
+    def read(self, pixels: FloatArray) -> BoolArray:
+        """Return the corners (R, C) of tags whose codes are read in their places, by all corners (R, C, 2)."""
+        quads = np.stack([pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, 1::2], pixels[1::2, ::2]], axis=2)
+        whole = np.asarray(np.isfinite(quads).all(axis=(2, 3)))
+        tags = read_tags(self.image, quads[whole], self.tags.codes)
+        own = (tags.number == self.tags.numbers[whole]) & (tags.turns == 0)
+        whole[whole] = own & (tags.likeness >= MIN_FORETOLD_LIKENESS)
+        return whole.repeat(2, axis=0).repeat(2, axis=1)
 
     def without_outliers(self, state: BoardState) -> BoardState:
         """Return the state without corners that lie where those around them cannot have them."""
@@ -229,14 +308,17 @@ class _Fitter:
             cells = state.known
             if np.count_nonzero(cells) < MIN_GUIDE_CORNERS:
                 return state
-            surface = self.map_of(state).left_out()
-            off = np.nan_to_num(np.linalg.norm(state.pixels[cells] - surface.pixels, axis=1)) / surface.gain
+            smooth = self.map_of(state)
+            off, gain = smooth.left_out()
+            off = np.nan_to_num(off) / gain
             usual = max(known_median(off), SCATTER_FLOOR_PX)
             usual_sigma = known_median(state.sigma_px[cells])
             sigma = np.minimum(state.sigma_px[cells], 3.0 * usual_sigma)
-            gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
-            allowed = np.maximum(TAG_OUTLIER * np.hypot(usual, sigma), DISPLACED_CELLS * gap)
-            excess = np.where(surface.gain < JUDGING_GAIN, off / allowed, 0.0)
+            allowed = TAG_OUTLIER * np.hypot(usual, sigma)
+            if not ((gain < JUDGING_GAIN) & (off > allowed)).any():
+                return state
+            gap = self.tags.pattern.spacing * smooth.at(self.places[cells]).heights().min(axis=1)
+            excess = np.where(gain < JUDGING_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
             # Those that contradict the most go first: they may be all that speaks against their neighbours.
             worst = excess > max(1.0, 0.5 * float(excess.max()))
             if not worst.any():
@@ -248,10 +330,8 @@ class _Fitter:
 
     def last(self, state: BoardState) -> tuple[BoardState, float]:
         """Return the corners as they finally are, and the factor of their sigmas."""
-        if self._fitted is None or self._fitted[0] is not state:
-            self.again(state)
         assert self._fitted is not None
-        state, fit, sides = self._fitted
+        fit, sides, _ = self._fitted
         owner, factor = np.zeros(len(sides), np.int64), 1.0
         if self.tags.pattern.corner_squares:
             good = fit.valid & (fit.contrast > 0.0)
@@ -263,9 +343,8 @@ class _Fitter:
             state = whole
         cells = state.known
         if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
-            foretold = self.map_of(state).left_out()
-            off = np.linalg.norm(state.pixels[cells] - foretold.pixels, axis=1)
-            expected = factor * state.sigma_px[cells] * np.hypot(1.0, foretold.gain)
+            off, gain = self.map_of(state).left_out()
+            expected = factor * state.sigma_px[cells] * np.hypot(1.0, gain)
             scatter = known_median(off / expected) / MEDIAN_OF_RAYLEIGH
             factor *= scatter if scatter > UNEXPLAINED else 1.0
         return state, factor

@@ -7,15 +7,16 @@ the points around leave over, or by the points around alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.surface import Polynomials, perspective, projected
+from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MAX_LEVERAGE = 0.99
 """A point that a term is there for alone is foretold by nothing."""
@@ -109,11 +110,18 @@ class SmoothMap:
         flat = self._base(wanted)
         return TagSurface(flat.pixels + left, flat.sides + sides, flat.bends + bends, gain)
 
-    def left_out(self) -> TagSurface:
-        """Return the map at the places themselves, the pixels foretold by the other points."""
+    def left_out(self) -> tuple[FloatArray, FloatArray]:
+        """Return how far (N,) the points lie off where the others have them, px, and the gain (N,) of those."""
         leverage = self._polynomial.leverage
-        gain = np.sqrt(leverage / (1.0 - leverage))
-        return replace(self.at(self._places), pixels=self._pixels - self._polynomial.foretold, gain=gain)
+        return np.hypot(*self._polynomial.foretold.T), np.sqrt(leverage / (1.0 - leverage))
+
+    def scatter(self) -> float:
+        """Return how far the points usually lie off where the others have them, px per axis, beside what those err by.
+
+        Where the map has too few terms for the lens, that is more than what points are known to.
+        """
+        off, gain = self.left_out()
+        return known_median(off / np.hypot(1.0, gain)) / MEDIAN_OF_RAYLEIGH
 
 
 def wide_perspective(

@@ -30,7 +30,6 @@ from rigkit.detection.subpixel.subpixel import LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.kernels.tags import TagRules, fit_tags
-from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
 """A border narrower than this, s, has the code in all windows of its corners. On real images of a grid, made
@@ -103,7 +102,7 @@ def with_whole_tags(
     found = fit_tags(
         *(image, maps, centres, scales, ink[row // 2, column // 2], breaks, 0.5 * tags.pattern.spacing),
         *(np.full(len(row), blur), step * state.contrast[mine].mean(axis=1)),
-        *(BEND_SIGMAS * np.maximum(np.median(state.sigma_px[mine], axis=1), _scatter(state, smooth)), rules),
+        *(BEND_SIGMAS * np.maximum(np.median(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
     )
     moves = found[:, :8].reshape(-1, 4, 2)
     furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
@@ -116,16 +115,6 @@ def with_whole_tags(
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
     blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
-
-
-def _scatter(state: BoardState, smooth: SmoothMap) -> float:
-    """Return how far corners usually lie off where the others have them, px per axis, beside what those err by.
-
-    Where the map has too few terms for the lens, that is more than what corners are known to, and so are the bends.
-    """
-    foretold = smooth.left_out()
-    off = np.linalg.norm(state.pixels[state.known] - foretold.pixels, axis=1)
-    return known_median(off / np.hypot(1.0, foretold.gain)) / MEDIAN_OF_RAYLEIGH
 
 
 def _four(known: BoolArray) -> BoolArray:

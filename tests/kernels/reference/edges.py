@@ -74,6 +74,7 @@ def fit_corners(
     ends: BoolArray,
     sign: FloatArray,
     blur: FloatArray,
+    window_blur: FloatArray,
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
@@ -81,7 +82,7 @@ def fit_corners(
         Geometry(sides, curvature, gaps, ends, reach=reach, paper=paper, tilts=tilts, single=single),
         curvature_sigma,
     )
-    window = collect(image, pixels, geometry, blur, rules.radius_px)
+    window = collect(image, pixels, geometry, window_blur, rules.radius_px)
     prior_mean, prior = _prior(geometry, loose, blur, window.size)
     kept = np.count_nonzero(loose > 0.0, axis=1) < 2
     values = prior_mean.copy()
@@ -94,7 +95,7 @@ def fit_corners(
     rest = np.zeros(window.weight.shape)
     active = np.ones(len(pixels), bool)
     diagonal = range(PARAMETERS)
-    for _ in range(rules.iterations):
+    for turn in range(rules.iterations):
         every = bool(active.all())
         rows = linearise(
             values[active], window if every else window.of(active), geometry if every else _of(geometry, active)
@@ -114,7 +115,10 @@ def fit_corners(
         rest[active] = rows[:, -1] - (taken[:, None].astype(np.float32) @ rows[:, :-1])[:, 0]
         change = np.abs(step[:, [X, Y, S]])
         change[:, 2] /= BLUR_LAG * values[active, S]
-        active[np.flatnonzero(active)[change.max(axis=1) <= rules.converged_px]] = False
+        settled = change.max(axis=1) <= rules.converged_px
+        # What was left before a first step that found the brightness is no residual.
+        settled &= (turn > 0) | np.isnan(contrast[active])
+        active[np.flatnonzero(active)[settled]] = False
         if not active.any():
             break
     noise, lags = variance, np.zeros((2, len(pixels), len(LAGS)))
