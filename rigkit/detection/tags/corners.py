@@ -67,9 +67,10 @@ beside it."""
 FEW_CORNERS = 12
 """Corners that say how blurred the image is, to a few hundredths."""
 
-ROUGH_PX = 0.25
-"""Saddles are nearer to corners than this, corners of outlines are not: where it is usual that a fit goes further, what
-it started from said too little of the lines."""
+BETTER_KNOWN, ROUGH_PX = 0.5, 0.25
+"""Lines are looked at again where corners scatter no more than this part of what those did that told of them first: else
+what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only corners of
+outlines, which lie in whole pixels."""
 
 BENT_SIGMAS = 0.3
 """Corners are fitted again where their lines bend otherwise by this part of their sigmas: left alone it would add a
@@ -120,7 +121,7 @@ class _Fitter:
         self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
         self.signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
         self._mapped: tuple[BoardState, SmoothMap] | None = None
-        self._fitted: tuple[EdgeFit, FloatArray, bool] | None = None
+        self._fitted: tuple[EdgeFit, FloatArray, float] | None = None
         self._vain = np.zeros(self.signs.shape, np.bool_)
         self.curvature = np.full(self.places.shape, np.nan)
 
@@ -211,7 +212,8 @@ class _Fitter:
         """Return the state with all its corners fitted, with lines that bend as they have it themselves, without those
         that failed; the fit is kept. Where `blur` is not known, a quick fit tells it."""
         cells = state.known
-        surface = self.map_of(state).at(self.places[cells])
+        smooth = self.map_of(state)
+        surface = smooth.at(self.places[cells])
         seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
         cells = cells.copy()
         cells[cells] = seen
@@ -219,21 +221,25 @@ class _Fitter:
         start = state.pixels[cells]
         blur = self._blur(cells, surface, start) if blur is None else blur
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
-        moved = known_median(np.linalg.norm(fit.pixels - state.pixels[cells], axis=1)[fit.valid])
-        self._fitted = fit, surface.sides, moved > ROUGH_PX
+        self._fitted = fit, surface.sides, smooth.scatter()
         self._vain[:] = False
         return state.without(np.ones_like(cells)).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def again(self, state: BoardState) -> BoardState:
-        """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted."""
-        cells, smooth = state.known, self.map_of(state)
+        """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted, if
+        that is known better now."""
+        assert self._fitted is not None
+        smooth, before = self.map_of(state), self._fitted[2]
+        scatter = smooth.scatter()
+        if scatter > BETTER_KNOWN * before:
+            return state
+        cells = state.known
         surface = smooth.at(self.places[cells])
         steps = np.minimum(0.5 * self.steps[cells].max(axis=2), WINDOW_REACH)
         half = np.minimum(steps * np.linalg.norm(surface.sides, axis=2), LAST_PASS[0])
         # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
         off = np.abs(surface.curvature() - self.curvature[cells]).max(axis=1) * half.max(axis=1) ** 2 / 6.0
-        assert self._fitted is not None
-        bent = self._fitted[2] | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], smooth.scatter()))
+        bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
         if not bent.any():
             return state
         blur = known_median(state.blur)
