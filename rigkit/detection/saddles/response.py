@@ -8,6 +8,7 @@ its noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -128,16 +129,21 @@ def _finite(image: NDArray[np.generic]) -> FloatImage:
 
 def pyramid(grey: GreyImage) -> list[Level]:
     """Return the levels of the search, the finest first."""
+    return list(each_level(grey))
+
+
+def each_level(grey: GreyImage) -> Iterator[Level]:
+    """Yield the levels of the search, the finest first, each made when it is asked for."""
     scale = 1
     while grey.size > scale**2 * BASE_PIXELS:
         scale *= 2
     base, offset = _shrunk(grey, scale), 0.5 * (scale - 1.0)
-    levels: list[Level] = []
-    while len(levels) < OCTAVES and min(base.shape) >= 16:
+    for _ in range(OCTAVES):
+        if min(base.shape) < 16:
+            return
         smooth, base = front.smoothed(base, SMOOTH)
-        levels.append(Level(smooth, _thresholds(smooth), float(scale), offset))
+        yield Level(smooth, _thresholds(smooth), float(scale), offset)
         scale *= 2
-    return levels
 
 
 def _shrunk(grey: GreyImage, factor: int) -> GreyImage:

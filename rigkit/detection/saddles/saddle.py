@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,9 +56,12 @@ class Corners:
         return len(self.pixels)
 
 
-def find_corners(levels: list[Level]) -> tuple[Corners, Saddles]:
-    """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles."""
-    kept: list[Corners] = []
+def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
+    """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles.
+
+    `finer` : those of the levels before, if only coarser `levels` are to be looked at.
+    """
+    kept = [] if finer is None else [finer]
     saddles: list[FloatArray] = []
     for level in levels:
         local, which, angles, contrast = _corners_of(level)

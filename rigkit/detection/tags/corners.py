@@ -68,8 +68,8 @@ FEW_CORNERS = 12
 """Corners that say how blurred the image is, to a few hundredths."""
 
 BETTER_KNOWN, ROUGH_PX = 0.5, 0.25
-"""Lines are looked at again where corners scatter no more than this part of what those did that told of them first: else
-what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only corners of
+"""Lines are looked at again where corners scatter no more than this part of what those did that told of them first:
+else what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only corners of
 outlines, which lie in whole pixels."""
 
 BENT_SIGMAS = 0.3

@@ -14,12 +14,17 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
-from rigkit.detection.saddles.response import pyramid
-from rigkit.detection.saddles.saddle import find_corners
+from rigkit.detection.saddles.response import GreyImage, Level, each_level
+from rigkit.detection.saddles.saddle import Corners, find_corners
 from rigkit.detection.tags.corners import tag_corners
 from rigkit.detection.tags.placing import TagBoard, placed_lattices
 from rigkit.detection.tags.quads import placed_tags
+from rigkit.detection.tags.surface import SmoothMap
 from rigkit.detection.targets.base import Finder, Search
+
+FIRST_SEEN, FEWEST_SEEN = 0.9, 16
+"""Of the corners of a board in an image, so many seen on the finest level are enough, and so many at least: those left
+are few, and sought one by one."""
 
 
 class AprilGridFinder(Finder):
@@ -40,11 +45,35 @@ class AprilGridFinder(Finder):
         yield from ((item, placed_tags(search.grey, item)) for item in tags if not item.pattern.corner_squares)
         if not joined:
             return
-        ratio = LENGTH_RATIO * max(max(t.pattern.spacing, 1.0 / t.pattern.spacing) for t in joined)
-        levels = pyramid(search.grey)
-        corners, _ = find_corners(levels)
-        lattices = list(build_lattices(corners, find_links(corners, levels[0], ratio)))
-        for item in joined:
-            pixels, used = placed_lattices(search.grey, lattices, item)
-            lattices = [lattice for n, lattice in enumerate(lattices) if n not in used]
-            yield item, pixels
+        levels = each_level(search.grey)
+        finest = next(levels)
+        corners, _ = find_corners([finest])
+        placed = list(_placed_by(corners, finest, search.grey, joined))
+        if not all(_nearly_whole(item, pixels, search.grey.shape) for item, pixels in placed):
+            corners, _ = find_corners(levels, corners)
+            placed = list(_placed_by(corners, finest, search.grey, joined))
+        yield from placed
+
+
+def _placed_by(
+    corners: Corners, finest: Level, image: GreyImage, boards: Sequence[TagBoard]
+) -> Iterator[tuple[TagBoard, FloatArray]]:
+    """Yield the boards and those of the corners that are theirs (R, C, 2), NaN where none is."""
+    ratio = LENGTH_RATIO * max(max(item.pattern.spacing, 1.0 / item.pattern.spacing) for item in boards)
+    lattices = list(build_lattices(corners, find_links(corners, finest, ratio)))
+    for item in boards:
+        pixels, used = placed_lattices(image, lattices, item)
+        lattices = [lattice for n, lattice in enumerate(lattices) if n not in used]
+        yield item, pixels
+
+
+def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) -> bool:
+    """Return whether so many corners (R, C, 2) are known that the rest is better sought where these foretell it."""
+    known = np.isfinite(pixels[..., 0])
+    count, wanted = int(np.count_nonzero(known)), known.size
+    if FIRST_SEEN * wanted > count >= FEWEST_SEEN:
+        # What lies outside the image is not missing.
+        places = tags.pattern.positions(tags.board.grid().astype(np.float64)).reshape(pixels.shape)
+        all_seen = SmoothMap(places[known], pixels[known]).at(places.reshape(-1, 2)).pixels
+        wanted = int(np.count_nonzero(((all_seen > 0.0) & (all_seen < np.array(shape[::-1]) - 1.0)).all(axis=1)))
+    return bool(count >= max(FEWEST_SEEN, FIRST_SEEN * wanted))
