@@ -69,8 +69,8 @@ FEW_CORNERS = 12
 
 BETTER_KNOWN, ROUGH_PX = 0.5, 0.25
 """Lines are looked at again where corners scatter no more than this part of what those did that told of them first:
-else what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only corners of
-outlines, which lie in whole pixels."""
+else what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only
+corners of outlines, which lie in whole pixels."""
 
 BENT_SIGMAS = 0.3
 """Corners are fitted again where their lines bend otherwise by this part of their sigmas: left alone it would add a
@@ -90,8 +90,9 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
     state = fitter.first(pixels)
     if np.count_nonzero(state.known) < MIN_TAG_CORNERS:
         return None
-    # What the lattice lacks is added before all corners are fitted again; what only finer ones foretell, after that.
-    state = fitter.without_outliers(fitter.completed(fitter.again(fitter.completed(state))))
+    # What the lattice lacks is added before corners are fitted again; what only finer ones foretell, after that.
+    state = fitter.completed(fitter.again(state))
+    state = fitter.without_outliers(state)
     row, column = np.nonzero(state.known)
     if len(row) < MIN_TAG_CORNERS:
         return None
@@ -122,7 +123,7 @@ class _Fitter:
         self.signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
         self._mapped: tuple[BoardState, SmoothMap] | None = None
         self._fitted: tuple[EdgeFit, FloatArray, float] | None = None
-        self._vain = np.zeros(self.signs.shape, np.bool_)
+        self._vain, self._waiting = np.zeros((2, *self.signs.shape), np.bool_)
         self.curvature = np.full(self.places.shape, np.nan)
 
     def map_of(self, state: BoardState) -> SmoothMap:
@@ -186,8 +187,11 @@ class _Fitter:
         )
 
     def first(self, pixels: FloatArray) -> BoardState:
-        """Return the rough corners fitted, those that failed left out."""
-        return self.fitted(BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan)), None)
+        """Return the rough corners fitted, those that failed left out, and those missing that they foretell."""
+        rough = BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan))
+        state = self.fitted(rough, None)
+        more = self.added(state, self.map_of(rough))
+        return state if more is None else self.completed(more)
 
     def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
         """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
@@ -222,7 +226,7 @@ class _Fitter:
         blur = self._blur(cells, surface, start) if blur is None else blur
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
         self._fitted = fit, surface.sides, smooth.scatter()
-        self._vain[:] = False
+        self._vain[:] = self._waiting[:] = False
         return state.without(np.ones_like(cells)).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def again(self, state: BoardState) -> BoardState:
@@ -233,6 +237,7 @@ class _Fitter:
         scatter = smooth.scatter()
         if scatter > BETTER_KNOWN * before:
             return state
+        self._vain[:] = self._waiting[:] = False
         cells = state.known
         surface = smooth.at(self.places[cells])
         steps = np.minimum(0.5 * self.steps[cells].max(axis=2), WINDOW_REACH)
@@ -249,12 +254,14 @@ class _Fitter:
         fit = self.fit(cells, surface.of(bent), state.pixels[cells], blur, LAST_PASS)
         return state.without(cells).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
-    def added(self, state: BoardState) -> BoardState | None:
-        """Return the state with those missing corners that can be added now, None where there are none."""
-        missing = ~(state.known | self._vain)
+    def added(self, state: BoardState, smooth: SmoothMap | None = None) -> BoardState | None:
+        """Return the state with those missing corners that can be added now, None where there are none; `smooth`
+        foretells them, by default the state's own map."""
+        missing = ~(state.known | self._vain | self._waiting)
         if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
             return None
-        surface = self.map_of(state).beyond(self.places[missing])
+        smooth = smooth or self.map_of(state)
+        surface = smooth.beyond(self.places[missing])
         height, width = self.image.shape
         with np.errstate(invalid="ignore"):
             inside = (surface.pixels > MARGIN_PX) & (surface.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
@@ -266,17 +273,19 @@ class _Fitter:
         surface = surface.of(usable)
         blur = known_median(state.blur)
         start = surface.pixels
-        if (self.map_of(state).scatter() * surface.gain > blur).any():
+        if (smooth.scatter() * surface.gain > blur).any():
             wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.heights().min(axis=1))
             rough = self.fit(cells, surface, start, wide, LAST_PASS, mirrored=False)
             start = np.where(rough.valid[:, None], rough.pixels, start)
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
         good = self._there(state, cells, surface, fit, blur)
         more = state.with_fit(cells, fit, good)
-        self._vain |= cells
-        # What is new foretells those around it better.
-        self._vain &= cv2.dilate((cells & more.known).astype(np.uint8), AROUND_NEW) == 0
-        return more if good.any() else None
+        # What was foretold as well as corners are known is not there; other corners may be foretold by those new.
+        self._vain[cells], self._waiting[cells] = surface.gain <= 1.0, True
+        if not good.any():
+            return None
+        self._waiting &= cv2.dilate((more.known & ~state.known).astype(np.uint8), AROUND_NEW) == 0
+        return more
 
     def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
         """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
