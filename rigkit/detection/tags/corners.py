@@ -110,17 +110,7 @@ class _Fitter:
 
     def __init__(self, image: GreyImage, tags: TagBoard, camera: Camera | None) -> None:
         self.image, self.tags, self.camera = image, tags, camera
-        board = tags.board
-        self.unit_mm = np.array(board.squares_mm)
-        grid = board.grid()
-        self.places = tags.pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2)
-        # To the next corner on either side, in sides of a tag: within the tag, or across the gap.
-        inwards = np.array([tags.pattern.spacing, 1.0])
-        odd = (grid % 2).reshape(board.rows, board.columns, 2)
-        right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
-        left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
-        self.steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
-        self.signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
+        self.places, self.steps, self.signs = tags.places, tags.steps, tags.signs
         self._mapped: tuple[BoardState, SmoothMap] | None = None
         self._fitted: tuple[EdgeFit, FloatArray, float] | None = None
         self._vain, self._waiting = np.zeros((2, *self.signs.shape), np.bool_)
@@ -133,7 +123,7 @@ class _Fitter:
             if self.camera is not None and np.count_nonzero(state.known) >= MIN_GUIDE_CORNERS:
                 pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
                 if pose is not None:
-                    base = partial(seen_surface, self.camera, pose, self.unit_mm)
+                    base = partial(seen_surface, self.camera, pose, np.array(self.tags.board.squares_mm))
             self._mapped = state, SmoothMap(self.places[state.known], state.pixels[state.known], base)
         return self._mapped[1]
 

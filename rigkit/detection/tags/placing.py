@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -36,19 +37,28 @@ MIN_TAGS_OF_PLACE = 4
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TagBoard:
-    """A board of tags and what is needed to read it."""
+    """A board of tags and what is needed to read it and to place its corners (R, C).
+
+    Attributes
+    ----------
+    numbers : (R / 2, C / 2) of its tags, which look as `codes` say.
+    places : (R, C, 2) of its corners, in sides of a tag.
+    steps : (R, C, 2, 2) how far it is to the corners above and below, right and left, within the tag or across the gap.
+    signs : (R, C) +1 where brightness grows with the angle across the line along the row, else -1.
+    """
 
     board: Board
     pattern: AprilGrid
     numbers: IntArray
     codes: Codes
+    places: FloatArray
+    steps: FloatArray
+    signs: FloatArray
 
-    @classmethod
-    def of(cls, board: Board) -> TagBoard:
-        pattern = board.pattern
-        assert isinstance(pattern, AprilGrid)
-        numbers = pattern.numbers(*board.size)
-        return cls(board, pattern, numbers, Codes.of(pattern, numbers.ravel()))
+    @staticmethod
+    def of(board: Board) -> TagBoard:
+        """Return that of a board; those of boards asked for before are kept."""
+        return _tag_board(board)
 
     def corner_of(self, number: IntArray) -> IntArray:
         """Return (column, row) of the first corner of tags (N, 2)."""
@@ -56,6 +66,26 @@ class TagBoard:
         row, column = np.mgrid[: self.numbers.shape[0], : self.numbers.shape[1]]
         first[self.numbers] = 2 * np.stack([column, row], axis=-1)
         return first[number]
+
+
+@lru_cache(maxsize=64)
+def _tag_board(board: Board) -> TagBoard:
+    pattern = board.pattern
+    assert isinstance(pattern, AprilGrid)
+    numbers, grid = pattern.numbers(*board.size), board.grid()
+    odd = (grid % 2).reshape(board.rows, board.columns, 2)
+    inwards = np.array([pattern.spacing, 1.0])
+    right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
+    left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
+    return TagBoard(
+        board,
+        pattern,
+        numbers,
+        Codes.of(pattern, numbers.ravel()),
+        pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2),
+        np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2),
+        np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0),
+    )
 
 
 def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoard) -> tuple[FloatArray, set[int]]:

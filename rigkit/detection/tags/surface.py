@@ -65,7 +65,7 @@ class TagSurface:
         """Return how far a unit of the board lies from the line along x, and from that along y, (M, 2) px."""
         x, y = self.sides[..., 0], self.sides[..., 1]
         area = np.abs(x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])
-        return np.asarray(area[:, None] / np.maximum(np.sqrt(x * x + y * y), 1e-9))
+        return np.asarray(area[:, None] / np.maximum(np.hypot(x, y), 1e-9))
 
     def of(self, which: BoolArray) -> TagSurface:
         """Return the places `which` (M,)."""

@@ -73,7 +73,6 @@ def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) ->
     count, wanted = int(np.count_nonzero(known)), known.size
     if FIRST_SEEN * wanted > count >= FEWEST_SEEN:
         # What lies outside the image is not missing.
-        places = tags.pattern.positions(tags.board.grid().astype(np.float64)).reshape(pixels.shape)
-        all_seen = SmoothMap(places[known], pixels[known]).at(places.reshape(-1, 2)).pixels
+        all_seen = SmoothMap(tags.places[known], pixels[known]).at(tags.places.reshape(-1, 2)).pixels
         wanted = int(np.count_nonzero(((all_seen > 0.0) & (all_seen < np.array(shape[::-1]) - 1.0)).all(axis=1)))
     return bool(count >= max(FEWEST_SEEN, FIRST_SEEN * wanted))
