@@ -35,7 +35,7 @@ MIN_TAGS_OF_PLACE = 4
 """Fewer tags are read one by one, or not at all."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TagBoard:
     """A board of tags and what is needed to read it and to place its corners (R, C).
 
@@ -78,13 +78,13 @@ def _tag_board(board: Board) -> TagBoard:
     right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
     left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
     return TagBoard(
-        board,
-        pattern,
-        numbers,
-        Codes.of(pattern, numbers.ravel()),
-        pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2),
-        np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2),
-        np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0),
+        board=board,
+        pattern=pattern,
+        numbers=numbers,
+        codes=Codes.of(pattern, numbers.ravel()),
+        places=pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2),
+        steps=np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2),
+        signs=np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0),
     )
 
 
