@@ -39,7 +39,8 @@ def detect_boards(
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
         stays a grid of its own. A board is named only where one single given board has that size and one single
-        detection fits it (whole, where others lack corners that would lie in the image), or by its marks.
+        detection fits it (whole, where others lack corners that would lie in the image), or by its marks; a grid of
+        circles where no larger board can be meant, of which the image's border cuts off the rest.
     min_corners : boards with fewer corners are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known: it shows which parts are of one board (`guided.rejoin`) and where
         corners of known boards were missed, and fits all of them with windows and lines as it sees them
@@ -68,7 +69,8 @@ def detect_boards(
     if search.fewest < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank)
-    plain = [board for board in search.boards if not board.identified]
+    # Grids of circles are named where they are placed, and not where a larger board may be meant.
+    plain = [board for board in search.boards if board.pattern.type == Chessboard.type]
     return tuple(_with_ids(_without_repeated(ordered), plain, (stored.shape[1], stored.shape[0])))
 
 

@@ -155,6 +155,21 @@ def test_a_board_whose_corner_is_cut_off_is_told_from_a_larger_one(turn_deg: flo
         assert np.abs(errors(found, truth)).max() < SINGLE_PX
 
 
+@pytest.mark.parametrize("pattern", [REGULAR.pattern, HEXAGONAL.pattern], ids=["regular", "hexagonal"])
+def test_of_two_boards_that_the_image_cannot_tell_apart_none_is_named(pattern: Circles) -> None:
+    """A row is beyond the image's border: what is left is the smaller board, or a part of the larger one."""
+    small, large = (replace(REGULAR, board_id=f"of {n}", columns=7, rows=n, pattern=pattern) for n in (6, 7))
+    turn = exp_so3(np.radians([5.0, 3.0, 2.0]))
+    place = Rigid3(turn, np.array([0.0, 0.0, 420.0]) - turn @ large.points().mean(axis=0))
+    scene = BenchScene("regular", (PlacedBoard(large, place),), (), bench_camera("regular"), bench_field_deg("regular"))
+    rows = scene.truth()[0].lattice()[..., 1]
+    image = scene.render()
+    cut = image[: int(0.5 * (rows[-2].max() + rows[-1].min()))]
+    assert [item.board_id for item in detect_boards(cut, [small, large])] == [None]
+    assert [item.board_id for item in detect_boards(cut, [small])] == ["of 6"]
+    assert [item.board_id for item in detect_boards(image, [small, large])] == ["of 7"]
+
+
 def test_circles_that_something_covers_are_left_out() -> None:
     rng = np.random.default_rng(3)
     scene = one_board(rng, lens="regular", board=HEXAGONAL)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from detection_bench.scenes import one_board
+from detection_bench.scenes import BenchScene, bench_camera, bench_field_deg, one_board
 
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
@@ -21,6 +21,7 @@ from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charu
 from rigkit.detection.tags.unknown_tags import TagSightings
 from rigkit.detection.unknown import LOOKING, difference, guess_board
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 
@@ -208,6 +209,20 @@ def test_circles_are_told_where_there_are_no_squares() -> None:
     board = Board("b", 5, 4, 60.0, 60.0, pattern=Circles(diameter_mm=30.0))
     guess = guess_board([shown(board)])
     assert guess is not None and guess.board.pattern.type == "circles" and sorted(guess.board.size) == [4, 5]
+
+
+def test_rows_cut_off_by_the_image_do_not_make_a_smaller_board() -> None:
+    """Two images show all rows but one, one image the whole board."""
+    board = Board("b", 6, 5, 60.0, 60.0, pattern=Circles(diameter_mm=30.0))
+    camera = bench_camera("regular")
+    turn = exp_so3(np.radians([5.0, 3.0, 2.0]))
+    place = Rigid3(turn, np.array([0.0, 0.0, 800.0]) - turn @ board.points().mean(axis=0))
+    scene = BenchScene("c", (PlacedBoard(board, place),), (), camera, bench_field_deg("regular"))
+    whole, rows = grey_image(scene.render()), scene.truth()[0].lattice()[..., 1]
+    cut = whole[: int(0.5 * (rows[-2].max() + rows[-1].min()))]
+    guess = guess_board([cut, whole, cut])
+    assert guess is not None
+    assert sorted(guess.board.size) == [5, 6]
 
 
 def shown(board: Board) -> GreyImage:

@@ -19,8 +19,7 @@ from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import CircleGrid
 
 TELLING = 2
-"""A place in a board is preferred to another, in it or in another board, that leaves more than so many more places
-empty."""
+"""A place in a board is preferred to another in it that leaves more than so many more places empty."""
 MAX_EMPTY = 0.2
 """Part of a board's circles that may be covered where the others show their place."""
 EMPTY_LINE = 0.5
@@ -38,15 +37,31 @@ class _Place:
 def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board, BoardDetection]]:
     """Return which of the boards the lattice can be, the likeliest first, each with the circles on its grid, unnamed.
 
-    A lattice that is a whole board is that one, though a larger board may have room for it. Other boards are compared
-    as places in one board are (`TELLING`): where the image's border cuts off the corner of a board, the paper beside it
-    is seen, where a larger board would have circles.
+    They are those that leave fewest places empty which the image shows: where the image's border cuts off the corner of
+    a board, the paper beside it is seen, where a larger board would have circles. A lattice that is a whole board comes
+    first, and after it larger boards that it may be a part of, in whatever place, where the image's border cuts these.
     """
     fits = [(board, place) for board in boards if (place := _place_on(found, board)) is not None]
     least = min((place.empty for _, place in fits), default=0)
-    likely = sorted((fit for fit in fits if fit[1].empty <= least + TELLING), key=lambda fit: fit[1].empty)
+    likely = [fit for fit in fits if fit[1].empty == least]
     whole = [(board, place) for board, place in fits if len(place.grid) == board.corner_count]
-    return [(board, _detection(found, place.grid, board.size)) for board, place in whole or likely]
+    if whole:
+        others = [
+            (board, _open_place(found, board, 0)) for board in boards if all(board is not own for own, _ in whole)
+        ]
+        likely = whole + [(board, place) for board, place in others if place is not None]
+    return [(board, _detection(found, place.grid, board.size)) for board, place in likely]
+
+
+def may_be_part(found: CircleGrid, board: Board) -> bool:
+    """Return whether the lattice can be a part of the board, of which the image's border cuts off the rest."""
+    return _open_place(found, board, TELLING) is not None
+
+
+def _open_place(found: CircleGrid, board: Board, most: int) -> _Place | None:
+    """Return a place in the board that leaves `most` places empty that the image shows; None where there is none."""
+    least = min(_places_on(found, board), key=lambda place: place.empty, default=None)
+    return None if least is None or least.empty > most else least
 
 
 def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
@@ -56,10 +71,7 @@ def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:
 
 
 def _place_on(found: CircleGrid, board: Board) -> _Place | None:
-    pattern = board.pattern
-    if not isinstance(pattern, Circles) or pattern.inverted != found.bright:
-        return None
-    places = [place for circles, empty in _counted(found, pattern.layout) for place in _places(circles, empty, board)]
+    places = _places_on(found, board)
     if not places:
         return None
     least = min(place.empty for place in places)
@@ -69,6 +81,14 @@ def _place_on(found: CircleGrid, board: Board) -> _Place | None:
     if len({_key(place.grid, board) for place in good}) > 1:
         return None
     return max(good, key=lambda place: _upright(place.grid, found.pixels))
+
+
+def _places_on(found: CircleGrid, board: Board) -> list[_Place]:
+    """Return all places in the board that the lattice can have."""
+    pattern = board.pattern
+    if not isinstance(pattern, Circles) or pattern.inverted != found.bright:
+        return []
+    return [place for circles, empty in _counted(found, pattern.layout) for place in _places(circles, empty, board)]
 
 
 def lone_part(found: CircleGrid, board: Board) -> BoardDetection | None:

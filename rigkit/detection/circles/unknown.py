@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import NEIGHBOUR_DISTANCES, STAGGERS, Circles
 from rigkit.detection.circles.find import CircleGrid, find_grids
-from rigkit.detection.circles.place import placed_on
+from rigkit.detection.circles.place import may_be_part, placed_on
 from rigkit.detection.saddles.response import GreyImage
 
 MIN_SIDE_CIRCLES = 3
@@ -25,11 +25,13 @@ class CircleSightings:
     Attributes
     ----------
     boards : how many images show each board whole; of distance 1 mm, without the circles' size.
+    bounded : how many of these show that it does not go on beyond the image's border.
     diameters : of the circles, in distances of neighbours.
     shown : for each image that shows a whole grid its index and the boards that this can be.
     """
 
     boards: Counter[tuple[str, int, int, str, bool]] = field(default_factory=Counter)
+    bounded: Counter[tuple[str, int, int, str, bool]] = field(default_factory=Counter)
     diameters: list[float] = field(default_factory=list)
     shown: list[tuple[int, set[tuple[str, int, int, str, bool]]]] = field(default_factory=list)
 
@@ -40,6 +42,7 @@ class CircleSightings:
             return False
         fits = {kind for kind in _kinds(grids[0]) if _whole(grids[0], kind)}
         self.boards.update(fits)
+        self.bounded.update(kind for kind in fits if not _goes_on(grids[0], kind))
         if fits:
             self.diameters.append(2.0 * grids[0].radius)
             self.shown.append((index, fits))
@@ -72,13 +75,29 @@ def _whole(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
     return placed is not None and placed.complete
 
 
+def _goes_on(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
+    """Return whether the image's border may cut off a row or column more."""
+    layout, columns, rows, _, bright = kind
+    staggers = STAGGERS if layout != "regular" else STAGGERS[:1]
+    larger = ((columns + 1, rows), (columns, rows + 1))
+    return any(may_be_part(grid, _board((layout, *size, stagger, bright))) for size in larger for stagger in staggers)
+
+
 def guessed_circles(seen: CircleSightings) -> tuple[Board, tuple[int, ...]] | None:
     """Return the grid that most images show whole, with circles 1 mm apart in a row, and which images; None for none.
 
-    A grid that looks the same from its other end is told staggered to the right.
+    Images that show paper all around count first: what the border of an image cuts looks like a whole grid of fewer
+    rows. Where none does, or as many do, the larger grid is the whole one. A grid that looks the same from its other
+    end is told staggered to the right.
     """
     if not seen.boards:
         return None
-    best = max(seen.boards, key=lambda kind: (seen.boards[kind], kind[0] == "regular", -STAGGERS.index(kind[3]), kind))
+    best = max(
+        seen.boards,
+        key=lambda kind: (
+            *(seen.bounded[kind], seen.boards[kind], kind[1] * kind[2]),
+            *(kind[0] == "regular", -STAGGERS.index(kind[3]), kind),
+        ),
+    )
     diameter = round(float(np.median(seen.diameters)) * NEIGHBOUR_DISTANCES[best[0]], 2)
     return _board(best, diameter), tuple(index for index, fits in seen.shown if best in fits)
