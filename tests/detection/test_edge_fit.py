@@ -112,8 +112,18 @@ def test_brightness_told_wrong_leaves_no_residual(rng: np.random.Generator) -> N
     """A fit that starts where it ends takes a step for the brightness all the same, and then looks at what is left."""
     shape, pixels = geometry(4), corners(4, rng)
     image, _ = image_of(pixels, shape, 0.8)
-    known = {"contrast": np.full(4, 60.0), "mirrored": False, "converged_px": 0.05}
-    fit = fit_edges(image, pixels, shape, np.ones(4), np.full(4, 0.8), radius_px=18.0, iterations=8, **known)
+    fit = fit_edges(
+        image,
+        pixels,
+        shape,
+        np.ones(4),
+        np.full(4, 0.8),
+        radius_px=18.0,
+        iterations=8,
+        converged_px=0.05,
+        mirrored=False,
+        contrast=np.full(4, 60.0),
+    )
     assert fit.valid.all()
     assert fit.residual.max() < 0.5
 
