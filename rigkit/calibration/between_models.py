@@ -34,7 +34,7 @@ from rigkit.geometry.rotation import log_so3, skew
 MIN_LIKELY = 0.05
 """A model that is less likely the better one adds next to nothing, however far it is off."""
 RAYS = 400
-"""So many corners, spread over all views, are enough to follow another lens."""
+"""So many corners are enough to follow another lens."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -116,7 +116,7 @@ def between_models(
 
 
 def spread_rays(points_in_cam: FloatArray) -> Rays:
-    """Return unit rays (M, 3) to up to 400 of the points (N, 3)."""
-    chosen = np.linspace(0, len(points_in_cam) - 1, min(RAYS, len(points_in_cam))).astype(np.int64)
-    points = points_in_cam[chosen]
-    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))
+    """Return unit rays (M, 3) to up to 400 of the points (N, 3), spread over their angles with the axis."""
+    rays = points_in_cam / np.linalg.norm(points_in_cam, axis=-1, keepdims=True)
+    chosen = np.linspace(0, len(rays) - 1, min(RAYS, len(rays))).astype(np.int64)
+    return np.asarray(rays[np.argsort(rays[:, 2])[chosen]])

@@ -256,17 +256,14 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
     if folds < 2:
         return None
     images = list(dict.fromkeys(observations.images))
-    clusters = observations.clusters()
-    differ = len(np.unique(clusters))
-    if differ < LEAST_IMAGES:
+    if int(observations.clusters().max()) + 1 < LEAST_IMAGES:
         return None
-    folds = min(folds, differ)
     place = {name: i for i, name in enumerate(images)}
     image = np.array([place[name] for name in observations.images])
-    fold = clusters % folds
+    fold = observations.folds(folds)
     squared = np.zeros(len(images))
     weight = fit.weight(observations)
-    for k in range(folds):
+    for k in range(int(fold.max()) + 1):
         train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
         solved = solve(
             observations.subset(train),

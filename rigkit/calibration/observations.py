@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rigkit.calibration.folds import folds_of
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points, median_of
 from rigkit.core.boards import Board
@@ -51,7 +52,8 @@ class Observations:
     first_row : (len(boards) + 1,) first row of each board in the table.
     board : (V,) int, board of each view.
     workspace : of the solver; subsets share it.
-    known_clusters : what `clusters` has found, once it was asked; observations of the same views share it.
+    known_clusters, known_folds : what `clusters` and `folds` have found, once they were asked; observations of the same
+        views share it.
     """
 
     views: tuple[BoardView, ...]
@@ -65,6 +67,7 @@ class Observations:
     board: IntArray
     workspace: Workspace = field(default_factory=Workspace, repr=False)
     known_clusters: list[IntArray] = field(default_factory=list, repr=False)
+    known_folds: dict[int, IntArray] = field(default_factory=dict, repr=False)
 
     @classmethod
     def from_views(cls, views: Sequence[BoardView]) -> Observations:
@@ -136,6 +139,7 @@ class Observations:
             present=self.present[chosen],
             board=self.board[chosen],
             known_clusters=[],
+            known_folds={},
         )
 
     @property
@@ -149,6 +153,13 @@ class Observations:
             boards, pixels = [view.board.board_id for view in self.views], [view.pixels for view in self.views]
             self.known_clusters.append(cluster_numbers(self.images, boards, pixels))
         return self.known_clusters[0]
+
+    def folds(self, count: int) -> IntArray:
+        """Return the fold of each view (V,), of `count` of them or, of fewer images, each its own."""
+        if count not in self.known_folds:
+            clusters = self.clusters()
+            self.known_folds[count] = folds_of([view.pixels for view in self.views], clusters, count)[clusters]
+        return self.known_folds[count]
 
 
 def _check(views: Sequence[BoardView], view_of: IntArray, grid: IntArray, size: IntArray, sigma: FloatArray) -> None:

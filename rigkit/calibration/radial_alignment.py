@@ -160,8 +160,9 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:
     """Return, for each view, the fit to a random subset of its corners with the smallest median residual."""
-    rng = np.random.default_rng(0)
-    order = np.argsort(np.where(used[:, None], rng.random((len(used), SUBSETS, used.shape[1])), 2.0), axis=-1)
+    # The same numbers for every view: what a view's are is not to depend on the others.
+    drawn = np.random.default_rng(0).random((SUBSETS, used.shape[1]))
+    order = np.argsort(np.where(used[:, None], drawn, 2.0), axis=-1)
     chosen = order[..., None, :SUBSET_SIZE]
     offset, local = offset[:, None], local[:, None]
     subset = _Views(np.take_along_axis(offset, chosen, axis=-1), np.take_along_axis(local, chosen, axis=-1))

@@ -20,15 +20,15 @@ SOUGHT_FURTHER = 1.001
 
 
 def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequence[Pixels]) -> IntArray:
-    """Return for each view (V,) the number of the image that it is of; images that repeat an earlier one have its
-    number.
+    """Return for each view (V,) the number of the image that it is of; images that repeat each other have one number,
+    and so have those that hang together by others that they repeat.
 
     Parameters
     ----------
     images, boards : name of each view's image and of its board.
     pixels : (N, 2) of each view's corners.
     """
-    places, shown = _places(pixels), dict[str, list[int]]()
+    places, shown = places_of(pixels), dict[str, list[int]]()
     for view, image in enumerate(images):
         shown.setdefault(image, []).append(view)
     # Only images of the same boards can repeat each other.
@@ -40,9 +40,8 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     number = {image: i for i, image in enumerate(shown)}
     for group in alike.values():
         one, other = close_pairs(places[np.array(group)].reshape(len(group), -1), REPEATED_PX)
-        for earlier, later in sorted(zip(one.tolist(), other.tolist(), strict=True), key=lambda pair: pair[::-1]):
-            names = images[group[earlier][0]], images[group[later][0]]
-            number[names[1]] = min(number[names[0]], number[names[1]])
+        for later, first in enumerate(joined(one, other, len(group)).tolist() if len(one) else ()):
+            number[images[group[later][0]]] = number[images[group[first][0]]]
     _, dense = np.unique([number[name] for name in images], return_inverse=True)
     return dense.astype(np.int64)
 
@@ -74,7 +73,19 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     return pairs[:, 0], pairs[:, 1]
 
 
-def _places(pixels: Sequence[Pixels]) -> FloatArray:
+def joined(one: IntArray, other: IntArray, count: int) -> IntArray:
+    """Return for each of `count` things the first one of those that it hangs together with, by pairs (P,) each."""
+    first = np.arange(count)
+    while True:
+        before = first.copy()
+        np.minimum.at(first, one, before[other])
+        np.minimum.at(first, other, before[one])
+        first = first[first]
+        if (first == before).all():
+            return first
+
+
+def places_of(pixels: Sequence[Pixels]) -> FloatArray:
     """Return for each view how many corners there are, their centre, and their extents along the image's axes and
     diagonals, px: (V, 7)."""
     count = np.array([len(corners) for corners in pixels])

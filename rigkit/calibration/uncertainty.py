@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from rigkit.calibration.departures import Departures
-from rigkit.calibration.result import Calibration, Rival
+from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, symmetric_pinv
@@ -135,8 +135,7 @@ class FarProjection:
         """Return it for a calibration; the rays to the corners `from_boards` as they were solved, where all are known
         to project: it saves the way back from the pixels."""
         camera, corners = calibration.camera, calibration.corners
-        chosen = np.flatnonzero(corners.kept)
-        chosen = chosen[_spread(len(chosen))]
+        chosen = _spread(corners)
         if from_boards:
             points = corners.in_cam(chosen)
             rays, valid = points / np.sqrt((points * points).sum(axis=-1, keepdims=True)), np.ones(len(points), bool)
@@ -309,8 +308,16 @@ def pose_covariance_of_lens(
     return np.asarray(step @ covariance @ step.T)
 
 
-def _spread(count: int) -> IntArray:
-    return np.linspace(0, count - 1, min(CORNERS, count)).astype(np.int64)
+def _spread(corners: CalibrationCorners) -> IntArray:
+    """Return the numbers of up to 400 kept corners, of views in the order of where they lie in the image: the same ones
+    in whatever order the views are."""
+    chosen = np.flatnonzero(corners.kept)
+    view = corners.view[chosen]
+    shown, first = np.unique(view, return_index=True)
+    rank = np.zeros(len(corners.count), np.int64)
+    rank[shown[np.lexsort(corners.pixels[chosen[first]].T)]] = np.arange(len(shown))
+    chosen = chosen[np.argsort(rank[view], kind="stable")]
+    return chosen[np.linspace(0, len(chosen) - 1, min(CORNERS, len(chosen))).astype(np.int64)]
 
 
 def uncertainty_map(

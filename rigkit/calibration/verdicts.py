@@ -325,8 +325,7 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
         return [Finding.bad(what, "take more views, with the board tilted")]
-    pixels = c.corners.pixels[c.corners.kept]
-    place = pixels[np.linspace(0, len(pixels) - 1, len(inside)).astype(np.int64)[np.nanargmax(inside)]]
+    place = far.corners.pixels[np.nanargmax(inside[far.rays_valid])]
     what += f", most in the {_cell(c, place)} of the image"
     return [Finding.bad(what, "take more views there, with the board tilted")]
 

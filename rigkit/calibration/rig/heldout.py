@@ -23,15 +23,13 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
     as in the solution.
     """
     observations, state = joint.observations, joint.solution.state
-    frame = joint.frames
     nothing = None, (None,) * len(observations.cameras)
-    frames = int(frame.max()) + 1
-    if folds < 2 or frames < LEAST_IMAGES:
+    if folds < 2 or int(joint.frames.max()) + 1 < LEAST_IMAGES:
         return nothing
-    folds = min(folds, frames)
+    fold = joint.folds(folds)
     squared, count = np.zeros(len(observations.cameras)), np.zeros(len(observations.cameras))
-    for k in range(folds):
-        test = frame % folds == k
+    for k in range(int(fold.max()) + 1):
+        test = fold == k
         train = observations.subset(~test)
         if not _hang_together(train):
             return nothing

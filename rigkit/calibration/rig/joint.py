@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rigkit.calibration.folds import folds_of
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
@@ -92,6 +93,12 @@ class JointRig:
         frames, boards, pixels = zip(*sorted(shown, key=lambda of: of[0]), strict=True)
         number = dict(zip(frames, cluster_numbers(frames, boards, pixels).tolist(), strict=True))
         return np.array([number[name] for name in names], dtype=np.int64)
+
+    def folds(self, count: int) -> IntArray:
+        """Return the fold of every pose (F,), of `count` of them or, of fewer frames, each its own."""
+        pixels = [view.pixels for own in self.observations.cameras for view in own.views]
+        frame = self.frames[np.concatenate(self.observations.frame)]
+        return folds_of(pixels, frame, count)[self.frames]
 
     @property
     def shared_count(self) -> int:
