@@ -14,10 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.fit import Fit, fit_kept, inliers, sigma_of
+from rigkit.calibration.fit import Fit, fit_kept
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.outliers import inliers, sigma_of
 from rigkit.calibration.shape import released_groups, shape_model, warp_groups
 from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
@@ -96,7 +97,7 @@ def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple
         sigma = sigma_of(norm, kept)
         normal = with_priors(solution.data, state, sigma)
         state = replace(state, shape=replace(state.shape, sigma=_sizes(observations, state, normal, sigma)))
-        kept = inliers(norm, observations, sigma, state.camera.size_px)
+        kept = inliers(norm, observations, sigma, state.camera.size_px, solution.data.residuals[0].px)
     return state, kept
 
 

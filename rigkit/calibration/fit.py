@@ -11,30 +11,21 @@ from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
-from rigkit.cameras.base import Camera, image_center
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
-OUTLIER_SIGMAS = 5.0
-"""A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
-sigma = median |r| / 1.177: by chance alone 4 corners in a million do."""
-RINGS, RING_CORNERS = 8, 50
-"""Corners scatter more towards the rim of the image, where squares are small and blurred: the rule takes the scatter of
-the ring around the middle that a corner lies in, of so many with as many corners each, but no fewer than 50."""
-RING_FACTOR = 4.0
-"""No ring scatters more than this many times as much as all corners: beyond it the corners in it are bad ones."""
 CAUCHY_SIGMAS = 2.5
 COARSE_TOLERANCE = 5e-2
 FINE = 1e-5
 """The robust solves stop where a step promises less than this part of the cost: they only tell outliers from the rest,
 and the least squares that follow begin where they end."""
-SIGMA_FLOOR_PX = 1e-4
-"""Exact corners have no scatter to judge outliers by: below this rounding would make them."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
 FOLD = 1e-6
@@ -81,32 +72,9 @@ class Fit:
         return float(np.sqrt((self.residuals.px**2).sum(axis=-1)[self.kept].mean()))
 
 
-def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
-    """Return the robust standard deviation per coordinate, median |r| / 1.177, of the corners `used`."""
-    chosen = norm[used]
-    return max(median_of(chosen) / MEDIAN_OF_RAYLEIGH, SIGMA_FLOOR_PX) if chosen.size else SIGMA_FLOOR_PX
-
-
 def robust_sigma(fit: Fit, observations: Observations) -> float:
     """Return the robust standard deviation of all corners, weighted, px."""
     return sigma_of(fit.norm(observations), observations.present)
-
-
-def inliers(norm: FloatArray, observations: Observations, sigma_px: float, size_px: tuple[int, int]) -> BoolArray:
-    """Return which corners the rule keeps, (V, C), from their weighted residuals."""
-    present = observations.present
-    kept = present & (norm <= OUTLIER_SIGMAS * sigma_px)
-    if (kept == present).all():
-        return kept
-    own = norm[present]
-    middle = image_center(size_px)
-    order = np.argsort(((observations.pixels[present] - middle) ** 2).sum(axis=-1))
-    limit = np.empty(len(own))
-    for ring in np.array_split(order, min(max(len(own) // RING_CORNERS, 1), RINGS)):
-        scatter = sigma_of(own, ring)
-        limit[ring] = OUTLIER_SIGMAS * min(max(scatter, sigma_px), RING_FACTOR * sigma_px)
-    kept[present] = own <= limit
-    return kept
 
 
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:
@@ -125,7 +93,7 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
         if found.sigma_px < GOOD_ENOUGH * size_px[0]:
             break
     if best is not None:
-        kept = inliers(best.norm, observations, best.sigma_px, size_px)
+        kept = inliers(best.norm, observations, best.sigma_px, size_px, best.px)
         clean = bool((kept == observations.present).all())
         fit = _settled(observations, best.state, best.norm, kept, SETTLE_ROUNDS, best.data if clean else None)
         if np.isfinite(robust_sigma(fit, observations)):
@@ -138,10 +106,11 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Found:
-    """A state found robustly, its weighted residuals and their robust standard deviation; the normal equations of all
-    corners there, where they are known."""
+    """A state found robustly, its residuals, their weighted lengths and the robust standard deviation of those; the
+    normal equations of all corners there, where they are known."""
 
     state: State
+    px: FloatArray
     norm: FloatArray
     sigma_px: float
     data: NormalEquations | None = None
@@ -150,7 +119,7 @@ class _Found:
     def at(cls, state: State, data: NormalEquations, observations: Observations) -> _Found:
         """Return the state with what follows from the normal equations there."""
         norm = data.residuals[0].weighted(observations)
-        return cls(state, norm, sigma_of(norm, observations.present), data)
+        return cls(state, data.residuals[0].px, norm, sigma_of(norm, observations.present), data)
 
 
 def _clean(observations: Observations, start: _Found) -> _Found | None:
@@ -171,7 +140,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
     state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
-        return _Found(state, norm, sigma)  # nothing for a robust loss to do
+        return _Found(state, coarse.data.residuals[0].px, norm, sigma)  # nothing for a robust loss to do
     # Padding is left out of the medians by standing beyond all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
     of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / MEDIAN_OF_RAYLEIGH
@@ -184,7 +153,7 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
         state = replace(state, rotation=rotation, translation_mm=translation)
     fine = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=FINE)
     norm = fine.data.residuals[0].weighted(observations)
-    return _Found(fine.state, norm, sigma_of(norm, present))
+    return _Found(fine.state, fine.data.residuals[0].px, norm, sigma_of(norm, present))
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:
@@ -218,7 +187,8 @@ def _settled(
         solution = solve(observations, state, weight=weight, prior_sigma_px=prior, at_start=data)
         data = None
         state, norm = solution.state, solution.data.residuals[0].weighted(observations)
-        agree = inliers(norm, observations, sigma_of(norm, kept), state.camera.size_px)
+        px = solution.data.residuals[0].px
+        agree = inliers(norm, observations, sigma_of(norm, kept), state.camera.size_px, px)
         if again == rounds or (agree == kept).all():
             break
         kept = agree

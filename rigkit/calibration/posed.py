@@ -12,19 +12,11 @@ from numpy.typing import ArrayLike
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import (
-    CAUCHY_SIGMAS,
-    OUTLIER_SIGMAS,
-    SETTLE_ROUNDS,
-    Fit,
-    fit_kept,
-    heldout_squares,
-    inliers,
-    sigma_of,
-)
+from rigkit.calibration.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept, heldout_squares
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import with_board_shape
+from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
 from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Calibration, Candidate, Convergence
 from rigkit.calibration.state import State, evaluate

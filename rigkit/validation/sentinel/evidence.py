@@ -13,9 +13,9 @@ import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
 from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.fit import inliers, sigma_of
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.outliers import inliers, sigma_of
 from rigkit.calibration.poses import refine_poses
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.state import State, evaluate
