@@ -27,7 +27,8 @@ import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.calibration.result import Calibration
-from rigkit.core.arrays import FloatArray, IntArray, Pixels
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Pixels
 from rigkit.kernels.departures import POSE, LensCorners, averaged_amounts, displacements
 
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
@@ -55,7 +56,7 @@ class Departures:
         """Return what the images of a calibration leave open."""
         sigmas = calibration.parameter_sigmas
         p = len(sigmas)
-        products, freedom = _products(calibration, sigmas)
+        products, freedom = _products(calibration, calibration.camera, sigmas, np.eye(3))
         if not (np.isfinite(products).all() and products[-1, -1] >= 0.0):
             # A lens beyond all numbers, as a damaged file may have it.
             products = np.zeros_like(products)
@@ -82,14 +83,22 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     return averaged_amounts(information, score, SIZES_TRIED)
 
 
-def _products(calibration: Calibration, sigmas: FloatArray) -> tuple[FloatArray, int]:
-    """Return the sums of products (K, K) of derivatives by the parameters in units of `sigmas` (P,), the displacements
-    and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the parameters."""
-    corners, camera = calibration.corners, calibration.camera
+def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) -> FloatArray:
+    """Return what the corners of a calibration would tell of the parameters (P,) of another `camera`, poses eliminated,
+    (P, P) for corners of unit variance; `turn` takes rays of the calibrated camera to its own."""
+    p = camera.parameters.size
+    return _products(calibration, camera, np.ones(p), turn)[0][:p, :p]
+
+
+def _products(calibration: Calibration, camera: Camera, sigmas: FloatArray, turn: Mat3) -> tuple[FloatArray, int]:
+    """Return the sums of products (K, K) of derivatives by the parameters of a camera in units of `sigmas` (P,), the
+    displacements and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the
+    parameters. `turn` takes rays of the calibrated camera to those of `camera`."""
+    corners = calibration.corners
     used, count = _enough(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
-    lever = np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
-    x, y, z = lever + corners.translation_mm.T[:, view]
+    lever = turn @ np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
+    x, y, z = lever + turn @ corners.translation_mm.T[:, view]
     by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
     u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
     residuals = corners.residuals_px[used]

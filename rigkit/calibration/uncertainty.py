@@ -25,7 +25,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.departures import Departures
+from rigkit.calibration.departures import Departures, information_of_lens
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
@@ -117,8 +117,10 @@ class FarProjection:
     corners_left : (2, P + J, N) what that leaves, at the corners, of such steps and of the displacements.
     rivals : lenses of other models, each with how the parameters (P,) follow it and the rotation of its rays (3, 3):
         where boards were it is followed, elsewhere the two go apart.
+    calibration : whose it is.
     """
 
+    calibration: Calibration
     camera: Camera
     correlation: FloatArray
     sigmas: FloatArray
@@ -157,6 +159,7 @@ class FarProjection:
         left -= hides.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         return cls(
+            calibration=calibration,
             camera=camera,
             correlation=known / np.outer(safe, safe),
             sigmas=sigmas,
@@ -176,7 +179,30 @@ class FarProjection:
 
     def beyond_model(self, at: Along) -> FloatArray:
         """Return what of the covariance (M, 2, 2) is what the lens may do beyond its model."""
-        return self._beyond(self.left_over(at), at)
+        return self._beyond(self.left_over(at), at) + self._less_sure(at.rays)
+
+    def _less_sure(self, rays: Rays) -> FloatArray:
+        """Return by how much (M, 2, 2) rivals know less of `rays` (M, 3) than the lens chosen: where it is a rival that
+        is right, its own covariance is the true one (Buckland et al. 1997, eq. 9). Where boards were that is nothing;
+        elsewhere a richer model leaves open what the chosen one takes for known."""
+        out = np.zeros((len(rays), 2, 2))
+        if not self.rivals:
+            return out
+        own, *others = self._alone
+        known = own.along(rays)
+        for (rival, _, turn), other in zip(self.rivals, others, strict=True):
+            more = other.along(rays @ turn.T) - known
+            # As with `away`: what one of the two does not see is not compared.
+            values, axes = np.linalg.eigh(np.where(np.isfinite(more).all(axis=(1, 2), keepdims=True), more, 0.0))
+            out += rival.likely * (axes * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(axes, 1, 2)
+        return out
+
+    @cached_property
+    def _alone(self) -> list[_Alone]:
+        """The lens and its rivals, each as if there were no other."""
+        rays = self.corners.rays
+        lenses = [(self.camera, np.eye(3)), *((rival.camera, turn) for rival, _, turn in self.rivals)]
+        return [_Alone.of(self.calibration, camera, turn, rays) for camera, turn in lenses]
 
     def _beyond(self, left: FloatArray, at: Along) -> FloatArray:
         out = _propagated(self.departures.covariance, left)
@@ -235,6 +261,35 @@ class FarProjection:
         p = len(self.sigmas)
         left = self.sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:])
         return _propagated(self.correlation, left)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Alone:
+    """A lens with the covariance (P, P) that it would have by itself for these corners, and the rotations (3, P) that
+    hide its parameters best where boards were."""
+
+    camera: Camera
+    covariance: FloatArray
+    hides: FloatArray
+
+    @classmethod
+    def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays) -> _Alone:
+        """Return it for a `camera` whose rays are those of the calibrated one, of which these are `rays` (N, 3) to
+        corners, after a `turn`."""
+        information = information_of_lens(calibration, camera, turn)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        covariance = symmetric_pinv(information * scale[:, None] * scale) * scale[:, None] * scale
+        sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
+        design, p = projection_design(camera, rays @ turn.T), len(scale)
+        turned = design[:, p:]
+        square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
+        hides = symmetric_pinv(square) @ (turned @ np.swapaxes(design[:, :p], 1, 2)).sum(axis=0)
+        return cls(camera, covariance * sigma**2, hides)
+
+    def along(self, rays: Rays) -> FloatArray:
+        """Return the covariance (M, 2, 2) of the projection along rays (M, 3) of the lens itself."""
+        design, p = projection_design(self.camera, rays), len(self.covariance)
+        return _propagated(self.covariance, design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:]))
 
 
 def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:

@@ -146,7 +146,9 @@ def uncertainty_svg(calibration: Calibration) -> str:
     outline = " ".join(f"{x:.1f},{y:.1f}" for x, y in zoom * outline_of_corners(calibration))
     out.append(f'<polygon points="{outline}" fill="none" stroke="#fff" stroke-width="1.5" stroke-dasharray="6 4"/>')
     out += _numbers(calibration)
-    return "".join([*out, _foot(calibration, words, "dashed: around all corners that were seen")])
+    return "".join(
+        [*out, _foot(calibration, words, "dashed: around all corners that were seen; outside only lens models tell")]
+    )
 
 
 def _contours(worst_px: FloatArray, cell_width: float, cell_height: float) -> str:

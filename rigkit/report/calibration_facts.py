@@ -94,7 +94,7 @@ def _reach(c: Calibration) -> str:
     )
     if not beyond.size:
         return words + "."
-    words += f", and to ±{beyond.max():.2g} px at worst outside"
+    words += f", and to ±{beyond.max():.2g} px at worst outside, if the lens goes on there as lens models do"
     if worst(c.verdicts) is Severity.BAD:
         return words + "."
     if beyond.max() < MAX_RATIO_BEYOND * far.worst_px:

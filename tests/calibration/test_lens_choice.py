@@ -17,8 +17,8 @@ from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved
-from rigkit.calibration.result import Convergence
-from rigkit.calibration.uncertainty import FarProjection, followed, projection_design
+from rigkit.calibration.result import Convergence, Rival
+from rigkit.calibration.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model
 from rigkit.core.progress import silent
@@ -159,6 +159,25 @@ def test_models_in_doubt_widen_the_sigmas_by_their_difference(monkeypatch: pytes
         np.nanmax(FarProjection.of(found).at_corners_px ** 2 - FarProjection.of(alone).at_corners_px ** 2)
     )
     assert 0.0 < widened < differ
+
+
+def test_where_no_board_was_a_richer_rival_counts_with_what_it_leaves_open() -> None:
+    views, *_ = random_views(lens("reg"), 12, np.random.default_rng(1), reach_deg=20.0)
+    found, richer = (calibrate(views, SIZE, model="scaramuzza", degree=n, board="flat", folds=0) for n in (4, 6))
+    unsure = replace(found, rivals=(Rival("scaramuzza 6", richer.camera, 0.5),))
+    alone, both, own = (FarProjection.of(one) for one in (found, unsure, richer))
+    rim, _ = found.camera.unproject(np.array([[208.0, 615.0], [1408.0, 615.0], [808.0, 40.0], [400.0, 200.0]]))
+    known, open_ = (
+        worst_direction(one.covariance(rim) - one.beyond_model(Along.of(one.camera, rim))) for one in (alone, own)
+    )
+    assert (open_ > 1.5 * known).all()
+    away = 0.5 * np.array([np.outer(d, d) for d in both.away(Along.of(found.camera, rim))[0][1]])
+    added = worst_direction(both.covariance(rim) - alone.covariance(rim) - away) ** 2
+    assert added == pytest.approx(0.5 * (open_**2 - known**2), rel=0.3)
+    # Where boards were it knows nearly as much.
+    there = both.corners.rays
+    sizes = [np.trace(one.covariance(there), axis1=1, axis2=2).mean() for one in (alone, both)]
+    assert sizes[0] <= sizes[1] < 1.5 * sizes[0]
 
 
 def test_errors_name_the_camera_of_a_rig() -> None:
