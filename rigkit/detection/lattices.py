@@ -29,8 +29,10 @@ from rigkit.detection.lattice.grow import grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
+from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import find_corners
+from rigkit.detection.subpixel.evened import evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
@@ -41,6 +43,9 @@ MIN_PART_CORNERS = 6
 
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
+
+SAME_PX = 4.0
+"""Corners of one board placed in two ways lie nearer than this, px: strong blur moves them so much at most."""
 
 MORE_EVIDENCE = 0.5
 """The second fit of small squares adds no more to the score of the evidence: on 21 boards, blurred by up to 4 px, from
@@ -87,11 +92,55 @@ def candidates(
 def fitted(
     grey: GreyImage, boards: Sequence[Lattice], min_corners: int, sizes: Sequence[tuple[int, int]]
 ) -> list[RefinedLattice]:
-    """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch."""
+    """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch.
+
+    Those whose blur is uneven are fitted where it is made even (`RefinedLattice.picture`).
+    """
+    refined = refine(grey, boards, _may_be(sizes))
+    found = _fitted(grey, boards, refined, min_corners, sizes)
+    for board, item in zip(boards, refined, strict=True):
+        picture = evened(grey, board, item)
+        if picture is None:
+            continue
+        there = [replace(board, pixels=picture.of(board.pixels))]
+        room = sizes if len(found) < len(sizes) else ()
+        again = refine(picture.grey, there, _may_be(room))
+        found = _with_better(
+            found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, min_corners, room)]
+        )
+    return found
+
+
+def _may_be(sizes: Sequence[tuple[int, int]]) -> Callable[[RefinedLattice], bool]:
+    least_score = -MORE_EVIDENCE - (OF_EXPECTED_SIZE if sizes else 0.0)
+    return lambda item: Evidence.of(item).score > least_score
+
+
+def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
+    """Return `found` with `others` instead of those that are mostly of the same corners, and have no more of them."""
+    for item in others:
+        mine = item.lattice.pixels[item.lattice.known]
+        same = [
+            one
+            for one in found
+            if 2 * int(np.count_nonzero(near_any(one.lattice.pixels[one.lattice.known], mine, SAME_PX)))
+            > one.lattice.count
+        ]
+        if sum(one.lattice.count for one in same) <= item.lattice.count:
+            found = [one for one in found if not any(one is other for other in same)] + [item]
+    return found
+
+
+def _fitted(
+    grey: GreyImage,
+    boards: Sequence[Lattice],
+    refined: Sequence[RefinedLattice],
+    min_corners: int,
+    sizes: Sequence[tuple[int, int]],
+) -> list[RefinedLattice]:
+    """Return those of `refined` (what the fit left of `boards`) that are boards, each by itself."""
     size_px = (grey.shape[1], grey.shape[0])
     out = []
-    least_score = -MORE_EVIDENCE - (OF_EXPECTED_SIZE if sizes else 0.0)
-    refined = refine(grey, boards, lambda item: Evidence.of(item).score > least_score)
     for item in _confirmed(grey, boards, refined, min_corners, sizes):
         own = without_outliers(item, size_px)
         parts = (
@@ -104,7 +153,8 @@ def fitted(
             continue
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
-        out += fitted(grey, [part for part in alone if large(part, min_corners)], min_corners, sizes)
+        own_parts = [part for part in alone if large(part, min_corners)]
+        out += _fitted(grey, own_parts, refine(grey, own_parts, _may_be(sizes)), min_corners, sizes)
     return out
 
 
@@ -158,5 +208,11 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], lambda item: Evidence.of(item).score > -MORE_EVIDENCE)
-    return trustworthy(refined, sample.count, 0)
+    (refined,) = refine(grey, [sample], _may_be(()))
+    if trustworthy(refined, sample.count, 0):
+        return True
+    picture = evened(grey, sample, refined)
+    if picture is None:
+        return False
+    (again,) = refine(picture.grey, [replace(sample, pixels=picture.of(sample.pixels))], _may_be(()))
+    return trustworthy(again, sample.count, 0)

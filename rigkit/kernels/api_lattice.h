@@ -60,7 +60,7 @@ typedef struct {
     ARRAY(const float, circle, TURN, 2);
     ARRAY(const double, gains, gain_count);
     int64_t gain_count;
-    double most_odd, most_centre, most_cosine, quick_odd, quick_centre, quick_sharp;
+    double most_odd, most_centre, even_odd, even_centre, most_cosine, quick_odd, quick_centre, quick_even, quick_sharp;
 } ring_rules_t;
 
 EXPORT int64_t find_corners(

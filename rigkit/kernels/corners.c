@@ -38,8 +38,9 @@ INLINE int may_be_corner(
     for (int64_t k = 0; k < PAIRS; k++)
         energy += (even[k] - mean) * (even[k] - mean);
     const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)PAIRS;
+    const double most_centre = odd_energy < (float)rules->even_odd * energy ? rules->quick_even : rules->quick_centre;
     return odd_energy < (float)rules->quick_odd * energy &&
-           centre * centre < (float)(rules->quick_centre * rules->quick_centre) * variance &&
+           centre * centre < (float)(most_centre * most_centre) * variance &&
            response < (float)rules->quick_sharp * variance;
 }
 

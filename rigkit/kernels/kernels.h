@@ -159,7 +159,8 @@ INLINE int read_ring(
     }
     if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
         return 0;
-    if (!(fabsf(brightness_at(image, u, v) - mean) < (float)rules.most_centre * (high - low)))
+    const double most_centre = odd_energy < (float)rules.even_odd * energy ? rules.even_centre : rules.most_centre;
+    if (!(fabsf(brightness_at(image, u, v) - mean) < (float)most_centre * (high - low)))
         return 0;
     const float middle = 0.5f * (low + high);
     int64_t rises = 0;

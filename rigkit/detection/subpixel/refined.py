@@ -9,6 +9,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.lattice import Lattice, padded, turned
+from rigkit.detection.subpixel.resampled import Resampled
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,6 +24,7 @@ class RefinedLattice:
     scatter : factor by which `sigma_px` was raised, because the corners scatter about the lattice by so much more than
         the noise in the image explains.
     correlated : the same, because neighbouring pixels share noise (`correlation.sigma_factors`).
+    picture : what its corners were placed in, where that is not the image itself.
     """
 
     lattice: Lattice
@@ -33,6 +35,7 @@ class RefinedLattice:
     _: KW_ONLY
     scatter: float = 1.0
     correlated: float = 1.0
+    picture: Resampled | None = None
 
     @property
     def worst_sigma_px(self) -> FloatArray:
@@ -74,6 +77,19 @@ class RefinedLattice:
         scatter = max(self.scatter, other.scatter)
         rest = (np.where(known, *pair) for pair in pairs)
         return replace(self._of(self.lattice.filled(other.lattice), rest), scatter=scatter)
+
+    def within(self, picture: Resampled) -> RefinedLattice:
+        """Return this as it lies in `picture`, a part of the image."""
+        return self._moved(picture.of(self.lattice.pixels), 1.0 / picture.sigma_factor, None)
+
+    def out_of(self, picture: Resampled) -> RefinedLattice:
+        """Return this, which lies in `picture`, as it lies in the image."""
+        return self._moved(picture.back(self.lattice.pixels), picture.sigma_factor, picture)
+
+    def _moved(self, pixels: FloatArray, factor: float, picture: Resampled | None) -> RefinedLattice:
+        lattice = replace(self.lattice, pixels=pixels)
+        sigma_px, blur_px = factor * self.sigma_px, factor * self.blur_px
+        return replace(self, lattice=lattice, sigma_px=sigma_px, blur_px=blur_px, picture=picture)
 
     def _values(self) -> tuple[FloatArray, ...]:
         return (self.sigma_px, self.blur_px, self.residual, self.noise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.origin import quarter_turns
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.resampled import Resampled
 from rigkit.detection.targets.base import Finder, Search
 
 SEEN_OF_LINE = 0.5
@@ -28,15 +30,39 @@ class ChessboardFinder(Finder):
     """All lattices that no other target has taken, whatever their size."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        sizes = tuple(dict.fromkeys(board.size for board in boards))
-        lattices = [known_part(item, sizes) for item in search.lattices]
-        placed = _placed(search.grey, lattices, boards, search.camera)
-        turned = [item.turned(quarter_turns(item.lattice, sizes)) for item in placed]
-        every = [completed(search.grey, _detection(item), boards, search.camera) for item in turned]
-        if search.quick:
-            return every
-        pairs = zip(every, turned, strict=True)
-        return [relit(search.grey, item, refined) for item, refined in pairs]
+        if search.camera is not None:
+            # It says where corners are in the image itself.
+            return _in_image(search.grey, search.lattices, boards, search.camera, quick=search.quick)
+        out = _in_image(
+            search.grey, [item for item in search.lattices if item.picture is None], boards, quick=search.quick
+        )
+        for item in search.lattices:
+            if (picture := item.picture) is not None:
+                there = _in_image(picture.grey, [item.within(picture)], boards, quick=search.quick)
+                out += [_out_of(picture, found) for found in there]
+        return out
+
+
+def _in_image(
+    grey: GreyImage,
+    found: Sequence[RefinedLattice],
+    boards: Sequence[Board],
+    camera: Camera | None = None,
+    *,
+    quick: bool,
+) -> list[BoardDetection]:
+    """Return the boards that the lattices `found` in an image are, on their grids, completed."""
+    sizes = tuple(dict.fromkeys(board.size for board in boards))
+    lattices = [known_part(item, sizes) for item in found]
+    placed = _placed(grey, lattices, boards, camera)
+    turned = [item.turned(quarter_turns(item.lattice, sizes)) for item in placed]
+    every = [completed(grey, _detection(item), boards, camera) for item in turned]
+    return every if quick else [relit(grey, *pair) for pair in zip(every, turned, strict=True)]
+
+
+def _out_of(picture: Resampled, found: BoardDetection) -> BoardDetection:
+    """Return what was found in a part of an image as it lies in the image."""
+    return replace(found, pixels=picture.back(found.pixels), sigma_px=picture.sigma_factor * found.sigma_px)
 
 
 def _placed(

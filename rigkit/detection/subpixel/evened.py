@@ -1,0 +1,52 @@
+"""Images in which a board is blurred alike in all directions, by about as much as its fit is made for.
+
+A camera that moves blurs edges across its way and leaves those along it sharp; one far out of focus blurs by more than
+windows reach. Corners are placed by edges of one blur. Where a board's is of another shape, or too wide, the image is
+resampled so that it is even: across the motion it is stretched, along it made smaller, and nothing of what blur has left
+is lost. To the search and to the fit the board is one that is seen aslant.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import known_median
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.blur_shape import blur_covariance
+from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.resampled import Resampled, resampled
+
+LOOKED_AT_PX = 1.5
+"""Boards whose edges are as wide, s, are looked at: below, a motion is less than twice the blur that it is added to."""
+
+UNEVEN, WIDE_PX = 1.5, 4.5
+"""Blur is made even where its s in one direction is so many times that in the other; or so many px, where windows of
+18 px begin to end within the edges (`edge_fit.BLUR_RANGE`)."""
+
+SHARPEST_PX, SQUARE_PX = 1.5, 9.0
+"""Smallest s that it is made, and the smallest square, as far as that is not smaller in the image itself: as of
+`whole_board`."""
+
+LEAST_PX = 0.5
+"""No lens and pixel blur by less; what is measured across a long motion may be anything below."""
+
+
+def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resampled | None:
+    """Return the part of `image` around a board with its blur made even; None where that is so, or nearly.
+
+    `lattice` : its corners as they were found; `refined` : what the fit with even blur made of them.
+    """
+    blur = known_median(refined.blur_px) if refined.lattice.count else 0.0
+    if not blur > LOOKED_AT_PX:
+        return None
+    variances, axes = np.linalg.eigh(blur_covariance(image, lattice, blur))
+    widths = np.sqrt(np.maximum(variances, LEAST_PX**2))
+    if widths[1] < UNEVEN * widths[0] and widths[1] < WIDE_PX:
+        return None
+    # Symmetric: what is upright stays nearly so.
+    per_blur = (axes / widths) @ axes.T
+    sides = np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ per_blur.T, axis=2)
+    square = float(np.quantile(sides, 0.1))
+    return resampled(image, lattice, max(SHARPEST_PX, min(SQUARE_PX / square, float(widths[1]))) * per_blur)

@@ -1,0 +1,66 @@
+"""Parts of an image, resampled: stretched along one direction and made smaller along another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from rigkit.core.arrays import FloatArray
+from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.lattice.local_fit import fit_cells
+from rigkit.detection.saddles.response import FloatImage, GreyImage
+
+MARGIN_CELLS = 3.0
+"""What is resampled goes on so many squares beyond the corners."""
+
+MOST_PIXELS = 4e6
+"""Of what is resampled."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Resampled:
+    """A part of an image, resampled: its pixel is `matrix` @ pixel + `offset`.
+
+    Attributes
+    ----------
+    grey : grey levels 0..255.
+    matrix, offset : (2, 2) and (2,).
+    """
+
+    grey: FloatImage
+    matrix: FloatArray
+    offset: FloatArray
+
+    @property
+    def sigma_factor(self) -> float:
+        """Standard deviation per axis (rms) in the image of what has one of 1 in both directions here."""
+        return float(np.linalg.norm(np.linalg.inv(self.matrix)) / np.sqrt(2.0))
+
+    def of(self, pixels: FloatArray) -> FloatArray:
+        """Return where `pixels` (..., 2) of the image are here."""
+        return np.asarray(pixels @ self.matrix.T + self.offset)
+
+    def back(self, pixels: FloatArray) -> FloatArray:
+        """Return where `pixels` (..., 2) of this are in the image."""
+        return np.asarray((pixels - self.offset) @ np.linalg.inv(self.matrix).T)
+
+
+def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray) -> Resampled | None:
+    """Return the part of `image` around `lattice` as `matrix` maps it; None where that is too large."""
+    corners = lattice.pixels[lattice.known] @ matrix.T
+    side = float(np.median(np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ matrix.T, axis=2)))
+    low = np.floor(corners.min(axis=0) - MARGIN_CELLS * side)
+    size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
+    # Finer first, so that no pixel of the image is skipped, then means.
+    fine = int(np.ceil(1.0 / np.linalg.svd(matrix)[1].min()))
+    if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MOST_PIXELS:
+        return None
+    # Pixel k of the image covers the finer ones from fine * k on: its middle is (fine - 1) / 2 further.
+    there = np.column_stack([fine * matrix, -fine * low + 0.5 * (fine - 1.0)])
+    columns, rows = (size * fine).tolist()
+    values = image.astype(np.float32)
+    drawn = cv2.warpAffine(values, there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey = cv2.resize(drawn, size.tolist(), interpolation=cv2.INTER_AREA) if fine > 1 else drawn
+    return Resampled(np.asarray(grey, np.float32), matrix, -low)
