@@ -104,7 +104,7 @@ def fitted(
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
         room = sizes if len(found) < len(sizes) else ()
-        again = refine(picture.grey, there, _may_be(room))
+        again = refine(picture.grey, there, _may_be(room), radius_px=picture.radius_px)
         found = _with_better(
             found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, min_corners, room)]
         )
@@ -214,5 +214,6 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     picture = evened(grey, sample, refined)
     if picture is None:
         return False
-    (again,) = refine(picture.grey, [replace(sample, pixels=picture.of(sample.pixels))], _may_be(()))
+    there = [replace(sample, pixels=picture.of(sample.pixels))]
+    (again,) = refine(picture.grey, there, _may_be(()), radius_px=picture.radius_px)
     return trustworthy(again, sample.count, 0)

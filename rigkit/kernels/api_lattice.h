@@ -67,7 +67,7 @@ EXPORT int64_t find_corners(
     image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp,
     ARRAY(const int32_t, peaks, count, 2), ARRAY(const float, response, count), int64_t count,
     ARRAY(double, saddles, count, 2), ARRAY(int64_t, which, count), ARRAY(double, angles, count + 1, 2),
-    ARRAY(double, contrast, count + 1), ARRAY(int64_t, found, 1));
+    ARRAY(double, contrast, count + 1), ARRAY(uint8_t, smeared, count + 1), ARRAY(int64_t, found, 1));
 EXPORT int64_t mark_known(
     ARRAY(const double, fresh, count, 2), int64_t count, ARRAY(const double, known, known_count, 2), int64_t known_count,
     double reach, ARRAY(uint8_t, mark, count));

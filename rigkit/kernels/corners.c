@@ -46,11 +46,11 @@ INLINE int may_be_corner(
 
 /* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
  * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
- * than `most_sharp`. Returns the number of saddles and, in `found`, of corners. */
+ * than `most_sharp`; `smeared` says which of these only motion explains. Returns the number of saddles and, in `found`, of corners. */
 FOR_EACH_PROCESSOR int64_t find_corners(
     image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
     const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
-    int64_t *found)
+    uint8_t *smeared, int64_t *found)
 {
     int64_t near = 0, corners = 0;
     for (int64_t k = 0; k < count; k++) {
@@ -58,9 +58,13 @@ FOR_EACH_PROCESSOR int64_t find_corners(
         if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
             continue;
         near++;
-        if (may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]) &&
-            read_ring(image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
-                      angles + 2 * corners, contrast + corners))
+        if (!may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]))
+            continue;
+        const int ring = read_ring(
+            image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
+            angles + 2 * corners, contrast + corners);
+        smeared[corners] = ring == 2;
+        if (ring)
             which[corners++] = near - 1;
     }
     *found = corners;

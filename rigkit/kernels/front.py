@@ -135,19 +135,20 @@ def corners(
     most_step: float,
     most_sharp: float,
     rules: RingRules,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast."""
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
+    """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast, and
+    whether only motion explains their middle."""
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
     count, found = len(at), np.zeros(1, np.int64)
     pixels, which = np.empty((count, 2)), np.empty(count, np.int64)
     # A ring is read before it is known whether it is kept.
-    angles, contrast = np.empty((count + 1, 2)), np.empty(count + 1)
+    angles, contrast, smeared = np.empty((count + 1, 2)), np.empty(count + 1), np.empty(count + 1, np.uint8)
     near = kernels().find_corners(
         *(ImageOf.make(smooth), rules, radius, most_step, most_sharp),
-        *(at, response, count, pixels, which, angles, contrast, found),
+        *(at, response, count, pixels, which, angles, contrast, smeared, found),
     )
     size = int(found[0])
-    return pixels[:near], which[:size], angles[:size], contrast[:size]
+    return pixels[:near], which[:size], angles[:size], contrast[:size], smeared[:size] > 0
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:

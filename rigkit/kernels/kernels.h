@@ -115,7 +115,7 @@ INLINE void ring_angles(
 }
 
 /* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
- * its contrast (reference.front.read_rings). */
+ * its contrast (reference.front.read_rings); 2 where only motion explains how bright its middle is. */
 INLINE int read_ring(
     const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
     double *contrast)
@@ -159,8 +159,9 @@ INLINE int read_ring(
     }
     if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
         return 0;
-    const double most_centre = odd_energy < (float)rules.even_odd * energy ? rules.even_centre : rules.most_centre;
-    if (!(fabsf(brightness_at(image, u, v) - mean) < (float)most_centre * (high - low)))
+    const float off = fabsf(brightness_at(image, u, v) - mean) / (high - low);
+    const int smeared = !(off < (float)rules.most_centre);
+    if (smeared && !(off < (float)rules.even_centre && odd_energy < (float)rules.even_odd * energy))
         return 0;
     const float middle = 0.5f * (low + high);
     int64_t rises = 0;
@@ -170,7 +171,7 @@ INLINE int read_ring(
         return 0;
     ring_angles(image, &rules, u, v, radius, even, angles);
     *contrast = (double)high - (double)low;
-    return 1;
+    return 1 + smeared;
 }
 
 /* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be

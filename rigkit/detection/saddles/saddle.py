@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level, peaks
 from rigkit.detection.saddles.ring import ring_rules
@@ -55,6 +55,10 @@ class Corners:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def of(self, which: BoolArray) -> Corners:
+        """Return those `which` (N,)."""
+        return Corners(self.pixels[which], self.angles[which], self.contrast[which], self.scale[which])
+
 
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles.
@@ -62,18 +66,24 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
     `finer` : those of the levels before, if only coarser `levels` are to be looked at.
     """
     kept = [] if finer is None else [finer]
+    moved: list[Corners] = []
     saddles: list[FloatArray] = []
     for level in levels:
-        local, which, angles, contrast = _corners_of(level)
+        local, which, angles, contrast, smeared = _corners_of(level)
         full = level.to_full(local)
         saddles.append(full)
         fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
+        kept.append(_without_known(fresh.of(~smeared), kept))
+        moved.append(fresh.of(smeared))
+    # A coarser level may show what is smeared on a finer one as it should be.
+    for fresh in moved:
         kept.append(_without_known(fresh, kept))
     return _joined(kept), Saddles(np.concatenate(saddles))
 
 
-def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
-    """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast."""
+def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
+    """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast, and
+    whether only motion explains their middle."""
     at, response = peaks(level)
     return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
 
@@ -84,7 +94,7 @@ def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
         return fresh
     before = np.concatenate([k.pixels for k in known])
     new = ~near_any(fresh.pixels, before, KNOWN_PX * float(fresh.scale[0]))
-    return Corners(fresh.pixels[new], fresh.angles[new], fresh.contrast[new], fresh.scale[new])
+    return fresh.of(new)
 
 
 def _joined(parts: list[Corners]) -> Corners:

@@ -17,13 +17,18 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.blur_shape import blur_covariance
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.resampled import Resampled, resampled
+from rigkit.detection.subpixel.subpixel import LAST_PASS
 
 LOOKED_AT_PX = 1.5
 """Boards whose edges are as wide, s, are looked at: below, a motion is less than twice the blur that it is added to."""
 
-UNEVEN, WIDE_PX = 1.5, 4.5
-"""Blur is made even where its s in one direction is so many times that in the other; or so many px, where windows of
-18 px begin to end within the edges (`edge_fit.BLUR_RANGE`)."""
+UNEVEN, WIDE_PX = 1.5, 3.0
+"""Blur is made even where its s in one direction is so many times that in the other; or so many px: noise that
+was there before the blur, and what the print and the codec do, is then alike over more pixels than `correlation` looks
+at, and windows begin to end within the edges."""
+
+WINDOW_BLURS = 5.0
+"""Windows reach so many s, at least: at three there is the end of an edge."""
 
 SHARPEST_PX, SQUARE_PX = 1.5, 9.0
 """Smallest s that it is made, and the smallest square, as far as that is not smaller in the image itself: as of
@@ -49,4 +54,7 @@ def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resam
     per_blur = (axes / widths) @ axes.T
     sides = np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ per_blur.T, axis=2)
     square = float(np.quantile(sides, 0.1))
-    return resampled(image, lattice, max(SHARPEST_PX, min(SQUARE_PX / square, float(widths[1]))) * per_blur)
+    even = max(SHARPEST_PX, min(SQUARE_PX / square, float(widths[1])))
+    # As large as in the image, where windows there are large enough.
+    radius_px = max(even / float(np.sqrt(widths.prod())) * LAST_PASS[0], WINDOW_BLURS * even)
+    return resampled(image, lattice, even * per_blur, min(radius_px, LAST_PASS[0]))

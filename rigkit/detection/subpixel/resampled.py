@@ -15,8 +15,11 @@ from rigkit.detection.saddles.response import FloatImage, GreyImage
 MARGIN_CELLS = 3.0
 """What is resampled goes on so many squares beyond the corners."""
 
-MOST_PIXELS = 4e6
-"""Of what is resampled."""
+STEP_PX = 2.0
+"""It is read at places so far apart, px of the image, at most: what blur has made smaller has nothing finer in it."""
+
+MOST_PIXELS = 1.6e7
+"""Larger parts are not resampled."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,11 +30,13 @@ class Resampled:
     ----------
     grey : grey levels 0..255.
     matrix, offset : (2, 2) and (2,).
+    radius_px : pixels further from a corner are not used to place it.
     """
 
     grey: FloatImage
     matrix: FloatArray
     offset: FloatArray
+    radius_px: float
 
     @property
     def sigma_factor(self) -> float:
@@ -47,20 +52,21 @@ class Resampled:
         return np.asarray((pixels - self.offset) @ np.linalg.inv(self.matrix).T)
 
 
-def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray) -> Resampled | None:
+def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px: float) -> Resampled | None:
     """Return the part of `image` around `lattice` as `matrix` maps it; None where that is too large."""
     corners = lattice.pixels[lattice.known] @ matrix.T
     side = float(np.median(np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ matrix.T, axis=2)))
     low = np.floor(corners.min(axis=0) - MARGIN_CELLS * side)
     size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
-    # Finer first, so that no pixel of the image is skipped, then means.
-    fine = int(np.ceil(1.0 / np.linalg.svd(matrix)[1].min()))
+    # Finer first, then means.
+    fine = int(np.ceil(1.0 / (STEP_PX * np.linalg.svd(matrix)[1].min())))
     if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MOST_PIXELS:
         return None
-    # Pixel k of the image covers the finer ones from fine * k on: its middle is (fine - 1) / 2 further.
+    # The middle of a pixel lies in the middle of the finer ones.
     there = np.column_stack([fine * matrix, -fine * low + 0.5 * (fine - 1.0)])
     columns, rows = (size * fine).tolist()
-    values = image.astype(np.float32)
-    drawn = cv2.warpAffine(values, there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    drawn = cv2.warpAffine(
+        image.astype(np.float32), there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     grey = cv2.resize(drawn, size.tolist(), interpolation=cv2.INTER_AREA) if fine > 1 else drawn
-    return Resampled(np.asarray(grey, np.float32), matrix, -low)
+    return Resampled(np.asarray(grey, np.float32), matrix, -low, radius_px)

@@ -73,13 +73,17 @@ of these that are a tenth of a square off."""
 
 
 def refine(
-    image: GreyImage, lattices: Sequence[Lattice], may_be: Callable[[RefinedLattice], bool] = lambda _: True
+    image: GreyImage,
+    lattices: Sequence[Lattice],
+    may_be: Callable[[RefinedLattice], bool] = lambda _: True,
+    *,
+    radius_px: float = LAST_PASS[0],
 ) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
     Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
     confirms are added. Lattices with small squares that `may_be` no boards, as far as one fit tells, are not fitted
-    once more.
+    once more. Pixels further from a corner than `radius_px` are not used.
     """
     if not lattices:
         return []
@@ -89,7 +93,7 @@ def refine(
     first = _first_pass(image, start, sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
     blur = _typical_blur(first, sheet.parts)
-    last, reached, factors = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts)
+    last, reached, factors = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts, radius_px)
     for part in sheet.parts if reached.any() else ():
         # Clutter in the background is small, and would cost as much as the board.
         mine = last.cut(*part)
@@ -98,7 +102,7 @@ def refine(
         # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
         once = last.without(~reached)
         blur = _typical_blur(once, sheet.parts)
-        again, _, others = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts)
+        again, _, others = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts, radius_px)
         factors = np.where([reached[part].any() for part in sheet.parts], others, factors)
         last = last.without(reached).filled(again)
     if holes.any():
@@ -157,6 +161,7 @@ def _last_pass(
     blur: FloatArray,
     sigma_px: FloatArray,
     parts: Sequence[Part],
+    radius_px: float,
 ) -> tuple[RefinedLattice, BoolArray, FloatArray]:
     """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out. Say (R, C) which
     are of boards whose neighbouring lines reach into the windows, and (P,) how correlated noise raises sigmas.
@@ -165,7 +170,7 @@ def _last_pass(
     """
     known = start.known
     shape = fit_cells(start.pixels, known)
-    radius_px, iterations, converged_px = LAST_PASS
+    _, iterations, converged_px = LAST_PASS
     curvature, curvature_sigma = line_bends_to_fit(start.pixels, sigma_px, known, shape.sides, radius_px)
     owner = np.zeros(known.shape, np.int64)
     for k, part in enumerate(parts):
