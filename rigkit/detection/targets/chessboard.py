@@ -39,7 +39,8 @@ class ChessboardFinder(Finder):
         for item in search.lattices:
             if (picture := item.picture) is not None:
                 there = _in_image(picture.grey, [item.within(picture)], boards, quick=search.quick)
-                out += [_out_of(picture, found) for found in there]
+                # What is too much aslant there may still be seen in the image itself.
+                out += [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
         return out
 
 
