@@ -31,7 +31,7 @@ from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
-from rigkit.detection.subpixel.subpixel import unsure
+from rigkit.detection.subpixel.unsure import strays
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -157,7 +157,7 @@ def _with_added(
     """Return `found` with those corners of `state` that it has not, but for any that contradict the others."""
     state = _together(image, guide.board, _settled(image, guide.board, state, state.known & ~opened.known))
     added = state.known & ~opened.known & (_contradiction(guide, state, state) <= 1.0)
-    added &= ~unsure(state.sigma_px)
+    added &= ~_strays(state)
     sigma = _known_factor(found, state if state.together else opened) * state.sigma_px
     row, column = np.nonzero(added)
     grid = np.concatenate([found.grid, np.stack([column, row], axis=-1)])
@@ -168,6 +168,16 @@ def _with_added(
         pixels=np.concatenate([found.pixels, state.pixels[row, column]])[order],
         sigma_px=np.concatenate([found.sigma_px, sigma[row, column]])[order],
     )
+
+
+def _strays(state: BoardState) -> BoolArray:
+    """Return which corners of `state` are unsure, and not where the others have them."""
+    known = state.known
+    shape = fit_cells(state.pixels, known, leave_out=True)
+    off, gain = np.full((2, *known.shape), np.nan)
+    off[known] = np.linalg.norm(state.pixels[known] - shape.pixels, axis=1) / shape.cell_px()
+    gain[known] = shape.gain
+    return strays(state.sigma_px, off, gain)
 
 
 def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray) -> BoardState:

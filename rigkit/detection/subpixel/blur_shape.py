@@ -24,7 +24,7 @@ LARGE_SQUARES = 7.0
 """Squares of more s are taken to be of so many: what is looked at around a corner is the same."""
 
 REACH = np.linspace(-0.6, 0.6, 9)
-"""Where brightness is read around a corner, in squares along both sides: beyond lie other things, at the board's end."""
+"""Where brightness is read around a corner, in squares along both sides: at the board's end other things lie beyond."""
 
 MOST_CORNERS = 64
 """Corners that are looked at: more tell no more."""

@@ -2,8 +2,8 @@
 
 A camera that moves blurs edges across its way and leaves those along it sharp; one far out of focus blurs by more than
 windows reach. Corners are placed by edges of one blur. Where a board's is of another shape, or too wide, the image is
-resampled so that it is even: across the motion it is stretched, along it made smaller, and nothing of what blur has left
-is lost. To the search and to the fit the board is one that is seen aslant.
+resampled so that it is even: across the motion it is stretched, along it made smaller, and nothing is lost of what blur
+has left. To the fit the board is one that is seen aslant.
 """
 
 from __future__ import annotations

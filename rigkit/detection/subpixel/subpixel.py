@@ -12,7 +12,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, known_median, upper_median
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
@@ -23,6 +23,7 @@ from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geom
 from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
+from rigkit.detection.subpixel.unsure import strays
 
 Part = tuple[slice, slice]
 
@@ -63,13 +64,6 @@ COVERED_OFF = 3.5
 off by this times the typical deviation, is covered in part, by the edge of a ruler or of a hand: its sides are not
 alike. On rendered boards under a ruler the factor is 12 and more, on boards with marks in their squares seldom 6; the
 noise is 0.065 and more. Glare on single squares of blurred boards, where little other noise is left, makes 0.04."""
-
-UNSURE_TIMES, NEARBY_CELLS, IN_PLACE_CELLS = 6.0, 2, 0.05
-"""A corner with so many times the sigma that is usual on its board, and so near to it, in cells (where a board is seen
-aslant, or in the dark, many are less sure), mostly has something else in its window. It is claimed only where the
-others have it, within so many cells: by the board's usual sigma alone, of 5736 corners of REAL boards all are, of 5566
-with the edge of a hard shadow on the board all but 5, of 16 000 of half-covered boards all but 30, and none of the 17
-of these that are a tenth of a square off."""
 
 
 def refine(
@@ -282,13 +276,14 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
     judged[known] = (shape.support >= MIN_CHECKED) & (shape.gain < 1.5)
     cells = spread(distance / shape.cell_px())
     excess = spread(distance / (item.sigma_px[known] * np.hypot(1.0, shape.gain)))
+    gain = spread(shape.gain)
     relative = item.noise / item.lattice.contrast
     drop = np.zeros_like(known)
     for part in parts:
         here, sure = known[part], judged[part]
         if here.sum() < MIN_CHECKED:
             continue
-        drop[part] = unsure(item.sigma_px[part]) & ~(cells[part] < IN_PLACE_CELLS)
+        drop[part] = strays(item.sigma_px[part], cells[part], gain[part])
         if sure.sum() < MIN_JUDGED:
             continue
         typical = upper_median(cells[part][sure])
@@ -297,16 +292,3 @@ def _checked(item: RefinedLattice, parts: Sequence[Part]) -> RefinedLattice:
         covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * usual)
         drop[part] |= sure & (outlying | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item
-
-
-def unsure(sigma_px: FloatArray) -> BoolArray:
-    """Return which corners of a board are much less sure than others, and those around them; `sigma_px` (R, C), NaN
-    where unknown."""
-    with np.errstate(invalid="ignore"):
-        out = np.asarray(sigma_px > UNSURE_TIMES * known_median(sigma_px))
-    if out.any():
-        reach = 2 * NEARBY_CELLS + 1
-        padded = np.pad(sigma_px, NEARBY_CELLS, constant_values=np.nan)
-        around = np.lib.stride_tricks.sliding_window_view(padded, (reach, reach))[out]
-        out[out] = sigma_px[out] > UNSURE_TIMES * np.nanmedian(around, axis=(1, 2))
-    return out

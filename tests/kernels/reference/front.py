@@ -28,11 +28,14 @@ from rigkit.detection.lattice.links import (
 from rigkit.detection.saddles.response import FloatImage, GreyImage, Level, sample
 from rigkit.detection.saddles.ring import (
     CIRCLE,
+    EVEN_CENTRE,
+    EVEN_ODD,
     GAINS,
     MAX_CENTRE,
     MAX_COSINE,
     MAX_ODD,
     QUICK_CENTRE,
+    QUICK_EVEN_CENTRE,
     QUICK_ODD,
     QUICK_SHARP,
     _gains,
@@ -109,14 +112,14 @@ def corners(
     most_step: float,
     most_sharp: float,
     rules: RingRules,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
     assert most_step == MAX_STEP and rules.most_odd == MAX_ODD
     found, near = saddle_step(smooth, at)
     found, response = found[near], response[near]
     which = np.flatnonzero(may_be_corners(smooth, found, radius, response))
     rings = read_rings(smooth, found[which], radius)
     good = rings.valid & (response[which] <= most_sharp * rings.contrast**2)
-    return found, which[good], rings.angles[good], rings.contrast[good]
+    return found, which[good], rings.angles[good], rings.contrast[good], rings.smeared[good]
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
@@ -204,11 +207,13 @@ class Rings:
     angles : (N, 2) rad, lines A and B as in `Corners`.
     contrast : (N,) bright minus dark, grey levels.
     valid : (N,) looks like a chessboard corner; the other values are undefined elsewhere.
+    smeared : (N,) only motion explains how bright the middle is.
     """
 
     angles: FloatArray
     contrast: FloatArray
     valid: BoolArray
+    smeared: BoolArray
 
 
 def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, response: FloatImage) -> BoolArray:
@@ -221,9 +226,8 @@ def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, resp
     variance = even.var(axis=1)
     odd = 0.25 * ((one - other) ** 2).mean(axis=1)
     off = np.abs(sample(image, places) - mean)
-    possible = (
-        (odd < QUICK_ODD * variance) & (off**2 < QUICK_CENTRE**2 * variance) & (response < QUICK_SHARP * variance)
-    )
+    most = np.where(odd < EVEN_ODD * variance, QUICK_EVEN_CENTRE, QUICK_CENTRE)
+    possible = (odd < QUICK_ODD * variance) & (off**2 < most**2 * variance) & (response < QUICK_SHARP * variance)
     return np.asarray(possible, dtype=np.bool_)
 
 
@@ -244,13 +248,16 @@ def read_rings(
     middle = 0.5 * (low + high)
     mean = even.mean(axis=1)
     spread = even - mean[:, None]
-    symmetric = (odd**2).sum(axis=1) < max_odd * (spread**2).sum(axis=1)
-    balanced = np.abs(sample(image, pixels) - mean) < max_centre * (high - low)
+    odd_energy, energy = (odd**2).sum(axis=1), (spread**2).sum(axis=1)
+    symmetric = odd_energy < max_odd * energy
+    off = np.abs(sample(image, pixels) - mean)
+    smeared = ~(off < max_centre * (high - low))
+    balanced = ~smeared | ((off < max(EVEN_CENTRE, max_centre) * (high - low)) & (odd_energy < EVEN_ODD * energy))
     above = even > middle[:, None]
     valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
     angles = np.zeros((len(pixels), 2))
     angles[valid] = _angles(image, pixels[valid], radius[valid], even[valid])
-    return Rings(angles, contrast, valid)
+    return Rings(angles, contrast, valid, smeared)
 
 
 def _angles(image: FloatImage, pixels: FloatArray, radius: FloatImage, even: FloatImage) -> FloatArray:
