@@ -55,7 +55,7 @@ from rigkit.detection.checks.validate import compact, has_edge_offset
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.lattices import candidates
+from rigkit.detection.lattices import Seen, candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.subpixel.subpixel import refine
@@ -205,7 +205,7 @@ def _judged(kind: str, image: str, board: bool, pixels: Grey, boards: list[Float
 
     least = MIN_BOARD if board else MIN_CORNERS
     size_px = (grey.shape[1], grey.shape[0])
-    fitted = refine(grey, candidates(grey, MIN_CORNERS, promising))
+    fitted = refine(grey, candidates(Seen.of(grey), MIN_CORNERS, promising))
     kept = [item for item in fitted if item.lattice.count >= least and compact(item.lattice, size_px)]
     mine = [item for item in kept if not board or any(_of_board(item.lattice, corners) for corners in boards)]
     return [

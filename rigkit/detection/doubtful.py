@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray, upper_median
 from rigkit.detection.checks.evidence import Evidence
-from rigkit.detection.lattices import candidates
+from rigkit.detection.lattices import Seen, candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
@@ -32,7 +32,9 @@ def doubtful_grid(image: NDArray[np.generic]) -> str | None:
     For images in which no board was found.
     """
     grey = without_bad_pixels(without_mosaic(grey_image(image)))
-    seen = [item for item in refine(grey, candidates(grey, MIN_DOUBTFUL_CORNERS, lambda *_: True)) if _worth(item)]
+    seen = [
+        item for item in refine(grey, candidates(Seen.of(grey), MIN_DOUBTFUL_CORNERS, lambda *_: True)) if _worth(item)
+    ]
     if not seen:
         return None
     largest = max(seen, key=lambda item: item.lattice.count)

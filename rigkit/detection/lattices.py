@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
-from rigkit.detection.saddles.saddle import find_corners
+from rigkit.detection.saddles.saddle import Corners, Saddles, find_corners, joined
 from rigkit.detection.subpixel.evened import evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
@@ -43,6 +43,9 @@ MIN_PART_CORNERS = 6
 
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
+
+SMEARED_CORNERS = 12
+"""From so many corners that only motion explains, an image without a board is searched once more with them."""
 
 SAME_PX = 4.0
 """Corners of one board placed in two ways lie nearer than this, px: strong blur moves them so much at most."""
@@ -63,24 +66,51 @@ def find_lattices(
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    found = fitted(grey, candidates(grey, min_corners, _sampled if marked else _promising), min_corners, sizes)
+    seen, promising = Seen.of(grey), _sampled if marked else _promising
+    found = fitted(grey, candidates(seen, min_corners, promising), min_corners, sizes)
+    if not _enough(found, sizes) and len(seen.saddles.smeared) >= SMEARED_CORNERS:
+        again = fitted(grey, candidates(seen.with_smeared(), min_corners, promising), min_corners, sizes)
+        found = max(again, found, key=lambda every: sum(item.lattice.count for item in every))
     if min_corners < MIN_BOARD_CORNERS:
         return found
     return [item for item in found if _of_size(item.lattice, sizes) or compact(item.lattice, size_px)]
 
 
-def candidates(
-    grey: GreyImage, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]
-) -> list[Lattice]:
-    """Return the lattices of `grey` that may be boards, before the sub-pixel fit.
+@dataclass(frozen=True, eq=False, slots=True)
+class Seen:
+    """An image in grey levels, the levels of its pyramid, and what is seen in them."""
+
+    grey: GreyImage
+    levels: list[Level]
+    corners: Corners
+    saddles: Saddles
+
+    @classmethod
+    def of(cls, grey: GreyImage) -> Seen:
+        levels = pyramid(grey)
+        return cls(grey, levels, *find_corners(levels))
+
+    def with_smeared(self) -> Seen:
+        """Return this with what is a corner only if something moved among the corners."""
+        return replace(self, corners=joined([self.corners, self.saddles.smeared]))
+
+
+def _enough(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether `found` is what may be there: a board of one of `sizes`, without these any, and none that moved."""
+    if not sizes:
+        return bool(found) and all(item.picture is None for item in found)
+    return any(frozenset(item.lattice.size) in {frozenset(size) for size in sizes} for item in found)
+
+
+def candidates(seen: Seen, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]) -> list[Lattice]:
+    """Return the lattices of an image that may be boards, before the sub-pixel fit.
 
     `promising` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
     """
-    size_px = (grey.shape[1], grey.shape[0])
-    levels = pyramid(grey)
-    corners, saddles = find_corners(levels)
-    lattices = build_lattices(corners, find_links(corners, levels[0]))
-    grown = grow_all(lattices, saddles, levels[0], functools.partial(promising, grey, levels[0]))
+    size_px = (seen.grey.shape[1], seen.grey.shape[0])
+    finest = seen.levels[0]
+    lattices = build_lattices(seen.corners, find_links(seen.corners, finest))
+    grown = grow_all(lattices, seen.saddles, finest, functools.partial(promising, seen.grey, finest))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []

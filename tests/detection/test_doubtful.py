@@ -27,7 +27,7 @@ SMEARED_PX = 1.5
 
 def too_blurred() -> np.ndarray:
     image = read_image(shared_data("real/bouguet-stereo") / "left07.jpg")
-    return cv2.GaussianBlur(image, (0, 0), 7.0)
+    return cv2.GaussianBlur(image, (0, 0), 8.0)
 
 
 def test_a_board_too_blurred_to_be_trusted_is_named(tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_a_blurred_board_of_a_declared_size_is_kept_with_sigmas_that_hold(seed: 
     rng = np.random.default_rng(seed)
     scene = one_board(rng)
     truth = scene.truth()[0]
-    image = scene.render(blur_px=6.5 + 0.5 * seed, noise_levels=2.0, rng=rng)
+    image = scene.render(blur_px=8.5 + 0.5 * seed, noise_levels=2.0, rng=rng)
     assert not detect_boards(image)
     board = Board("b", truth.columns, truth.rows, 30.0, 30.0)
     (found,) = detect_boards(image, [board])

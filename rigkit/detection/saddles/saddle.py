@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,13 +26,6 @@ KNOWN_PX = 2.0
 
 MAX_STEP = 1.5
 """A Newton step to the saddle that leads further than this from the peak of the response went wrong, level px."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Saddles:
-    """Saddle points in full-resolution pixels, (N, 2)."""
-
-    pixels: FloatArray
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,25 +53,34 @@ class Corners:
         return Corners(self.pixels[which], self.angles[which], self.contrast[which], self.scale[which])
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Saddles:
+    """Saddle points in full-resolution pixels, (N, 2), and those of them that are corners only if something moved."""
+
+    pixels: FloatArray
+    smeared: Corners
+
+
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
     """Return the chessboard corners of all levels, each once (the finest level wins), and all saddles.
 
     `finer` : those of the levels before, if only coarser `levels` are to be looked at.
     """
     kept = [] if finer is None else [finer]
-    moved: list[Corners] = []
+    smeared: list[Corners] = []
     saddles: list[FloatArray] = []
     for level in levels:
-        local, which, angles, contrast, smeared = _corners_of(level)
+        local, which, angles, contrast, moved = _corners_of(level)
         full = level.to_full(local)
         saddles.append(full)
         fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
-        kept.append(_without_known(fresh.of(~smeared), kept))
-        moved.append(fresh.of(smeared))
+        kept.append(_without_known(fresh.of(~moved), kept))
+        smeared.append(fresh.of(moved))
     # A coarser level may show what is smeared on a finer one as it should be.
-    for fresh in moved:
-        kept.append(_without_known(fresh, kept))
-    return _joined(kept), Saddles(np.concatenate(saddles))
+    others: list[Corners] = []
+    for fresh in smeared:
+        others.append(_without_known(fresh, [*kept, *others]))
+    return joined(kept), Saddles(np.concatenate(saddles), joined(others))
 
 
 def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
@@ -97,7 +99,8 @@ def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
     return fresh.of(new)
 
 
-def _joined(parts: list[Corners]) -> Corners:
+def joined(parts: Sequence[Corners]) -> Corners:
+    """Return the corners of all `parts`."""
     return Corners(
         np.concatenate([p.pixels for p in parts]),
         np.concatenate([p.angles for p in parts]),

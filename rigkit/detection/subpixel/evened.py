@@ -34,8 +34,9 @@ SHARPEST_PX, SQUARE_PX = 1.5, 9.0
 """Smallest s that it is made, and the smallest square, as far as that is not smaller in the image itself: as of
 `whole_board`."""
 
-LEAST_PX = 0.5
-"""No lens and pixel blur by less; what is measured across a long motion may be anything below."""
+LEAST_PX, MOST_CELLS = 0.5, 0.3
+"""No lens and pixel blur by less; what is measured across a long motion may be anything below. Nor is blur wider than
+this, in squares, while these can be told: what is measured of a motion along the squares may be anything above."""
 
 
 def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resampled | None:
@@ -47,12 +48,13 @@ def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resam
     if not blur > LOOKED_AT_PX:
         return None
     variances, axes = np.linalg.eigh(blur_covariance(image, lattice, blur))
-    widths = np.sqrt(np.maximum(variances, LEAST_PX**2))
+    shape = fit_cells(lattice.pixels, lattice.known)
+    widths = np.sqrt(variances).clip(LEAST_PX, max(MOST_CELLS * float(np.median(shape.cell_px())), LEAST_PX))
     if widths[1] < UNEVEN * widths[0] and widths[1] < WIDE_PX:
         return None
     # Symmetric: what is upright stays nearly so.
     per_blur = (axes / widths) @ axes.T
-    sides = np.linalg.norm(fit_cells(lattice.pixels, lattice.known).sides @ per_blur.T, axis=2)
+    sides = np.linalg.norm(shape.sides @ per_blur.T, axis=2)
     square = float(np.quantile(sides, 0.1))
     even = max(SHARPEST_PX, min(SQUARE_PX / square, float(widths[1])))
     # As large as in the image, where windows there are large enough.
