@@ -96,7 +96,7 @@ class Seen:
 
 
 def _enough(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether `found` is what may be there: a board of one of `sizes`, without these any, and none that moved."""
+    """Return whether `found` is all that may be there: a board of `sizes`, or without these one that did not move."""
     if not sizes:
         return bool(found) and all(item.picture is None for item in found)
     return any(frozenset(item.lattice.size) in {frozenset(size) for size in sizes} for item in found)

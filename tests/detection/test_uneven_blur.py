@@ -28,8 +28,8 @@ SMALL_SQUARES = 17.0
 """px: a motion of 15 px smears almost a whole one."""
 
 MOST_CELLS, RATIO = 0.005, (0.4, 1.6)
-"""Errors of corners (rms per axis) in squares, and over the stated sigmas: 0.0005 to 0.003 and 0.5 to 1.5 were measured,
-the last of a motion over four fifths of a square."""
+"""Errors of corners (rms per axis) in squares, and over the stated sigmas: 0.0005 to 0.003 and 0.5 to 1.5 were
+measured, the last of a motion over four fifths of a square."""
 
 
 def moved_board(length_px: float, direction: float, turned: float, seed: int = 0) -> tuple[np.ndarray, FloatArray]:
