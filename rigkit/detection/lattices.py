@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rigkit.core.arrays import known_median
 from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.discontinuity import may_be_discontinuous, split_at_discontinuities, without_outliers
 from rigkit.detection.checks.evidence import MIN_EXPECTED_CORNERS, OF_EXPECTED_SIZE, Evidence
@@ -32,7 +33,7 @@ from rigkit.detection.lattice.split import join_parts, split_at_turns, split_nec
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import Corners, Saddles, find_corners, joined
-from rigkit.detection.subpixel.evened import evened
+from rigkit.detection.subpixel.evened import LOOKED_AT_PX, evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
@@ -44,7 +45,7 @@ MIN_PART_CORNERS = 6
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
 
-SMEARED_CORNERS = 12
+SMEARED_CORNERS = 20
 """From so many corners that only motion explains, an image without a board is searched once more with them."""
 
 SAME_PX = 4.0
@@ -128,6 +129,9 @@ def fitted(
     """
     refined = refine(grey, boards, _may_be(sizes))
     found = _fitted(grey, boards, refined, min_corners, sizes)
+    if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
+        # What is blurred beside a board that is sharp lies in the background.
+        return found
     for board, item in zip(boards, refined, strict=True):
         picture = evened(grey, board, item)
         if picture is None:

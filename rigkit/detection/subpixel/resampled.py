@@ -62,11 +62,14 @@ def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px:
     fine = int(np.ceil(1.0 / (STEP_PX * np.linalg.svd(matrix)[1].min())))
     if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MOST_PIXELS:
         return None
+    # Of the image only what is drawn is converted.
+    reached = (np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * size + low) @ np.linalg.inv(matrix).T
+    first = np.floor(reached.min(axis=0)).clip(0, np.array(image.shape[::-1]) - 2).astype(int)
+    end = np.ceil(reached.max(axis=0)).astype(int) + 2
+    seen = image[first[1] : max(end[1], first[1] + 2), first[0] : max(end[0], first[0] + 2)].astype(np.float32)
     # The middle of a pixel lies in the middle of the finer ones.
-    there = np.column_stack([fine * matrix, -fine * low + 0.5 * (fine - 1.0)])
+    there = np.column_stack([fine * matrix, fine * (matrix @ first - low) + 0.5 * (fine - 1.0)])
     columns, rows = (size * fine).tolist()
-    drawn = cv2.warpAffine(
-        image.astype(np.float32), there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    drawn = cv2.warpAffine(seen, there, (columns, rows), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     grey = cv2.resize(drawn, size.tolist(), interpolation=cv2.INTER_AREA) if fine > 1 else drawn
     return Resampled(np.asarray(grey, np.float32), matrix, -low, radius_px)
