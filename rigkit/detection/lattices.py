@@ -69,7 +69,7 @@ def find_lattices(
     size_px = (grey.shape[1], grey.shape[0])
     seen, promising = Seen.of(grey), _sampled if marked else _promising
     found = fitted(grey, candidates(seen, min_corners, promising), min_corners, sizes)
-    if not _enough(found, sizes) and len(seen.saddles.smeared) >= SMEARED_CORNERS:
+    if _worth_another_look(seen, found, sizes):
         again = fitted(grey, candidates(seen.with_smeared(), min_corners, promising), min_corners, sizes)
         found = max(again, found, key=lambda every: sum(item.lattice.count for item in every))
     if min_corners < MIN_BOARD_CORNERS:
@@ -96,11 +96,15 @@ class Seen:
         return replace(self, corners=joined([self.corners, self.saddles.smeared]))
 
 
-def _enough(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
-    """Return whether `found` is all that may be there: a board of `sizes`, or without these one that did not move."""
-    if not sizes:
-        return bool(found) and all(item.picture is None for item in found)
-    return any(frozenset(item.lattice.size) in {frozenset(size) for size in sizes} for item in found)
+def _worth_another_look(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether corners that only motion explains may show more than was `found`: no whole board of `sizes`, or
+    without these none at all, or one that moved."""
+    whole = {frozenset(item.lattice.size) for item in found if item.lattice.known.all()}
+    if any(frozenset(size) in whole for size in sizes):
+        return False
+    if any(item.picture is not None for item in found):
+        return len(seen.saddles.smeared) > 0
+    return (bool(sizes) or not found) and len(seen.saddles.smeared) >= SMEARED_CORNERS
 
 
 def candidates(seen: Seen, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]) -> list[Lattice]:
@@ -245,7 +249,8 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     (refined,) = refine(grey, [sample], _may_be(()))
     if trustworthy(refined, sample.count, 0):
         return True
-    picture = evened(grey, sample, refined)
+    # Clutter leaves few corners.
+    picture = evened(grey, sample, refined) if refined.lattice.count >= MIN_BOARD_CORNERS else None
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
