@@ -23,7 +23,7 @@ ORDERS = np.array([1.0, 3.0, 5.0, 7.0])
 LARGE_SQUARES = 7.0
 """Squares of more s are taken to be of so many: what is looked at around a corner is the same."""
 
-REACH = np.linspace(-0.6, 0.6, 9)
+READ_AT = np.linspace(-0.6, 0.6, 9)
 """Where brightness is read around a corner, in squares along both sides: at the board's end other things lie beyond."""
 
 MOST_CORNERS = 64
@@ -47,7 +47,7 @@ def blur_covariance(image: GreyImage, lattice: Lattice, blur_px: float) -> Float
     chosen = np.zeros(len(shape.pixels), np.bool_)
     chosen[:: max(len(chosen) // MOST_CORNERS, 1)] = True
     shape, centres = shape.of(chosen), lattice.pixels[known][chosen]
-    along, down = (part.ravel() for part in np.meshgrid(REACH, REACH))
+    along, down = (part.ravel() for part in np.meshgrid(READ_AT, READ_AT))
     part = np.minimum(1.0, LARGE_SQUARES * blur_px / shape.cell_px())[:, None, None]
     shape = replace(shape, sides=part * shape.sides, bends=part**2 * shape.bends)
     # Along bent lines, as the squares lie.

@@ -15,7 +15,7 @@ from rigkit.detection.saddles.response import FloatImage, GreyImage
 MARGIN_CELLS = 3.0
 """What is resampled goes on so many squares beyond the corners."""
 
-STEP_PX = 2.0
+DRAWN_EVERY_PX = 2.0
 """It is read at places so far apart, px of the image, at most: what blur has made smaller has nothing finer in it."""
 
 MOST_PIXELS = 1.6e7
@@ -59,7 +59,7 @@ def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px:
     low = np.floor(corners.min(axis=0) - MARGIN_CELLS * side)
     size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
     # Finer first, then means.
-    fine = int(np.ceil(1.0 / (STEP_PX * np.linalg.svd(matrix)[1].min())))
+    fine = int(np.ceil(1.0 / (DRAWN_EVERY_PX * np.linalg.svd(matrix)[1].min())))
     if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MOST_PIXELS:
         return None
     # Of the image only what is drawn is converted.

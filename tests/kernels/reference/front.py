@@ -25,22 +25,9 @@ from rigkit.detection.lattice.links import (
     Links,
     _bounds,
 )
+from rigkit.detection.saddles import ring
 from rigkit.detection.saddles.response import FloatImage, GreyImage, Level, sample
-from rigkit.detection.saddles.ring import (
-    CIRCLE,
-    EVEN_CENTRE,
-    EVEN_ODD,
-    GAINS,
-    MAX_CENTRE,
-    MAX_COSINE,
-    MAX_ODD,
-    QUICK_CENTRE,
-    QUICK_EVEN_CENTRE,
-    QUICK_ODD,
-    QUICK_SHARP,
-    _gains,
-    arm_vectors,
-)
+from rigkit.detection.saddles.ring import CIRCLE, GAINS, MAX_CENTRE, MAX_COSINE, MAX_ODD, _gains, arm_vectors
 from rigkit.detection.saddles.saddle import MAX_STEP, Corners
 from rigkit.kernels.front import HALF, STRIP, STRIP_ROWS, STRIPS_FROM, LinkRules, RingRules
 
@@ -226,9 +213,10 @@ def may_be_corners(image: FloatImage, pixels: FloatArray, radius_px: float, resp
     variance = even.var(axis=1)
     odd = 0.25 * ((one - other) ** 2).mean(axis=1)
     off = np.abs(sample(image, places) - mean)
-    most = np.where(odd < EVEN_ODD * variance, QUICK_EVEN_CENTRE, QUICK_CENTRE)
-    possible = (odd < QUICK_ODD * variance) & (off**2 < most**2 * variance) & (response < QUICK_SHARP * variance)
-    return np.asarray(possible, dtype=np.bool_)
+    most = np.where(odd < ring.EVEN_ODD * variance, ring.QUICK_EVEN_CENTRE, ring.QUICK_CENTRE)
+    return np.asarray(
+        (odd < ring.QUICK_ODD * variance) & (off**2 < most**2 * variance) & (response < ring.QUICK_SHARP * variance)
+    )
 
 
 def read_rings(
@@ -249,12 +237,15 @@ def read_rings(
     mean = even.mean(axis=1)
     spread = even - mean[:, None]
     odd_energy, energy = (odd**2).sum(axis=1), (spread**2).sum(axis=1)
-    symmetric = odd_energy < max_odd * energy
-    off = np.abs(sample(image, pixels) - mean)
-    smeared = ~(off < max_centre * (high - low))
-    balanced = ~smeared | ((off < max(EVEN_CENTRE, max_centre) * (high - low)) & (odd_energy < EVEN_ODD * energy))
+    off = np.abs(sample(image, pixels) - mean) / (high - low)
+    smeared = ~(off < max_centre)
+    balanced = ~smeared | ((off < max(ring.EVEN_CENTRE, max_centre)) & (odd_energy < ring.EVEN_ODD * energy))
     above = even > middle[:, None]
-    valid = symmetric & balanced & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
+    valid = (
+        (odd_energy < max_odd * energy)
+        & balanced
+        & (np.count_nonzero(~above & np.roll(above, -1, axis=1), axis=1) == 1)
+    )
     angles = np.zeros((len(pixels), 2))
     angles[valid] = _angles(image, pixels[valid], radius[valid], even[valid])
     return Rings(angles, contrast, valid, smeared)
