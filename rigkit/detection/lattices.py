@@ -45,7 +45,7 @@ MIN_PART_CORNERS = 6
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
 
-SMEARED_CORNERS = 20
+SMEARED_CORNERS = 12
 """From so many corners that only motion explains, an image without a board is searched once more with them."""
 
 SAME_PX = 4.0
