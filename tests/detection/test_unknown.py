@@ -177,6 +177,14 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
     assert board.size == (8, 5) and board.pattern == pattern
 
 
+def test_markers_without_order_are_no_board() -> None:
+    """Chance reads numbers of which none is where another has it."""
+    seen, kind = MarkerSightings(images=[0]), ("DICT_4X4_1000", False)
+    seen.kinds[kind] = 4
+    seen.markers.append((kind, (np.array([10, 19, 500, 900]), np.array([[0, 0], [0, 2], [2, 0], [2, 2]]), 0.75)))
+    assert guessed_charuco(seen) == []
+
+
 @pytest.mark.parametrize("legacy", [False, True])
 def test_corners_tell_the_pattern_where_markers_fit_both(legacy: bool) -> None:
     """Nine squares a row: the two patterns are numbered alike but for one column, at either end, hidden here."""

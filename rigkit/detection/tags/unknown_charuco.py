@@ -146,7 +146,9 @@ def guessed_charuco(seen: MarkerSightings) -> list[Board]:
     if columns < 2:
         return []
     count = sum(len(numbers) for numbers, *_ in own)
-    own = [_in_order(*markers, columns) for markers in own]
+    own = [read for markers in own if len((read := _in_order(*markers, columns))[0])]
+    if not own:
+        return []
     first = _first_marker(own)
     last = max(int(numbers.max()) for numbers, *_ in own)
     side = round(float(np.median([side for _, _, side in own])), 2)
