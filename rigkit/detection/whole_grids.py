@@ -20,7 +20,7 @@ MIN_SHARE_OF_GRID = 0.8
 MIN_SURE_CORNERS = 20
 """Lattices of as many corners are no chance."""
 
-MARGIN_PX = 5.0
+UNSEEN_BORDER_PX = 5.0
 """Corners nearer to the image's border may be missed (sharp ones are found from 3 px on): a grid may go on there."""
 
 Size = tuple[int, int]
@@ -72,7 +72,7 @@ def _ends(lines: FloatArray, borders: FloatArray) -> bool:
     bend = np.nan_to_num(first - 2.0 * second + third)
     beyond = 2.0 * first - second + bend
     # Corners that are missing are NaN, and not inside.
-    inside = ((beyond >= MARGIN_PX) & (beyond <= borders - MARGIN_PX)).all(axis=1)
+    inside = ((beyond >= UNSEEN_BORDER_PX) & (beyond <= borders - UNSEEN_BORDER_PX)).all(axis=1)
     return bool(np.count_nonzero(inside) >= MIN_SHARE_OF_LINE * lines.shape[1])
 
 

@@ -31,6 +31,8 @@ pytestmark = pytest.mark.real
 LAB_DIFFERENCE_PX = 0.03
 """Projection against the exact lens over the part of the image that boards covered, after the best rotation, RMS."""
 PLANE_WARP_PX, PLANE_RELEASED_PX = 0.40, 0.22
+HELDOUT_REL = 0.1
+"""What is said of other pictures holds for those of a test split, but for corners left out."""
 FISHEYE1_PX = 0.413
 """Held-out RMS of the best rivals on these captures."""
 BASELINE_MM = (99.81, 0.25)
@@ -88,10 +90,11 @@ def plane_views(part: str) -> list[BoardView]:
 @pytest.mark.parametrize(("shape", "limit"), [("warp", PLANE_WARP_PX), ("released", PLANE_RELEASED_PX)])
 def test_plane_with_published_corners(shape: str, limit: float) -> None:
     result = calibrate(plane_views("train"), (1280, 800), model="kannala_brandt", board=shape)
-    assert result.heldout_rms_px is not None and result.heldout_rms_px < limit
     assert len(result.views) == 18 and result.dropped == ()
     # The published test split, every corner of it: only the poses of its views are fitted.
-    assert _rms_of_other_views(result, plane_views("test")) < limit
+    others = _rms_of_other_views(result, plane_views("test"))
+    assert others < limit
+    assert result.heldout_rms_px == pytest.approx(others, rel=HELDOUT_REL)
     assert len(result.outliers) < 0.02 * result.corner_count
 
 
