@@ -62,7 +62,7 @@ SIGMA_BAND = 0.2
 PLAIN = (0.7, 2)
 """Blur and noise of all parts that do not say otherwise."""
 SIZES = {"640x480": (640, 480), "1600x1200": (1600, 1200), "12 MP": (4000, 3000), "20 MP": (5472, 3648)}
-MOST_MS = {"640x480": 10.0, "1600x1200": 20.0, "12 MP": 60.0}
+MAX_MS = {"640x480": 10.0, "1600x1200": 20.0, "12 MP": 60.0}
 
 
 @dataclass(frozen=True)
@@ -295,8 +295,8 @@ def speed(tables: Tables, poses: int) -> list[Asked]:
         with_boards = 1e3 * float(np.median([a.cpu_s for a in answers]))
         peak = answers[-1].peak_mb
         tables.row("## Speed and memory", picture=f"three boards, {size}", cpu_ms=with_boards, peak_mb=peak)
-        if size in MOST_MS:
-            out.append(at_most(f"three boards, {size}, time", MOST_MS[size], with_boards, " ms"))
+        if size in MAX_MS:
+            out.append(at_most(f"three boards, {size}, time", MAX_MS[size], with_boards, " ms"))
         if size == "20 MP":
             out.append(at_most("20 MP, memory of the whole process", 1024.0, peak, " MB"))
         for name in BLANKS if size != "20 MP" else ():

@@ -71,7 +71,7 @@ MIN_CELL_PX = 6.0
 """Boards of smaller squares, pictures of boards in the background among them, are listed apart."""
 CHANCE = ("codes", "mosaic", "code")
 RIDGE = 1e-4
-MOST_RAGGED = 4.0
+MAX_RAGGED = 4.0
 """The prior: what keeps weights near 0, and that of raggedness at most this far from it."""
 SAME_CELLS, SAME_SHARE = 0.25, 0.9
 """A lattice is a board seen before where so much of it lies so near, in cells, to corners of that."""
@@ -254,7 +254,7 @@ def fitted_weights(found: list[Candidate], left_out: tuple[bool, str] | None = N
 
     limits: list[tuple[float | None, float | None]] = [(None, 0.0)] * len(SCORE) + [(None, None)]
     ragged = list(SCORE).index("raggedness")
-    limits[ragged] = (-MOST_RAGGED * spread[ragged], 0.0)
+    limits[ragged] = (-MAX_RAGGED * spread[ragged], 0.0)
     best = minimize(cost, np.zeros(len(SCORE) + 1), jac=True, bounds=limits, method="L-BFGS-B").x
     return np.append(best[:-1] / spread, best[-1] - mean @ (best[:-1] / spread))
 

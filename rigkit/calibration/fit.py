@@ -30,7 +30,7 @@ GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
 FOLD = 1e-6
 """A fold begins at the solution of all images: a step that promises less of the cost changes no digit shown."""
-LEAST_IMAGES = 3
+MIN_IMAGES_OF_FIT = 3
 """So many images can be left out one at a time: two others still show a camera."""
 SETTLE_ROUNDS = 8
 MAX_SCATTER_OF_VIEW = 2.0
@@ -218,7 +218,7 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
     """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
     shape from the other images, only the poses of its boards refitted. Images that repeat each other take part
     together, or not: else those that are left out would be known. Of fewer images than folds each is one. None with
-    less than LEAST_IMAGES that differ.
+    less than MIN_IMAGES_OF_FIT that differ.
 
     Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
     decides no more than it is worth.
@@ -226,7 +226,7 @@ def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatAr
     if folds < 2:
         return None
     images = list(dict.fromkeys(observations.images))
-    if int(observations.clusters().max()) + 1 < LEAST_IMAGES:
+    if int(observations.clusters().max()) + 1 < MIN_IMAGES_OF_FIT:
         return None
     place = {name: i for i, name in enumerate(images)}
     image = np.array([place[name] for name in observations.images])

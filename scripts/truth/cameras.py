@@ -25,7 +25,7 @@ from truth.resection import FOLDS, Fit, Size, Views, folds_of, held_out_rms, rms
 from truth.table import MRCAL, RIGKIT, Bench, Row
 
 HELD_OUT = "held-out rms"
-MOST_RELEASED = 100
+MAX_RELEASED = 100
 """Corners of the largest board on which cv2.calibrateCameraRO is tried on images held out: it takes minutes for one of
 160."""
 CALIPER_CORNERS = {"a": (0, 0), "b": (15, 0), "c": (0, 9), "d": (15, 9)}
@@ -76,7 +76,7 @@ def compared(bench: Bench, found: Calibration, fisheye: bool) -> Iterator[Row]:
     rms, count = held_out_rms(views, again(found, size_px))
     about = f"{found.camera.model}, board {found.boards[0].kind}; {len(views)} images; {seen(count, total)}"
     yield bench.row(HELD_OUT, RIGKIT, rms, how=about)
-    large = views[0].board.corner_count > MOST_RELEASED
+    large = views[0].board.corner_count > MAX_RELEASED
     for peer, fit in peers.CAMERA_FITS.items():
         if large and peer == peers.RELEASED:
             continue

@@ -16,7 +16,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.subpixel.subpixel import refine
 
-MOST_FITTED = 1200
+MAX_FITTED = 1200
 """Corners that are fitted there in vain: about as many as twelve boards have."""
 
 SIZE_PX = (640, 480)
@@ -28,9 +28,9 @@ def test_nothing_is_found_and_work_is_bounded(name: str, monkeypatch: pytest.Mon
     grown: list[int] = []
     grow_one = grow._grown
 
-    def counted_refine(image: np.ndarray, lattices: list[Lattice], *rest: object) -> object:
+    def counted_refine(image: np.ndarray, lattices: list[Lattice], *rest: object, **named: object) -> object:
         fitted.extend(item.count for item in lattices)
-        return refine(image, lattices, *rest)  # type: ignore[arg-type]
+        return refine(image, lattices, *rest, **named)  # type: ignore[arg-type]
 
     def counted_growth(lattice: Lattice, *rest: object) -> tuple[Lattice, bool]:
         out = grow_one(lattice, *rest)  # type: ignore[arg-type]
@@ -44,7 +44,7 @@ def test_nothing_is_found_and_work_is_bounded(name: str, monkeypatch: pytest.Mon
         grown.clear()
         assert detect_boards(blank(name, np.random.default_rng(seed), SIZE_PX)) == (), f"seed {seed}"
         assert len(grown) <= grow.MAX_GROWN
-        assert sum(fitted) <= MOST_FITTED
+        assert sum(fitted) <= MAX_FITTED
 
 
 def lattice_of(rows: list[str], side_px: float = 20.0, first_px: tuple[float, float] = (100.0, 100.0)) -> Lattice:

@@ -31,11 +31,11 @@ LEFT = Board("l", 12, 8, 20.0, 20.0, pattern=Circles("hexagonal", "left", diamet
 WHITE = Board("w", 4, 11, 40.0, 40.0, pattern=Circles("asymmetric", diameter_mm=16.0, inverted=True))
 BOARDS = [REGULAR, ASYMMETRIC, HEXAGONAL, LEFT, WHITE]
 
-MOST_BIAS_PX = 0.01
+MAX_BIAS_PX = 0.01
 """Of the centres of a slanted grid without noise, in the mean."""
 HONEST = (0.8, 1.25)
 """RMS error over predicted standard deviation."""
-MOST_BOUND = 1.15
+MAX_BOUND = 1.15
 """RMS error over the Cramer-Rao bound, which knows the map's curvature; at the rim of a board that fills a fisheye the
 whole board tells it (1.09 of twelve; by a perspective and a polynomial alone 1.23, by neighbours 1.35)."""
 SINGLE_PX = 0.12
@@ -101,8 +101,8 @@ def test_the_centre_is_the_image_of_the_centre(
     nearest = np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)
     off = found.pixels - truth[nearest]
     assert len(found) > 0.7 * len(truth)
-    assert np.abs(off.mean(axis=0)).max() < MOST_BIAS_PX
-    assert np.sqrt(np.median(off**2)) < MOST_BIAS_PX
+    assert np.abs(off.mean(axis=0)).max() < MAX_BIAS_PX
+    assert np.sqrt(np.median(off**2)) < MAX_BIAS_PX
     assert np.abs(off).max() < SINGLE_PX
 
 
@@ -118,8 +118,8 @@ def test_the_lens_tells_what_neighbours_do_not(board: Board) -> None:
         off.append(min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max())))
     assert len(off[0]) == len(off[1]) == board.corner_count
     assert np.sqrt((off[1] ** 2).mean()) < np.sqrt((off[0] ** 2).mean())
-    assert np.abs(off[1]).max() < 2.0 * MOST_BIAS_PX
-    assert np.abs(off[1].mean(axis=0)).max() < 0.2 * MOST_BIAS_PX
+    assert np.abs(off[1]).max() < 2.0 * MAX_BIAS_PX
+    assert np.abs(off[1].mean(axis=0)).max() < 0.2 * MAX_BIAS_PX
 
 
 def test_a_lens_that_did_not_see_the_board_is_not_asked() -> None:
@@ -248,4 +248,4 @@ def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> Non
             off = min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max()))
             assert found.complete
             relative.append((off**2).sum(axis=1).mean() / np.trace(bound, axis1=1, axis2=2).mean())
-    assert np.sqrt(np.mean(relative)) < MOST_BOUND
+    assert np.sqrt(np.mean(relative)) < MAX_BOUND

@@ -16,7 +16,7 @@ from rigkit.detection.lattice.local_fit import fit_cells
 BOARD = Board("b", 8, 6, 30.0, 30.0)
 SEEDS = 6
 
-MOST_OF_IT = 0.75
+MAX_OF_IT = 0.75
 """Of the corners in view: of 36 boards 0.8 are found."""
 
 
@@ -37,7 +37,7 @@ def test_what_is_seen_of_covered_boards_is_found_and_nothing_else() -> None:
         total.add(covered(seed, lens, kind))
     assert total.false == 0
     assert total.images == 6 * SEEDS
-    assert total.found > MOST_OF_IT * total.in_view
+    assert total.found > MAX_OF_IT * total.in_view
 
 
 @pytest.mark.parametrize(("seed", "lens"), [(18, "fisheye"), (44, "fisheye"), (51, "regular")])

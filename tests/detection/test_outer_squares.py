@@ -23,7 +23,7 @@ from rigkit.synthetic.render import Optics
 NOISE_LEVELS = 2.0
 SUPERSAMPLED = 8
 CELL_PX, COLUMNS, ROWS = 30.0, 7, 5
-MOST_PER_BLUR = 0.015
+MAX_PER_BLUR = 0.015
 """Of the blur, by which a corner may lie aside: where squares are cut at 3 blurs, half of it was measured."""
 
 
@@ -71,7 +71,7 @@ def test_squares_cut_short_do_not_pull_at_corners(
     assert len(found.grid) == COLUMNS * ROWS
     off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
     # Noise alone makes 0.01 px; without a model of what lies beyond, corners lie 0.14 to 2.4 px aside.
-    assert off.max() < MOST_PER_BLUR * blur_px
+    assert off.max() < MAX_PER_BLUR * blur_px
 
 
 @pytest.mark.parametrize("blur_px", [2.0, 3.0])
@@ -81,7 +81,7 @@ def test_nor_with_a_camera(blur_px: float) -> None:
     (found,) = detect_boards(image, [Board("b", COLUMNS, ROWS, 30.0, 30.0)], camera=camera)
     off = np.linalg.norm(found.pixels[:, None] - truth, axis=2).min(axis=1)
     assert len(found.grid) == COLUMNS * ROWS
-    assert off.max() < MOST_PER_BLUR * blur_px
+    assert off.max() < MAX_PER_BLUR * blur_px
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board
 
-MOST_PX = 0.004
+MAX_PX = 0.004
 """RMS without noise: what the models of edge and renderer have apart."""
 
 SIGMA_BAND = (0.75, 1.35)
@@ -50,7 +50,7 @@ def test_large_squares_at_the_rim_of_a_fisheye(noise: float) -> None:
         sigmas.append(found.sigma_px)
     every = np.concatenate(errors)
     if noise == 0.0:
-        assert np.sqrt((every**2).sum(axis=1).mean()) < MOST_PX
+        assert np.sqrt((every**2).sum(axis=1).mean()) < MAX_PX
     else:
         ratio = np.sqrt(np.mean((every / np.concatenate(sigmas)[:, None]) ** 2))
         assert SIGMA_BAND[0] < ratio < SIGMA_BAND[1]

@@ -27,7 +27,7 @@ BOARD = Board("b", COLUMNS, ROWS, 20.0, 20.0)
 SMALL_SQUARES = 17.0
 """px: a motion of 15 px smears almost a whole one."""
 
-MOST_CELLS, RATIO = 0.005, (0.4, 1.6)
+MAX_CELLS, RATIO = 0.005, (0.4, 1.6)
 """Errors of corners (rms per axis) in squares, and over the stated sigmas: 0.0005 to 0.003 and 0.5 to 1.5 were
 measured, the last of a motion over four fifths of a square."""
 
@@ -72,7 +72,7 @@ def test_boards_smeared_by_motion_are_found_whole_and_in_place(length_px: float,
     nearest = np.linalg.norm(apart, axis=2).argmin(axis=1)
     assert len(set(nearest.tolist())) == len(found.grid)
     off = apart[np.arange(len(nearest)), nearest]
-    assert np.sqrt((off**2).mean()) < MOST_CELLS * SMALL_SQUARES
+    assert np.sqrt((off**2).mean()) < MAX_CELLS * SMALL_SQUARES
     assert RATIO[0] < np.sqrt((off**2 / found.sigma_px[:, None] ** 2).mean()) < RATIO[1]
 
 

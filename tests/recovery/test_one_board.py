@@ -20,7 +20,7 @@ FAR_DEG = 3.0
 """The other pose is up to 50 deg off, the right one in 240 scenes by at most 0.7 deg at this noise."""
 EXACT_MM = 1e-3
 """Of a baseline of exact corners: rounding, and where the iterations stop."""
-MOST_SIGMAS = 4.0
+MAX_SIGMAS = 4.0
 """Of the baselines of 40 scenes; the other pose misses them by 100 and more."""
 
 
@@ -33,7 +33,7 @@ def test_the_shape_of_the_board_tells_which_pose(rng: np.random.Generator, camer
         r = reconstruct_pair(match_pair("one", camera, camera, one, two, [board]), pose_type=PoseType.GENERAL)
         off = r.cam2_from_cam1.rotation @ scene.cam2_from_cam1.rotation.T
         assert np.rad2deg(rotation_angle(off)) < FAR_DEG
-        assert abs(r.baseline_mm - scene.baseline_mm) < MOST_SIGMAS * r.baseline_sigma_mm
+        assert abs(r.baseline_mm - scene.baseline_mm) < MAX_SIGMAS * r.baseline_sigma_mm
 
 
 def test_a_board_without_any_noise_is_no_exception(rng: np.random.Generator) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.fit import LEAST_IMAGES
+from rigkit.calibration.fit import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
@@ -17,14 +17,15 @@ FOLD_TOLERANCE = 1e-6
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
     """Return the 2-D RMS over frames that took no part, of all cameras together and of each: cameras, mounts, places
     and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. Of fewer frames
-    than folds each is one. None with less than LEAST_IMAGES, or where those of one fold alone tell where a camera sits.
+    than folds each is one. None with less than MIN_IMAGES_OF_FIT, or where those of one fold alone tell where a camera
+    sits.
 
     It counts what a held-out error of single cameras cannot see: cameras that disagree. Residuals are weighted
     as in the solution.
     """
     observations, state = joint.observations, joint.solution.state
     nothing = None, (None,) * len(observations.cameras)
-    if folds < 2 or int(joint.frames.max()) + 1 < LEAST_IMAGES:
+    if folds < 2 or int(joint.frames.max()) + 1 < MIN_IMAGES_OF_FIT:
         return nothing
     fold = joint.folds(folds)
     squared, count = np.zeros(len(observations.cameras)), np.zeros(len(observations.cameras))

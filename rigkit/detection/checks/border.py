@@ -10,12 +10,12 @@ place for the part, or several: then it remains a part.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, sample
@@ -80,7 +80,7 @@ NEXT_SQUARE = np.array([1.35, 1.5, 1.65])
 MIN_NEXT_SUPPORT = 4
 """Corners behind a prediction of where they would be: it need not be better than a part of a square."""
 
-MOST_ALTERNATION, MIN_SIDES_SEEN = 0.5, 2
+MAX_ALTERNATION, MIN_SIDES_SEEN = 0.5, 2
 """They alternate by less than this part of the contrast of the last ones beyond each side of a board that is seen, and
 so many sides are. Of 43 boards in REAL images, blurred by 6 to 8 px or moved by 10 to 20 px so that their size decides
 (`rigkit.detection.checks.evidence.OF_EXPECTED_SIZE`), it is 0.34 at most and three sides are seen; of 36 patches of 20
@@ -132,6 +132,10 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     if not larger:
         return None
     every = sides(image, refined.lattice)
+    if known_median(refined.blur_px) > EDGE_WIDTH * float(
+        np.median(fit_cells(refined.lattice.pixels, refined.lattice.known).cell_px())
+    ):
+        every = _ending_in_blur(image, refined.lattice, every)
     top, left, bottom, right = every
     fits = {
         (across, down, before, above)
@@ -149,17 +153,32 @@ def place_part(image: GreyImage, refined: RefinedLattice, sizes: Sequence[tuple[
     return refined.padded((above, down - above), (before, across - before))
 
 
-def sides(image: GreyImage, lattice: Lattice) -> tuple[Beyond, Beyond, Beyond, Beyond]:
+FourSides = tuple[Beyond, Beyond, Beyond, Beyond]
+"""Beyond the first row, the first column, the last row and the last column."""
+
+
+def sides(image: GreyImage, lattice: Lattice) -> FourSides:
     """Return what lies beyond the first row, the first column, the last row and the last column."""
     first, second, third, fourth = (_above(image, lattice.turned(turns)) for turns in range(4))
     return first, second, third, fourth
+
+
+def _ending_in_blur(image: GreyImage, lattice: Lattice, every: FourSides) -> FourSides:
+    """Return what lies beyond the sides of a board whose edges are too wide to tell: where squares do not go on
+    alternating it ends."""
+    quiet = [_alternation_above(image, lattice.turned(turns)) < MAX_ALTERNATION for turns in range(4)]
+    ends = [
+        replace(one, side=Side.BORDER) if ending and one.side is Side.UNKNOWN else one
+        for one, ending in zip(every, quiet, strict=True)
+    ]
+    return ends[0], ends[1], ends[2], ends[3]
 
 
 def ends_quietly(image: GreyImage, lattice: Lattice) -> bool:
     """Return whether `lattice` is seen to end where it does: beyond its sides the squares do not go on alternating."""
     every = np.array([_alternation_above(image, lattice.turned(turns)) for turns in range(4)])
     seen = every[np.isfinite(every)]
-    return len(seen) >= MIN_SIDES_SEEN and bool((seen < MOST_ALTERNATION).all())
+    return len(seen) >= MIN_SIDES_SEEN and bool((seen < MAX_ALTERNATION).all())
 
 
 def _alternation_above(image: GreyImage, lattice: Lattice) -> float:

@@ -19,7 +19,7 @@ from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
 RADIUS_PX, FIT_STEPS = 18.0, 8
 """Radius of the window and Gauss-Newton steps, as in the last pass of `rigkit.detection.subpixel.subpixel`."""
 
-LEAST_NOISE = 1e-9
+MIN_NOISE_LEFT = 1e-9
 """Of a fit that failed there is none."""
 
 MARKER_BLURS = 2.0
@@ -61,7 +61,7 @@ def fit_corners(
         fit = fitted_beside_paper(image, every, fit, fitted, signs, np.zeros(len(start), np.int64))
     if isinstance(board.pattern, Charuco):
         # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-        more = fit.residual / np.maximum(fit.noise, LEAST_NOISE)
+        more = fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT)
         products = fit.products * (more**2)[:, None]
         fit = replace(fit, sigma_px=fit.sigma_px * more, noise=fit.residual, products=products)
     return fit

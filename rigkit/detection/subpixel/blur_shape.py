@@ -26,7 +26,7 @@ LARGE_SQUARES = 7.0
 READ_AT = np.linspace(-0.6, 0.6, 9)
 """Where brightness is read around a corner, in squares along both sides: at the board's end other things lie beyond."""
 
-MOST_CORNERS = 64
+MAX_LOOKED_AT = 64
 """Corners that are looked at: more tell no more."""
 
 STEPS, SETTLED, HALVINGS = 12, 0.01, 6
@@ -36,7 +36,7 @@ halved."""
 CHANGE = 1e-3
 """Derivatives are differences over so much of the logarithm of the covariance."""
 
-MOST_CHANGE = 0.7
+MAX_CHANGE = 0.7
 """The most that a step changes the logarithm of the covariance by: s by the factor 1.4."""
 
 
@@ -45,7 +45,7 @@ def blur_covariance(image: GreyImage, lattice: Lattice, blur_px: float) -> Float
     known = lattice.known
     shape = fit_cells(lattice.pixels, known)
     chosen = np.zeros(len(shape.pixels), np.bool_)
-    chosen[:: max(len(chosen) // MOST_CORNERS, 1)] = True
+    chosen[:: max(len(chosen) // MAX_LOOKED_AT, 1)] = True
     shape, centres = shape.of(chosen), lattice.pixels[known][chosen]
     along, down = (part.ravel() for part in np.meshgrid(READ_AT, READ_AT))
     part = np.minimum(1.0, LARGE_SQUARES * blur_px / shape.cell_px())[:, None, None]
@@ -92,7 +92,7 @@ def _covariance(seen: FloatArray, waves: FloatArray, vectors: FloatArray, blur_p
     for _ in range(STEPS):
         jacobian = np.stack([(left(log + CHANGE * unit) - rest) / CHANGE for unit in np.eye(3)], axis=1)
         step = np.linalg.lstsq(jacobian, -rest, rcond=None)[0]
-        step *= min(1.0, MOST_CHANGE / max(float(np.abs(step).max()), 1e-12))
+        step *= min(1.0, MAX_CHANGE / max(float(np.abs(step).max()), 1e-12))
         for _ in range(HALVINGS):
             after = left(log + step)
             if after @ after <= rest @ rest:

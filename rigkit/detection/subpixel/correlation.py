@@ -34,7 +34,7 @@ MIN_LEFT = 0.05
 COVERED_TIMES = 2.0
 """Where there is so many times the noise that is usual on the board, it is not the camera's alone."""
 
-LEAST_ALIKE, UNEVEN_TIMES = 0.1, 1.5
+MIN_ALIKE, UNEVEN_TIMES = 0.1, 1.5
 """A corner has more than noise beside it where neighbouring pixels share so much, in parts of the noise and times the
 square of the board's factor, and its own factor is the second number times the board's. Of 6480 corners of rendered
 boards under noise alone two have both (RENDERED); at edges of shadows, fingers and glare it is 1.6 to 4."""
@@ -108,7 +108,7 @@ def uneven_factors(
     seen = good & (fit.pairs[:, 0] > 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = (fit.products[:, 1:] / np.maximum(fit.pairs[:, 1:], 1.0)).mean(axis=1) / fit.noise**2
-        odd = seen & (alike > LEAST_ALIKE * usual[owner] ** 2)
+        odd = seen & (alike > MIN_ALIKE * usual[owner] ** 2)
     if odd.any():
         own = _factors(_known(fit.of(odd), sides[odd]), np.ones((np.count_nonzero(odd), 1)), radius_px)
         times = own / usual[owner[odd]]

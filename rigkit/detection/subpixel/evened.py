@@ -22,7 +22,7 @@ from rigkit.detection.subpixel.subpixel import LAST_PASS
 LOOKED_AT_PX = 1.5
 """Boards whose edges are as wide, s, are looked at: below, a motion is less than twice the blur that it is added to."""
 
-UNEVEN, WIDE_PX = 1.5, 3.0
+UNEVEN, WIDE_PX = 1.5, 4.0
 """Blur is made even where its s in one direction is so many times that in the other; or so many px: noise that
 was there before the blur, and what the print and the codec do, is then alike over more pixels than `correlation` looks
 at, and windows begin to end within the edges."""
@@ -34,7 +34,7 @@ SHARPEST_PX, SQUARE_PX = 1.5, 9.0
 """Smallest s that it is made, and the smallest square, as far as that is not smaller in the image itself: as of
 `whole_board`."""
 
-LEAST_PX, MOST_CELLS = 0.5, 0.3
+MIN_WIDTH_PX, MAX_WIDTH_CELLS = 0.5, 0.3
 """No lens and pixel blur by less; what is measured across a long motion may be anything below. Nor is blur wider than
 this, in squares, while these can be told: what is measured of a motion along the squares may be anything above."""
 
@@ -49,7 +49,9 @@ def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resam
         return None
     variances, axes = np.linalg.eigh(blur_covariance(image, lattice, blur))
     shape = fit_cells(lattice.pixels, lattice.known)
-    widths = np.sqrt(variances).clip(LEAST_PX, max(MOST_CELLS * float(np.median(shape.cell_px())), LEAST_PX))
+    widths = np.sqrt(variances).clip(
+        MIN_WIDTH_PX, max(MAX_WIDTH_CELLS * float(np.median(shape.cell_px())), MIN_WIDTH_PX)
+    )
     if widths[1] < UNEVEN * widths[0] and widths[1] < WIDE_PX:
         return None
     # Symmetric: what is upright stays nearly so.

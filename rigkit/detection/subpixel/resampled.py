@@ -18,7 +18,7 @@ MARGIN_CELLS = 3.0
 DRAWN_EVERY_PX = 2.0
 """It is read at places so far apart, px of the image, at most: what blur has made smaller has nothing finer in it."""
 
-MOST_PIXELS = 1.6e7
+MAX_RESAMPLED = 1.6e7
 """Larger parts are not resampled."""
 
 
@@ -60,7 +60,7 @@ def resampled(image: GreyImage, lattice: Lattice, matrix: FloatArray, radius_px:
     size = np.ceil(corners.max(axis=0) + MARGIN_CELLS * side - low).astype(int) + 1
     # Finer first, then means.
     fine = int(np.ceil(1.0 / (DRAWN_EVERY_PX * np.linalg.svd(matrix)[1].min())))
-    if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MOST_PIXELS:
+    if not 0 < float(np.prod(size, dtype=np.float64)) * fine**2 < MAX_RESAMPLED:
         return None
     # Of the image only what is drawn is converted.
     reached = (np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) * size + low) @ np.linalg.inv(matrix).T

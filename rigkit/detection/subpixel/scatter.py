@@ -30,7 +30,7 @@ MIXED = ((3, 3), (3, 4), (4, 3), (4, 4))
 """Orders of the differences along columns and then along rows. What a lens does to a corner it does nearly so to the
 corners beside it, so these shrink the bend twice over; scatter they leave as it is."""
 
-SURFACES, AS_ROUGH, LEAST_TERM = (3, 4), 1.5, 1e-6
+SURFACES, AS_ROUGH, MIN_TERM = (3, 4), 1.5, 1e-6
 EVEN_STEPS = 0.12
 """Degrees of the surfaces by which small boards are judged, and by how much more the first leaves, at most, if what is
 left is scatter; terms that few rows cannot tell are left out. Boards whose neighbouring steps differ by more than the
@@ -96,7 +96,7 @@ def _surface_roughness(pixels: FloatArray, sigma_px: FloatArray, degree: int) ->
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = 1.0 / sigma_px[known]
     surface, size, _ = np.linalg.svd(terms * weight[:, None], full_matrices=False)
-    surface = surface[:, size > LEAST_TERM * size[0]]
+    surface = surface[:, size > MIN_TERM * size[0]]
     free = len(row) - surface.shape[1]
     if 2 * free < MIN_DIFFERENCES:
         return np.nan

@@ -21,7 +21,7 @@ SEEN_ALONG, SEEN_ASIDE = np.array([0.15, 0.35]), 0.12
 """Where the light on opposite arms is compared: so far along them and aside, in sides of the cell. Beside the end of a
 board, where squares may be cut, only the nearer ones are looked at."""
 
-LEAST_ASIDE_PX = 1.0
+MIN_SHADOW_ASIDE_PX = 1.0
 """Nearer to a line its blur is seen, and nothing else."""
 
 UNEVEN = 0.4
@@ -52,7 +52,7 @@ LIGHT_RULES = LightRules.of(
     iterations=8,
 )
 
-MOST_LIGHT_STEP = np.array([0.7, 0.7, 0.2, 0.2, 0.3, 1e3, 1e3, 0.3, 1.5, 0.5, 0.3])
+MAX_LIGHT_STEP = np.array([0.7, 0.7, 0.2, 0.2, 0.3, 1e3, 1e3, 0.3, 1.5, 0.5, 0.3])
 """What one of them changes at most: corner, angles, log blur, levels; direction, place, log width, light."""
 
 TILE_PX = 24
@@ -95,7 +95,7 @@ def beside_shadows(
 
     `aside` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
     """
-    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, LEAST_ASIDE_PX, UNEVEN)
+    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, MIN_SHADOW_ASIDE_PX, UNEVEN)
 
 
 def light_steps(
@@ -106,7 +106,7 @@ def light_steps(
     `sides` (N, 2, 2) and `curvature` (N, 2) of the lines as in `Geometry`, `blur` about that of their edges, px; pixels
     further than `aside` (N,) px from both lines are not used.
     """
-    fitted = fit_light_steps(image, start, sides, curvature, aside, blur, MOST_LIGHT_STEP, LIGHT_RULES)
+    fitted = fit_light_steps(image, start, sides, curvature, aside, blur, MAX_LIGHT_STEP, LIGHT_RULES)
     _, _, sigma_px, towards, place, width, left, found = fitted.T
     step = LightSteps(
         centre=np.rint(start),

@@ -77,7 +77,7 @@ OUTWARDS = np.array([-1.0, 1.0, -1.0, 1.0])
 MIN_ROWS = 3
 """Steps between corners have neighbours."""
 
-LEAST_BLUR, LEAST_SQUARE = 1.5, 9.0
+MIN_BLUR_OF_BOARD, MIN_SQUARE = 1.5, 9.0
 """Pixels are made larger while blur is so many of them, and the smallest square."""
 
 MIN_BLUR_PX, SMALL_SQUARES = 1.2, 9.0
@@ -169,7 +169,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
         return None
     # Blur leaves nothing that larger pixels would not show.
     steps = [float(np.linalg.norm(np.diff(pixels, axis=axis), axis=2).min()) for axis in (0, 1)]
-    scale = max(int(min(blur / LEAST_BLUR, min(steps) / LEAST_SQUARE)), 1)
+    scale = max(int(min(blur / MIN_BLUR_OF_BOARD, min(steps) / MIN_SQUARE)), 1)
     window = BoardWindow.around(image, pixels, scale, int(np.ceil(TAIL_SIGMAS * blur)), around)
     if window is None:
         return None

@@ -56,7 +56,7 @@ WIDE_BLUR = 0.15
 MAX_TAG_ROUNDS = 12
 """Rounds in which missing corners are added, each foretold by those of the one before."""
 
-NOTHING_NEAR_PX, LEAST_CONTRAST = 1e4, 10.0
+NOTHING_NEAR_PX, MIN_EDGE_CONTRAST = 1e4, 10.0
 """Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
 starts from at least."""
 
@@ -150,7 +150,7 @@ class _Fitter:
             single = np.stack([row, -column], axis=1)
             inwards = (np.stack([column, row], axis=1)[:, None] @ surface.sides)[:, 0]
             ink, paper = start + 0.5 * pattern.border / side * inwards, start - 0.25 * pattern.spacing * inwards
-            contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), LEAST_CONTRAST)
+            contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST)
         narrow = (self.borders(surface) - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS
         expected = np.broadcast_to(np.clip(blur, *BLUR_RANGE), narrow.shape)
         geometry = Geometry(

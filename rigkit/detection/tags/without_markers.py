@@ -42,7 +42,7 @@ SHADE_SQUARES = 1.0
 STEPS_OF_SHADE = 4.0
 """They are asked at places so many to such a standard deviation."""
 
-LEAST_CONTRAST = 1e-3
+MIN_MARKER_CONTRAST = 1e-3
 """Of pixels weighted, the least variance of the board's picture (1 and -1) in which black and white are told apart."""
 
 
@@ -129,8 +129,8 @@ def _contrast(image: Picture, picture: Picture, used: BoolArray, reach_px: float
     total, seen, drawn, squared, both = (_blurred(np.asarray(plane), reach_px / step) for plane in means)
     total = np.maximum(total, 1e-6)
     variance = squared / total - (drawn / total) ** 2
-    slope = (both / total - seen * drawn / total**2) / np.maximum(variance, LEAST_CONTRAST)
-    slope = np.where(variance > LEAST_CONTRAST, slope, 0.0).astype(np.float32)
+    slope = (both / total - seen * drawn / total**2) / np.maximum(variance, MIN_MARKER_CONTRAST)
+    slope = np.where(variance > MIN_MARKER_CONTRAST, slope, 0.0).astype(np.float32)
     return np.asarray(cv2.resize(slope, image.shape[::-1], interpolation=cv2.INTER_LINEAR), np.float32)
 
 

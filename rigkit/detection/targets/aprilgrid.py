@@ -22,7 +22,7 @@ from rigkit.detection.tags.quads import placed_tags
 from rigkit.detection.tags.surface import SmoothMap
 from rigkit.detection.targets.base import Finder, Search
 
-FIRST_SEEN, FEWEST_SEEN = 0.9, 16
+FIRST_SEEN, MIN_SEEN_AT_FIRST = 0.9, 16
 """Of the corners of a board in an image, so many seen on the finest level are enough, and so many at least: those left
 are few, and sought one by one."""
 
@@ -71,8 +71,8 @@ def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) ->
     """Return whether so many corners (R, C, 2) are known that the rest is better sought where these foretell it."""
     known = np.isfinite(pixels[..., 0])
     count, wanted = int(np.count_nonzero(known)), known.size
-    if FIRST_SEEN * wanted > count >= FEWEST_SEEN:
+    if FIRST_SEEN * wanted > count >= MIN_SEEN_AT_FIRST:
         # What lies outside the image is not missing.
         all_seen = SmoothMap(tags.places[known], pixels[known]).at(tags.places.reshape(-1, 2)).pixels
         wanted = int(np.count_nonzero(((all_seen > 0.0) & (all_seen < np.array(shape[::-1]) - 1.0)).all(axis=1)))
-    return bool(count >= max(FEWEST_SEEN, FIRST_SEEN * wanted))
+    return bool(count >= max(MIN_SEEN_AT_FIRST, FIRST_SEEN * wanted))

@@ -38,7 +38,7 @@ class ChessboardFinder(Finder):
         )
         for item in search.lattices:
             if (picture := item.picture) is not None:
-                there = _in_image(picture.grey, [item.within(picture)], boards, quick=search.quick)
+                there = _in_image(search.grey, [item], boards, picture=picture, quick=search.quick)
                 # What is too much aslant there may still be seen in the image itself.
                 out += [completed(search.grey, _out_of(picture, found), boards, None) for found in there]
         return out
@@ -50,12 +50,16 @@ def _in_image(
     boards: Sequence[Board],
     camera: Camera | None = None,
     *,
+    picture: Resampled | None = None,
     quick: bool,
 ) -> list[BoardDetection]:
-    """Return the boards that the lattices `found` in an image are, on their grids, completed."""
+    """Return the boards that the lattices `found` in an image are, on their grids, completed: in `picture`, where that
+    is given, and as they lie there. How a board ends is seen in the image itself."""
     sizes = tuple(dict.fromkeys(board.size for board in boards))
     lattices = [known_part(item, sizes) for item in found]
     placed = _placed(grey, lattices, boards, camera)
+    if picture is not None:
+        grey, placed = picture.grey, [item.within(picture) for item in placed]
     turned = [item.turned(quarter_turns(item.lattice, sizes)) for item in placed]
     every = [completed(grey, _detection(item), boards, camera) for item in turned]
     return every if quick else [relit(grey, *pair) for pair in zip(every, turned, strict=True)]

@@ -8,10 +8,10 @@ from scipy.special import erf
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.shadows import (
-    LEAST_ASIDE_PX,
     LIGHT_RANGE,
     LIGHT_RULES,
-    MOST_LIGHT_STEP,
+    MAX_LIGHT_STEP,
+    MIN_SHADOW_ASIDE_PX,
     SEEN_ALONG,
     SEEN_ASIDE,
     UNEVEN,
@@ -41,7 +41,7 @@ def beside_shadows(
     """Return what `shadows.beside_shadows` does."""
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1e-9)
     off = np.minimum(SEEN_ASIDE, aside[:, None] / lengths)
-    seen = (off * lengths).min(axis=1) > LEAST_ASIDE_PX
+    seen = (off * lengths).min(axis=1) > MIN_SHADOW_ASIDE_PX
     lines = np.eye(2)[:, None, :]
     cells = (
         np.reshape(SEEN_ALONG, (-1, 1, 1, 1)) * lines
@@ -158,7 +158,7 @@ def together(
         products, variance = normal(jacobian, cost)
         right = (jacobian @ rest[..., None])[..., 0] - variance[:, None] * known * (now - start)
         diagonal = damping[:, None, None] * products * one
-        step = np.linalg.solve(products + diagonal, right[..., None])[..., 0].clip(-MOST_LIGHT_STEP, MOST_LIGHT_STEP)
+        step = np.linalg.solve(products + diagonal, right[..., None])[..., 0].clip(-MAX_LIGHT_STEP, MAX_LIGHT_STEP)
         tried = now + step
         tried[:, WIDTH] = tried[:, WIDTH].clip(*np.log(WIDTH_RANGE_PX))
         tried[:, LEFT] = tried[:, LEFT].clip(0.5 * LIGHT_RANGE[0], LIGHT_RULES.most_light)
