@@ -123,21 +123,22 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     tags = read_tags(image, quads, board.codes)
     sure = np.flatnonzero(tags.read)
     if not len(sure):
-        return _place_together(image, lattice, board)
+        return _place_together(image, lattice.size, quads, cells, board)
     votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.corner_of(tags.number[sure]))
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
     columns, rows = lattice.size
     every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
     own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
     if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
-        return _place_together(image, lattice, board)
+        return _place_together(image, lattice.size, quads, cells, board)
     return votes, turn, shift
 
 
-def _place_together(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
-    """Return where a lattice lies whose tags are too blurred to be read one by one: where all of them together are most
-    like the codes that the board has there."""
-    quads, cells = squares_of(lattice, dark=True)
+def _place_together(
+    image: GreyImage, size: tuple[int, int], quads: FloatArray, cells: IntArray, board: TagBoard
+) -> Place | None:
+    """Return where a lattice of this size lies whose tags, in the squares `quads` (N, 4, 2) at `cells` (N, 2), are too
+    blurred to be read one by one: where all of them together are most like the codes that the board has there."""
     if len(quads) < MIN_TAGS_OF_PLACE:
         return None
     excess = excess_likeness(image, quads, board.codes)
@@ -148,7 +149,7 @@ def _place_together(image: GreyImage, lattice: Lattice, board: TagBoard) -> Plac
     code_of = np.full(int(board.codes.numbers.max()) + 1, -1)
     code_of[board.codes.numbers[::4]] = np.arange(0, len(board.codes.numbers), 4)
     tall, wide = board.numbers.shape
-    columns, rows = lattice.size
+    columns, rows = size
     found: list[tuple[FloatArray, IntArray, IntArray]] = []
     for turn, odd in product(range(4), (0, 1)):
         turned = grid_turned(cells, (columns - 1, rows - 1), turn)
