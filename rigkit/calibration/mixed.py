@@ -25,7 +25,7 @@ MIN_SHARE_PAIRED = 0.5
 MAX_SHARE_CHAINED = 0.2
 """More images than this part that are both start and end: a board moved by equal steps."""
 MAX_STARTS = 24
-"""So many views from which motions are tried."""
+"""So many views from which motions are tried, of all spread over where their boards were, in whatever order they come."""
 
 
 def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
@@ -65,7 +65,8 @@ def _partners(
     # A pose as four points: the board's origin, and the ends of axes half as long as it is far away.
     frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     reach = SAME_MOTION * distance * 2.0
-    starts = np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))
+    along = np.lexsort(centre.T)
+    starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
     # By how much each motion moves a frame that stands where boards usually were, as products of all ends and starts:
     # coordinates first, then start, end and point.
     usual = frame + centre.mean(axis=0)

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.folds import folds_of
+from rigkit.calibration.mixed import two_cameras
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
 
 FOLDS = 5
 SAME = 1e-6
 """Sums of other orders round otherwise; solvers stop within this."""
+UNSURE_MM = 1.0
+"""By so much boards' places are off: where two of a motion then agree is chance."""
 
 
 @pytest.mark.parametrize(("name", "seed"), [("fish", 7), ("wide", 1)])
@@ -78,3 +85,21 @@ def test_images_that_repeat_others_are_one_in_any_order(rng: np.random.Generator
         number = cluster_numbers([str(k) for k in order], ["b"] * 4, [pixels[k] for k in order])
         assert len({int(number[order.index(k)]) for k in (0, 1, 2)}) == 1
         assert number[order.index(3)] != number[order.index(0)]
+
+
+def test_two_cameras_are_found_or_not_in_any_order() -> None:
+    """Poses so unsure that a motion hardly comes twice, of more images than motions are tried from."""
+    rng = np.random.default_rng(15)
+    views, rotations, places = random_views(lens("reg"), 30, rng, reach_deg=REACH_DEG["reg"])
+    found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
+    beside = exp_so3(np.array([0.0, 0.05, 0.0]))
+    both = []
+    for k, view in enumerate(found.views):
+        own = np.array([places[k], beside @ places[k] - [60.0, 0.0, 0.0]]) + rng.normal(size=(2, 3)) * UNSURE_MM
+        for name, turn, place in zip("ab", (rotations[k], beside @ rotations[k]), own, strict=True):
+            both.append(replace(view, image=name + view.image, cam_from_board=Rigid3(turn, place)))
+    said = set()
+    for _ in range(20):
+        session = replace(found, views=tuple(both[k] for k in rng.permutation(len(both))))
+        said.add(bool(two_cameras(session, np.arange(len(both)))))
+    assert len(said) == 1
