@@ -25,7 +25,7 @@ MIN_SHARE_PAIRED = 0.5
 MAX_SHARE_CHAINED = 0.2
 """More images than this part that are both start and end: a board moved by equal steps."""
 MAX_STARTS = 24
-"""So many views from which motions are tried, of all spread over where their boards were, in whatever order they come."""
+"""So many views from which motions are tried, spread over the places of the boards, in whatever order they come."""
 
 
 def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
