@@ -138,7 +138,8 @@ def _too_few(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
         return []
     words = f"{count} images only" if count > 1 else "1 image only"
     if len(set(images)) > count:
-        words = f"{len(set(images))} images show the boards at {count} different places only"
+        where = f"at {count} different places" if count > 1 else "in one and the same place"
+        words = f"{len(set(images))} images show the boards {where} only"
     return [
         Finding(
             severity=Severity.BAD if count < FAR_TOO_FEW else Severity.LOOK,

@@ -167,8 +167,8 @@ def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: _Kinds) 
     places = np.stack(
         [*off.T, np.hypot(*off.T), np.linalg.norm(shift, axis=1), *corners.rotation[at, :2, 2].T, boards.astype(float)]
     )
-    rank = np.argsort(np.argsort(places, axis=1, kind="stable"), axis=1)
-    steps = rank[:, None] >= np.arange(1, len(at))[:, None]
+    # Between values that differ: where all images show one board, no step is the order of the images.
+    steps = places[:, None] >= np.sort(places, axis=1)[:, 1:, None]
     line = _explained(kinds.amounts, kinds.weight, places).min() + np.log(len(at))
     step = _explained(kinds.amounts, kinds.weight, steps.reshape(-1, len(at)).astype(float)).min()
     return float(min(line, step + 2.0 * np.log(len(at))))

@@ -102,3 +102,12 @@ def test_a_third_of_the_images_contradicts_the_others(rng: np.random.Generator) 
     assert not any("is left out:" in verdict for verdict in every)
     two = [without_distortion(v, camera) if k in (4, 9) else v for k, v in enumerate(views)]
     assert "contradict" not in str(calibrate(two, SIZE, model="brown", board="flat").verdicts)
+
+
+def test_four_images_after_four_others_are_of_two_kinds_as_in_turns(rng: np.random.Generator) -> None:
+    """Where all images show one board, no side of it is a cause; fewer images than ten have no halves in time."""
+    views = [mirrored(v) if k > 3 else v for k, v in enumerate(seen(off_the_middle(), 8, rng))]
+    for order in (range(8), (0, 4, 1, 5, 2, 6, 3, 7)):
+        session = [replace(views[k], image=f"{i}.png") for i, k in enumerate(order)]
+        said = calibrate(session, SIZE, model="brown", board="flat").verdicts[0]
+        assert KINDS in said.message and "as if some were mirrored" in said.message
