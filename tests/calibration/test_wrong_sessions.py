@@ -117,6 +117,9 @@ def test_repeated_frames(rng: np.random.Generator) -> None:
     few = calibrate([*views[:4], *again[:4]], SIZE, model="brown", board="flat")
     assert "where another one does" in first(few)
     assert any("8 images show the boards at 4 different places only" in str(verdict) for verdict in few.verdicts)
+    same = [replace(views[0], image=f"{k}", pixels=views[0].pixels + 0.05 * rng.normal(size=(54, 2))) for k in range(5)]
+    one = calibrate(same, SIZE, model="brown", board="flat")
+    assert any("5 images show the boards in one and the same place only" in str(verdict) for verdict in one.verdicts)
 
 
 def test_corners_of_the_image_without_boards(rng: np.random.Generator) -> None:
