@@ -8,7 +8,8 @@ the better one, and the lens chosen is wrong by the difference: with weights w_m
 
 where d_m is how the unknowns of the chosen model move to follow model m where the boards were, after the rotation of
 the rays that boards leave open, and with the boards' motions that go with it. Where one model is clearly the best all
-w_m are zero.
+w_m are zero. A board's shape is a model, too: flat, warped or of free shape, a board that few images show bends the
+lens to itself.
 
 Reference: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference", Biometrics
 53 (1997), eq. 9, about the estimate chosen in place of the average.
@@ -21,12 +22,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choice import Option
+from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.fit import Fit, fit_other_lens
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import followed
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import log_so3, skew
@@ -52,7 +54,7 @@ def rival_fits(
     chosen fit has them but for their warps."""
     own = chosen.state.camera
     cameras = [option.fit.state.camera for option in options]
-    alike = [camera.model == own.model and camera.parameters.size == own.parameters.size for camera in cameras]
+    alike = [same_model(camera, own) for camera in cameras]
     if not any(alike):
         # The chosen lens stands among them in another size.
         alike = [camera.model == own.model for camera in cameras]
@@ -67,6 +69,21 @@ def rival_fits(
             continue
         found.append(RivalFit(Rival(option.name, fit.state.camera, likely[option.name]), fit.state))
     return found
+
+
+def same_model(one: Camera, other: Camera) -> bool:
+    """Say whether two cameras are of one model and size."""
+    return one.model == other.model and one.parameters.size == other.parameters.size
+
+
+def rival_shapes(chosen: Option, shapes: Sequence[Option]) -> list[RivalFit]:
+    """Return the same lens as boards of the other `shapes` show it, of those that are likely enough the better ones."""
+    likely = HeldOut.of([shapes]).likely()
+    return [
+        RivalFit(Rival(f"board {one.fit.state.shape.kind}", one.fit.state.camera, likely[one.name]), one.fit.state)
+        for one in shapes
+        if one.name != chosen.name and likely.get(one.name, 0.0) >= MIN_LIKELY
+    ]
 
 
 def with_rivals(candidates: Sequence[Candidate], rivals: Sequence[Rival]) -> tuple[Candidate, ...]:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.assemble import assemble, require_determined
-from rigkit.calibration.between_models import rival_fits, with_rivals
+from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.lens_choice import (
     Choice,
@@ -212,7 +212,7 @@ def _result(
     """Return the result of a camera with its verdicts."""
     how, fit = begun.how, found.chosen.fit
     others = _others(tried, fit.state.camera.model) if len(tried.models) > 1 else []
-    close = rival_fits(found.observations, fit, rivals, likely)
+    close = [*rival_fits(found.observations, fit, rivals, likely), *rival_shapes(found.chosen, found.shapes)]
     result = assemble(
         found.observations,
         fit,

@@ -21,7 +21,7 @@ from rigkit.core.progress import Progress
 @dataclass(frozen=True, eq=False, slots=True)
 class Solved:
     """What one camera model came to: the observations used, why views were left out, the size and board shape chosen,
-    what was tried, which larger sizes were, and the sizes compared on flat boards."""
+    what was tried, which larger sizes were, the sizes compared on flat boards, and the board shapes compared."""
 
     observations: Observations
     reasons: tuple[tuple[str, str], ...]
@@ -29,6 +29,7 @@ class Solved:
     candidates: list[Candidate]
     beyond: Wanted
     sizes: list[Option]
+    shapes: list[Option]
 
 
 def only(options: list[Option], wanted: Wanted, model: str) -> tuple[list[Option], Wanted]:
@@ -55,24 +56,24 @@ def solved(
         options = compared(observations, options, folds, progress)
         chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
     candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
-    observations, chosen, shapes = with_board_shape(observations, chosen, board, folds, progress)
-    return Solved(observations, reasons, chosen, [*candidates, *shapes], beyond, options)
+    observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
+    return Solved(observations, reasons, chosen, [*candidates, *tried], beyond, options, shapes)
 
 
 def with_board_shape(
     observations: Observations, flat: Option, board: str, folds: int, progress: Progress
-) -> tuple[Observations, Option, list[Candidate]]:
-    """Return the fit with boards of the shape asked for, `board`, from that with `flat` ones, and what was tried: with
-    "auto" the shape that predicts other images best. The views are those with boards that look the same turned numbered
-    from one end."""
+) -> tuple[Observations, Option, list[Option], list[Candidate]]:
+    """Return the fit with boards of the shape asked for, `board`, from that with `flat` ones, the shapes compared, and
+    what was tried: with "auto" the shape that predicts other images best. The views are those with boards that look the
+    same turned numbered from one end."""
     if board == "flat" or not often_seen(observations).any():
-        return observations, flat, []
+        return observations, flat, [flat], []
     observations, flat, fits = _fit_shapes(observations, flat, board)
     shapes, spared = _shapes(observations, flat, fits, board, folds, progress)
     chosen = choose(observations, shapes)
     candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
     # Corners that only another shape follows were taken in to compare the two, not to be believed.
-    return observations, flat if chosen.name == flat.name else chosen, candidates
+    return observations, flat if chosen.name == flat.name else chosen, shapes, candidates
 
 
 def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:

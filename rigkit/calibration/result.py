@@ -131,8 +131,8 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rival:
-    """A lens of another model (or size) than the one chosen that the images support about as well: its name among the
-    candidates, the camera, and how likely it is the better one, 0 to 1."""
+    """A lens of another model (or size) than the one chosen, or the same from boards of another shape, that the images
+    support about as well: its name among the candidates, the camera, and how likely it is the better one, 0 to 1."""
 
     name: str
     camera: Camera

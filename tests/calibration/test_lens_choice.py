@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
+from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration import calibrate as module
-from rigkit.calibration.between_models import rival_fits
+from rigkit.calibration.between_models import rival_fits, rival_shapes
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
 from rigkit.calibration.fit import Fit, fit_model
@@ -208,13 +208,42 @@ def test_the_chosen_lens_in_another_size_is_no_rival(fits: dict[str, tuple[Obser
     assert [one.rival.name for one in rival_fits(observations, small, both, likely)] == ["scaramuzza 6", "eucm"]
 
 
+def test_a_shape_of_the_board_that_predicts_about_as_well_is_a_rival(fits: dict[str, tuple[Observations, Fit]]) -> None:
+    flat, bent = lenses(fits, scatter(0.0, 0.1)).options
+    shapes = [replace(flat, name="scaramuzza 5"), replace(bent, name="board warp")]
+    for chosen, other in (shapes, shapes[::-1]):
+        (rival,) = rival_shapes(chosen, shapes)
+        assert rival.rival.name == "board flat" and 0.3 < rival.rival.likely < 0.7
+        assert rival.state is other.fit.state
+    worse = replace(shapes[1], heldout=1.0 + np.asarray(bent.heldout))
+    assert rival_shapes(shapes[0], [shapes[0], worse]) == []
+    unknown = [replace(one, heldout=None) for one in shapes]
+    assert rival_shapes(unknown[0], unknown) == []
+
+
+def test_boards_in_doubt_widen_the_sigmas_by_what_they_make_of_the_lens(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A board bowed by half a millimetre, in five noisy images: flat or not, they do not tell.
+    x, y = (BOARD.points()[:, :2] / BOARD.points()[:, :2].max(axis=0)).T
+    bowed = BOARD.points() + np.stack([0.0 * x, 0.0 * x, 2.0 * x * (1.0 - x) + 0.0 * y], axis=-1)
+    rng = np.random.default_rng(0)
+    views, *_ = random_views(lens("reg"), 5, rng, reach_deg=REACH_DEG["reg"], noise_px=0.4, points_mm=bowed)
+    found = calibrate(views, SIZE, model="kannala_brandt")
+    monkeypatch.setattr(module, "rival_shapes", lambda *_: [])
+    alone = calibrate(views, SIZE, model="kannala_brandt")
+    assert any(rival.name.startswith("board") for rival in found.rivals)
+    np.testing.assert_array_equal(found.camera.parameters, alone.camera.parameters)
+    more = np.linalg.eigvalsh(found.frame_covariance - alone.frame_covariance)
+    assert more.max() > 0.0 and more.min() > -1e-9 * more.max()
+    assert FarProjection.of(found).usual_px > 1.1 * FarProjection.of(alone).usual_px
+
+
 def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     fits: dict[str, tuple[Observations, Fit]],
 ) -> None:
     observations, fit = fits["ucm"]
 
     def found(images: np.ndarray, squares: np.ndarray) -> Solved:
-        return Solved(observations.subset(images), (), Option("ucm", fit, squares[images]), [], [], [])
+        return Solved(observations.subset(images), (), Option("ucm", fit, squares[images]), [], [], [], [])
 
     every, ripple = np.arange(IMAGES), 1.0 + 0.1 * np.sin(np.arange(IMAGES))
     # The image that one of them left out is bad for the other.

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.between_models import spread_rays
+from rigkit.calibration.between_models import same_model, spread_rays
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
@@ -27,7 +27,8 @@ RIVAL_TOLERANCE = 1e-6
 
 def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: FloatArray) -> FloatArray:
     """Return what the rivals of the lenses add to the covariance (G, G) of all globals; `sigmas` (G,) are the standard
-    deviations without that. Lenses that are held near what each camera says alone bring their rivals with them."""
+    deviations without that. Lenses that are held near what each camera says alone bring their rivals with them. What
+    shape the boards have is a question to all cameras together: the same lens from another one is no rival here."""
     here, layout = joint.solution.state, joint.solution.state.layout(joint.observations)
     out = np.zeros((layout.count, layout.count))
     if joint.observations.held or joint.known is not None:
@@ -36,7 +37,8 @@ def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: F
     for c, weight in enumerate(joint.observations.weights):
         points, _ = here.of_camera(c, joint.observations).points_in_cam(joint.observations.cameras[c])
         rays.append(spread_rays(points[weight > 0.0]))
-    for name in dict.fromkeys(rival.name for calibration in single for rival in calibration.rivals):
+    others = [rival.name for one in single for rival in one.rivals if not same_model(rival.camera, one.camera)]
+    for name in dict.fromkeys(others):
         own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
         start = replace(
             here,
