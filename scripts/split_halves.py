@@ -9,12 +9,14 @@ all sets say together is the last line. And a test that never alarms is worthles
 lenses, must be found.
 
     python scripts/split_halves.py [SET ...] [--data DIR] [--splits 6] [--images N] [--cache DIR] [--power]
-        [--model MODEL] [--without IMAGE ...] [--twins N]
+        [--model MODEL] [--without IMAGE ...] [--twins N] [--small N]
 
 With --images so many images are calibrated apart from all others: what a small session says of itself. With --without
 the images named are left out: does a ratio come from one of them? With --twins halves of so many SIMULATED sessions
 like the real one, whose images all err alike (`honesty.twins`): if these agree with their sigmas, small sessions know
-how sure they are, and where the real one does not, an image of it errs otherwise.
+how sure they are, and where the real one does not, an image of it errs otherwise. With --small so many random
+draws of 3, 4, 5, 7 and 10 images against all others (`honesty.small`; with --twins of SIMULATED sessions): what small
+sessions state, and what their verdicts say; give --model auto for what a user gets.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from honesty.small import Drawn, drawn_sessions, print_small, table
 from honesty.twins import twin
 from truth.cameras import published_corners
 
@@ -72,6 +75,7 @@ def identified(words: str) -> Board:
     return board
 
 
+CHARUCO_STEREO = "charuco:30x15x49.33,dictionary=DICT_4X4_250,marker_mm=38.46"
 CAPTURES = {
     "bouguet-left": Capture("real/bouguet-stereo", "left*.jpg", Board("b", 9, 6, 30.0, 30.0)),
     "bouguet-right": Capture("real/bouguet-stereo", "right*.jpg", Board("b", 9, 6, 30.0, 30.0)),
@@ -84,12 +88,8 @@ CAPTURES = {
     "cylinder-202": Capture("public/cylinder/202", "*", Board("b", 19, 14, 10.0, 10.0)),
     "bumblebee-left": Capture("public/bumblebee2", "left*.jpg", Board("b", 4, 6, 30.0, 30.0)),
     "bumblebee-right": Capture("public/bumblebee2", "right*.jpg", Board("b", 4, 6, 30.0, 30.0)),
-    "charuco-stereo-left": Capture(
-        "public/charuco-stereo", "left*", identified("charuco:30x15x49.33,dictionary=DICT_4X4_250,marker_mm=38.46")
-    ),
-    "charuco-stereo-right": Capture(
-        "public/charuco-stereo", "right*", identified("charuco:30x15x49.33,dictionary=DICT_4X4_250,marker_mm=38.46")
-    ),
+    "charuco-stereo-left": Capture("public/charuco-stereo", "left*", identified(CHARUCO_STEREO)),
+    "charuco-stereo-right": Capture("public/charuco-stereo", "right*", identified(CHARUCO_STEREO)),
     "charuco-lifecam": Capture(
         "public/charuco-lifecam", "*.jpg", identified("charuco:7x7x25.4,dictionary=DICT_4X4_50,marker_mm=19.05")
     ),
@@ -334,6 +334,16 @@ def summary(
     return off
 
 
+def small(name: str, loaded: Loaded, args: argparse.Namespace) -> dict[int, list[Drawn | str]]:
+    """Print and return what small sessions of a set, or of its twins, come to, by how many images they have."""
+    views, size = loaded
+    whole = calibrated(views, size, args.model) if args.twins else None
+    seed, drawn = sum(map(ord, name)), lambda rng: views if whole is None else twin(whole, views, rng)
+    found = drawn_sessions(drawn, args.small, lambda part: calibrated(part, size, args.model), seed)
+    print(f"{name} ({len(views)} images)\n{table(found)}", flush=True)
+    return found
+
+
 def print_of_all(off: list[tuple[float, float]]) -> None:
     """Print what all REAL sets together say: one set's ratio scatters from a half to twice by itself."""
     log, sigma = np.array(off).T
@@ -357,16 +367,20 @@ def main() -> None:
     parser.add_argument("--power", action="store_true", help="find other cameras and moved lenses")
     parser.add_argument("--without", nargs="+", default=[], metavar="IMAGE", help="leave these images out")
     parser.add_argument("--twins", type=int, metavar="N", help="halves of so many simulated sessions like the real one")
+    parser.add_argument("--small", type=int, metavar="N", help="so many draws of 3 to 10 images against all others")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     everything: dict[str, tuple[Loaded, list[CalibrationComparison]]] = {}
+    few: dict[str, dict[int, list[Drawn | str]]] = {}
     for name in args.sets or CAPTURES:
         views, size = load(name, args.data, args.cache)
         if not views:
             print(f"{name}: no images in {args.data / CAPTURES[name].folder}: left out")
             continue
         loaded = {image: own for image, own in views.items() if image not in args.without}, size
-        if args.power:
+        if args.small:
+            few[name] = small(name, loaded, args)
+        elif args.power:
             power(name, loaded, args.model)
         elif args.twins:
             twins(name, loaded, args.twins, args.model)
@@ -377,6 +391,7 @@ def main() -> None:
         first, second = (calibrated(*load(name, args.data, args.cache), args.model) for name in (a, b))
         print(in_words(f"{a} against {b}", compare_calibrations(first, second)))
     off = [summary(name, loaded, found, args) for name, (loaded, found) in everything.items() if found]
+    print_small(few, {name for name in few if CAPTURES[name].rendered})
     if args.images is None and len(off) > 1:
         print_of_all([one for one in off if one is not None])
 

@@ -18,7 +18,7 @@ from rigkit.calibration.shape import often_seen
 from rigkit.core.progress import Progress
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Solved:
     """What one camera model came to: the observations used, why views were left out, the size and board shape chosen,
     what was tried, which larger sizes were, the sizes compared on flat boards, and the board shapes compared."""
@@ -57,7 +57,15 @@ def solved(
         chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
     candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
-    return Solved(observations, reasons, chosen, [*candidates, *tried], beyond, options, shapes)
+    return Solved(
+        observations=observations,
+        reasons=reasons,
+        chosen=chosen,
+        candidates=[*candidates, *tried],
+        beyond=beyond,
+        sizes=options,
+        shapes=shapes,
+    )
 
 
 def with_board_shape(

@@ -114,7 +114,7 @@ def _shaped(
     lens = fit.state.camera
     held = fit_kept(observations, replace(fit.state, camera=HeldLens.of(lens)), fit.kept)
     flat = Option("board flat", held, heldout_squares(observations, held, folds))
-    observations, chosen, candidates = with_board_shape(observations, flat, board, folds, silent)
+    observations, chosen, _, candidates = with_board_shape(observations, flat, board, folds, silent)
     if chosen is flat:
         return observations, fit, fit.rms_px, tuple(candidates)
     state = replace(chosen.fit.state, camera=lens)

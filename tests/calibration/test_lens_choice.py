@@ -243,7 +243,15 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     observations, fit = fits["ucm"]
 
     def found(images: np.ndarray, squares: np.ndarray) -> Solved:
-        return Solved(observations.subset(images), (), Option("ucm", fit, squares[images]), [], [], [], [])
+        return Solved(
+            observations=observations.subset(images),
+            reasons=(),
+            chosen=Option("ucm", fit, squares[images]),
+            candidates=[],
+            beyond=[],
+            sizes=[],
+            shapes=[],
+        )
 
     every, ripple = np.arange(IMAGES), 1.0 + 0.1 * np.sin(np.arange(IMAGES))
     # The image that one of them left out is bad for the other.
