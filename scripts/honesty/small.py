@@ -112,9 +112,10 @@ def drawn_sessions(
     calibrated why."""
     out: dict[int, list[Drawn | str]] = {}
     for size in SIZES:
-        rng = np.random.default_rng([seed, size])
-        for _ in range(draws):
-            views = views_of_draw(rng)
+        for draw in range(draws):
+            # The first draws are the same, however many are asked for.
+            rng = np.random.default_rng([seed, size, draw])
+            views = views_of_draw(np.random.default_rng([seed, size, draw, 1]))
             if len(views) - size < LEAST_OTHERS:
                 break
             names = rng.permutation(sorted(views)).tolist()
