@@ -277,7 +277,9 @@ class _Alone:
         """Return it for a `camera` whose rays are those of the calibrated one, of which these are `rays` (N, 3) to
         corners, after a `turn`."""
         information = information_of_lens(calibration, camera, turn)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        told = np.diag(information)
+        # A lens gone astray may know nothing of a parameter, or by rounding less.
+        scale = np.where(told > 0.0, 1.0 / np.sqrt(np.where(told > 0.0, told, 1.0)), 0.0)
         covariance = symmetric_pinv(information * scale[:, None] * scale) * scale[:, None] * scale
         sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
         design, p = projection_design(camera, rays @ turn.T), len(scale)

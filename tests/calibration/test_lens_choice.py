@@ -9,6 +9,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration import calibrate as module
+from rigkit.calibration import uncertainty
 from rigkit.calibration.between_models import rival_fits, rival_shapes
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
@@ -261,3 +262,13 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     assert module._better([before], [better]) and not module._better([before], [worse])
     assert module._better([before, before], [better, better]) and not module._better([before] * 2, [worse] * 2)
     assert not module._better([before], [found(every[:1], ripple)])
+
+
+def test_a_rival_gone_astray_is_no_number_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As five images of a board of other squares have shown one: by rounding it was told less than nothing."""
+    views, *_ = random_views(lens("reg"), 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
+    found = calibrate(views, SIZE, model="pinhole", board="flat")
+    far = FarProjection.of(replace(found, rivals=(Rival("pinhole", found.camera, 0.1),)))
+    monkeypatch.setattr(uncertainty, "information_of_lens", lambda *_: np.diag([4e2, 7e7, -8e10, -3e14]))
+    with np.errstate(over="raise", invalid="raise"):
+        assert np.isfinite(far.covariance(far.corners.rays)).all()
