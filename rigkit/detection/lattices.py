@@ -5,7 +5,7 @@ fit, and what is a board. No size need be known, no number of boards, no lens.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,7 @@ from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
-from rigkit.detection.saddles.saddle import Corners, Saddles, find_corners, joined
+from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
 from rigkit.detection.subpixel.evened import LOOKED_AT_PX, evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
@@ -71,7 +71,13 @@ def find_lattices(
     found = fitted(grey, candidates(seen, min_corners, promising), min_corners, sizes)
     if _worth_another_look(seen, found, sizes):
         again = fitted(grey, candidates(seen.with_smeared(), min_corners, promising), min_corners, sizes)
-        found = max(again, found, key=lambda every: sum(item.lattice.count for item in every))
+        found = max(again, found, key=_corners_of)
+    for coarser in seen.coarser():
+        if _whole(found, sizes):
+            break
+        more = candidates(coarser, min_corners, promising)
+        if sum(item.count for item in more) > _corners_of(found):
+            found = max(found, fitted(grey, more, min_corners, sizes), key=_corners_of)
     if min_corners < MIN_BOARD_CORNERS:
         return found
     return [item for item in found if _of_size(item.lattice, sizes) or compact(item.lattice, size_px)]
@@ -91,16 +97,38 @@ class Seen:
         levels = pyramid(grey)
         return cls(grey, levels, *find_corners(levels))
 
+    def coarser(self) -> Iterator[Seen]:
+        """Return this as the coarser levels alone show it, without one level more each time.
+
+        Where bright squares run over into dark ones (too much light, thin print), or dark ones into bright ones (ink
+        that spreads), these do not meet: near a corner, the borders of the quadrants lie aside of the lines, by an
+        angle that falls with the radius of the ring.
+        """
+        for k in range(1, len(self.levels)):
+            corners = each_once(self.saddles.by_level[k:])
+            if len(corners) < MIN_BOARD_CORNERS:
+                return
+            yield replace(self, levels=self.levels[k:], corners=corners)
+
     def with_smeared(self) -> Seen:
         """Return this with what is a corner only if something moved among the corners."""
         return replace(self, corners=joined([self.corners, self.saddles.smeared]))
 
 
+def _corners_of(found: Sequence[RefinedLattice]) -> int:
+    return sum(item.lattice.count for item in found)
+
+
+def _whole(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+    """Return whether one of `found` has all corners of a grid of one of `sizes`, or of any if none are known."""
+    whole = {frozenset(item.lattice.size) for item in found if item.lattice.known.all()}
+    return not whole.isdisjoint(map(frozenset, sizes)) if sizes else bool(whole)
+
+
 def _worth_another_look(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether corners that only motion explains may show more than was `found`: no whole board of `sizes`, or
     without these none at all, or one that moved."""
-    whole = {frozenset(item.lattice.size) for item in found if item.lattice.known.all()}
-    if any(frozenset(size) in whole for size in sizes):
+    if sizes and _whole(found, sizes):
         return False
     if any(item.picture is not None for item in found):
         return len(seen.saddles.smeared) > 0

@@ -19,8 +19,9 @@ Degraded = tuple[NDArray[np.generic], FloatArray]
 
 SAME = np.eye(2, 3)
 MOTION_RAD = np.radians(30.0)
-GLARE_PART, WEBCAM_PX = 0.15, 1.2
-"""Standard deviation of a glare's spot as a part of the image's height, and of what a webcam sharpens."""
+GLARE_PART, WEBCAM_PX, OPTICS_PX = 0.15, 1.2, 0.6
+"""Standard deviation of a glare's spot as a part of the image's height, of what a webcam sharpens, and of a lens's
+blur."""
 
 
 def noisy(values: Values, levels: float, rng: np.random.Generator) -> Values:
@@ -94,6 +95,13 @@ def inverted(values: Values, _: float, rng: np.random.Generator) -> Values:
     return np.float32(255.0) - values
 
 
+def run_over(values: Values, px: float, rng: np.random.Generator) -> Values:
+    """Return the image with bright squares that run over into dark ones by `px` (light that saturates, thin print), or,
+    where that is negative, dark ones into bright ones (ink that spreads)."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(abs(px)) + 1,) * 2)
+    return blurred(np.asarray((cv2.dilate if px > 0.0 else cv2.erode)(values, disc), np.float32), OPTICS_PX, rng)
+
+
 def shadowed(grey: Grey, through: FloatArray, angle: float, width_px: float, left: float) -> Grey:
     """Return the image under a shadow with a straight edge `through` a pixel, towards `angle`, that leaves the part
     `left` of the light."""
@@ -115,6 +123,7 @@ LIGHT: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
     "vignetting": vignetted,
     "covered": covered,
     "inverted": inverted,
+    "run over": run_over,
 }
 """What changes brightness alone, by name."""
 

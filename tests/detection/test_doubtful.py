@@ -26,8 +26,8 @@ SMEARED_PX = 1.5
 
 
 def too_blurred() -> np.ndarray:
-    image = read_image(shared_data("real/bouguet-stereo") / "left07.jpg")
-    return cv2.GaussianBlur(image, (0, 0), 8.0)
+    image = read_image(shared_data("real/bouguet-stereo") / "left08.jpg")
+    return cv2.GaussianBlur(image, (0, 0), 10.0)
 
 
 def test_a_board_too_blurred_to_be_trusted_is_named(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rigkit.core.arrays import Pixels
+from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 
 COLUMNS, ROWS, SIDE_PX = 8, 6, 36.0
@@ -64,3 +65,16 @@ def test_squares_that_overlap_by_pixels_are_corners_at_a_coarser_level(grow: flo
     (found,) = detect_boards(image)
     assert found.complete and len(found.grid) == COLUMNS * ROWS
     assert np.abs(found.pixels - truth).max() < 0.12
+
+
+@pytest.mark.parametrize("grow, scale", [(-0.1, 1), (0.1, 1), (-0.06, 2), (0.06, 2)])
+def test_squares_that_run_over_by_a_tenth_are_found_at_coarser_levels(
+    grow: float, scale: int, rng: np.random.Generator
+) -> None:
+    """3.6 and 4.3 px: on the finest level, the corners are bars of one brightness. Their sigmas say that they are less
+    sure."""
+    image, truth = print_of(grow, 1e-6, rng, scale)
+    (found,) = detect_boards(image, [Board("b", COLUMNS, ROWS, 30.0, 30.0)])
+    assert found.complete and found.board_id == "b"
+    errors = found.pixels - truth
+    assert np.sqrt((errors**2 / found.sigma_px[:, None] ** 2).mean()) < 1.4

@@ -55,10 +55,18 @@ class Corners:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Saddles:
-    """Saddle points in full-resolution pixels, (N, 2), and those of them that are corners only if something moved."""
+    """Saddle points, and corners that are not among those of the whole image.
+
+    Attributes
+    ----------
+    pixels : (N, 2) full resolution.
+    smeared : those that are corners only if something moved.
+    by_level : the corners of each level, also those that a finer one has found.
+    """
 
     pixels: FloatArray
     smeared: Corners
+    by_level: tuple[Corners, ...]
 
 
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
@@ -67,6 +75,7 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
     `finer` : those of the levels before, if only coarser `levels` are to be looked at.
     """
     kept = [] if finer is None else [finer]
+    own: list[Corners] = []
     smeared: list[Corners] = []
     saddles: list[FloatArray] = []
     for level in levels:
@@ -74,13 +83,22 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
         full = level.to_full(local)
         saddles.append(full)
         fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
+        own.append(fresh)
         kept.append(_without_known(fresh.of(~moved), kept))
         smeared.append(fresh.of(moved))
     # A coarser level may show what is smeared on a finer one as it should be.
     others: list[Corners] = []
     for fresh in smeared:
         others.append(_without_known(fresh, [*kept, *others]))
-    return joined(kept), Saddles(np.concatenate(saddles), joined(others))
+    return joined(kept), Saddles(np.concatenate(saddles), joined(others), tuple(own))
+
+
+def each_once(by_level: Iterable[Corners]) -> Corners:
+    """Return the corners of several levels, the finest first, each once (the finest level wins)."""
+    kept: list[Corners] = []
+    for own in by_level:
+        kept.append(_without_known(own, kept))
+    return joined(kept)
 
 
 def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
