@@ -20,7 +20,7 @@ from rigkit.io.manifest import Dataset, load_dataset
 from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras
-from rigkit.workflows.pairs import match_images, reconstruct_with
+from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
 from rigkit.workflows.results import write_results
 
 _log = logging.getLogger(__name__)
@@ -47,6 +47,8 @@ def export_cloud(
 ) -> Reconstruction:
     """Reconstruct one pair of a data set, write its cloud, and return the reconstruction.
 
+    The cloud is that of `reconstruct_dataset`: on the planes that the manifest names, the calibrations in its sigmas.
+
     Raises InputError: no such pair, or none named of several; a file that cannot be read or written; DegenerateError:
     the corners do not determine the pose.
     """
@@ -57,9 +59,9 @@ def export_cloud(
     if options.kind != "colmap":
         ensure_writable(options.output, force=options.force, inputs=known.inputs)
     pair.require_images()
-    camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
-    matched, image1, _ = match_images(pair, camera1.camera, camera2.camera, "raw")
-    r = reconstruct_with(matched, pair, options.method, image1)
+    cameras = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
+    matched, image1, _ = match_images(pair, *(loaded.camera for loaded in cameras), "raw")
+    r = with_whole_sigmas(reconstruct_with(matched, pair, options.method, image1), pair.planes, *cameras)
     folder, files = options.output, dict[str, str | bytes]()
     if options.kind == "colmap":
         model, notes = colmap_model(
@@ -101,6 +103,7 @@ def _cloud_npz(reconstruction: Reconstruction) -> bytes:
         "colours": cloud.colours,
         "sigma_mm": cloud.sigma_mm,
         "normal_sigma_rad": cloud.normal_sigma_rad,
+        "calibration_in_sigmas": np.array(cloud.calibration_in_sigmas),
         "board_index": cloud.board_index,
         "grid": cloud.grid,
         "board_ids": np.array(cloud.board_ids),

@@ -17,7 +17,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image_of, to_grey
 from rigkit.io.manifest import Pair
 from rigkit.reconstruction.board_planes import BoardPlanes
-from rigkit.reconstruction.calibration_shifts import CalibrationShifts, calibration_shifts
+from rigkit.reconstruction.calibration_shifts import CalibrationShifts, calibration_shifts, with_calibrations
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
@@ -112,13 +112,15 @@ def planes_of(geometry: PairGeometry, planes: Planes, camera1: LoadedCamera, cam
     return fit_planes(geometry, planes, camera1.known, camera2.known, one_camera=camera1 is camera2)
 
 
-def reconstruct_on_planes(
+def with_whole_sigmas(
     reconstruction: Reconstruction, planes: Planes, camera1: LoadedCamera, camera2: LoadedCamera
 ) -> Reconstruction:
-    """Return a pair's reconstruction on the boards' planes, with the calibrations' share in its sigmas.
+    """Return a pair's free reconstruction as clouds are written: on `planes`, the calibrations' share in its sigmas.
 
-    Raises DegenerateError where too few corners are seen.
+    Raises DegenerateError where too few corners are seen for planes.
     """
+    if planes == "free":
+        return with_calibrations(reconstruction, shifts_of(reconstruction, camera1, camera2))
     if reconstruction.geometry is None:
         raise InputError(f"pair '{reconstruction.pair_id}': planes are fitted to boards, and there are none")
     return on_planes(reconstruction, planes_of(reconstruction.geometry, planes, camera1, camera2))

@@ -11,11 +11,10 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
-from rigkit.reconstruction.calibration_shifts import with_calibrations
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import pair_pictures
 from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import match_images, reconstruct_on_planes, reconstruct_with, shifts_of
+from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,10 +83,7 @@ def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     matched, image1, image2 = match_images(pair, camera1.camera, camera2.camera, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     planes = options.planes or pair.planes
-    if planes != "free":
-        r = reconstruct_on_planes(r, planes, camera1, camera2)
-    else:
-        r = with_calibrations(r, shifts_of(r, camera1, camera2))
+    r = with_whole_sigmas(r, planes, camera1, camera2)
     ply = f"{pair.pair_id}/{options.method if planes == 'free' else planes}.ply"
     files = {ply: ply_bytes(r.cloud)}
     if options.pictures:

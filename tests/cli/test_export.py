@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
 from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera
+from rigkit.io.ply import read_ply
 from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.export_camera import foreign_files
 
@@ -74,6 +76,26 @@ def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureF
     theirs = np.stack([model.points3D[i].xyz for i in sorted(model.points3D)])
     assert np.abs(theirs - data["points_mm"]).max() < 1e-9
     assert main(["export", *source, "-o", str(tmp_path / "cloud.npz")]) == 2
+
+
+@pytest.mark.parametrize("planes", ["free", "lattice"])
+def test_a_cloud_is_the_same_by_export_and_reconstruct(planes: str, tmp_path: Path) -> None:
+    shutil.copytree(REPOSITORY / "calib", tmp_path / "calib")
+    shutil.copytree(LAB, lab := tmp_path / "datasets" / "lab-a")
+    manifest = lab / "dataset.toml"
+    pair = 'id = "regular-general"\n'
+    manifest.write_text(manifest.read_text().replace(pair, f'{pair}planes = "{planes}"\n'))
+    asked = [str(lab), "-p", "regular-general"]
+    assert main(["reconstruct", *asked, "--no-pictures", "-o", str(tmp_path / "out")]) == 0
+    (theirs,) = (tmp_path / "out" / "regular-general").glob("*.ply")
+    assert main(["export", *asked, "-o", str(tmp_path / "cloud.ply")]) == 0
+    written = (tmp_path / "cloud.ply").read_bytes()
+    assert b"and the covariance of the calibrations" in written.split(b"end_header")[0]
+    assert written == theirs.read_bytes()
+    assert main(["export", *asked, "-o", str(tmp_path / "cloud.npz")]) == 0
+    cloud, arrays = read_ply(tmp_path / "cloud.ply"), np.load(tmp_path / "cloud.npz")
+    np.testing.assert_array_equal(arrays["sigma_mm"], cloud.sigma_mm)
+    assert arrays["calibration_in_sigmas"]
 
 
 def saved_rig(path: Path, cameras: Sequence[Camera], poses: Sequence[Rigid3]) -> Path:
