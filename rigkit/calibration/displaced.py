@@ -40,7 +40,7 @@ SOFTEST, HARDEST, PENALTIES = 1e-6, 1.0, 19
 """Amounts that stand for a rival are looked for with so many penalties on their size, as parts of what moves most."""
 SLOPE_STEP_PX = 1e-2
 """For the slope of displacements, which are polynomials over hundreds of pixels: exact to eight digits."""
-MAX_ROUNDS, ROUNDING_PX = 20, 1e-10
+MAX_INVERSION_ROUNDS, ROUNDING_PX = 20, 1e-10
 """Each round of going back through displacements takes their slope, a hundredth, off the error."""
 
 
@@ -107,7 +107,7 @@ class DisplacedCamera(Camera):
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         off = np.zeros((2, len(u)))
-        for _ in range(MAX_ROUNDS):
+        for _ in range(MAX_INVERSION_ROUNDS):
             before, off = off, self._displacement(u - off[0], v - off[1])
             if not np.nanmax(np.abs(off - before), initial=0.0) > ROUNDING_PX:
                 break

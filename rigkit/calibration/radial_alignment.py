@@ -30,7 +30,7 @@ TURN_SIGMAS = 2.5
 """Residuals of so many robust sigmas count half."""
 MIN_SCATTER_PX = 1e-6
 """Exact corners scatter by rounding alone, far below any noise; weights are one over it."""
-ON_AXIS = 1e-3
+MIN_RADIUS_SHARE = 1e-3
 """Of a view's largest radius: nearer to the axis a corner has no direction, and its weight no end."""
 FAR_EPIPOLE = 1e-9
 """Homogeneous coordinate of a unit vector that lies at infinity."""
@@ -146,7 +146,7 @@ class _Views:
         xy = self.camera_xy(h)
         x, y = xy[..., 0, :], xy[..., 1, :]
         radius = np.sqrt(x * x + y * y)
-        radius = np.maximum(radius, ON_AXIS * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
+        radius = np.maximum(radius, MIN_RADIUS_SHARE * radius.max(axis=-1, keepdims=True) + np.finfo(float).tiny)
         return np.abs(self._u * y - self._v * x) / radius, radius
 
 

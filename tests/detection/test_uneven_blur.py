@@ -14,7 +14,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.blur_shape import blur_covariance
-from rigkit.detection.subpixel.evened import UNEVEN
+from rigkit.detection.subpixel.evened import UNEVEN_WIDTHS
 from rigkit.detection.subpixel.resampled import resampled
 from rigkit.detection.subpixel.unsure import strays
 from rigkit.io.images import read_image
@@ -91,7 +91,7 @@ def test_the_shape_of_the_blur(length_px: float, direction: float) -> None:
         return
     # The Gaussian that comes nearest to an even smear is wider than its standard deviation, by a fifth.
     assert 0.9 * length_px / 12.0**0.5 < np.sqrt(widths[1]) < 1.35 * length_px / 12.0**0.5
-    assert np.sqrt(widths[1] / widths[0]) > UNEVEN
+    assert np.sqrt(widths[1] / widths[0]) > UNEVEN_WIDTHS
     assert abs(np.cos(direction) * axes[0, 1] + np.sin(direction) * axes[1, 1]) > np.cos(0.1)
 
 

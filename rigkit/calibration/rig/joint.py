@@ -49,6 +49,7 @@ could: it is not good."""
 MIN_SHARE = 0.5
 """More of the shared targets must agree than disagree."""
 MAX_ROUNDS = 8
+"""The rig is solved so many times at most, each time without the frames that disagreed."""
 NAMED = 3
 """So many of the frames that disagree are named."""
 TRIED = 6

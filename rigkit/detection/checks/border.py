@@ -61,7 +61,7 @@ there is no white margin, a sheet that lies along the squares looks like a borde
 MIN_STEP = 0.3
 """Steps of brightness from which the end of a square is looked for, on the same scale."""
 
-DARK = 0.35
+MAX_NEXT_DARK = 0.35
 """The next dark square is darker than this, on the same scale."""
 
 MIN_OUTER_CONTRAST = 0.5
@@ -213,7 +213,7 @@ def _above(image: GreyImage, lattice: Lattice) -> Beyond:
     border &= np.abs(relative - level) < EVEN
     if (usable & steps).sum() >= MIN_OF_KIND and border[usable].mean() >= AGREEING_SQUARES:
         return Beyond(Side.BORDER, level)
-    goes_on = np.where(squares.bright, relative < DARK, relative > 1.0 - DARK)
+    goes_on = np.where(squares.bright, relative < MAX_NEXT_DARK, relative > 1.0 - MAX_NEXT_DARK)
     return Beyond(Side.GOES_ON if goes_on[usable].mean() >= AGREEING_SQUARES else Side.UNKNOWN)
 
 

@@ -52,7 +52,7 @@ WAVY_BY_NOISE = 2.5
 circles."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
-ROUNDS = 40
+MAX_NEW_RINGS = 40
 """Rings of circles that a grid may grow by."""
 MAX_UNEXPLAINED, MAX_MISSHAPEN, MAX_DISPLACED = 0.2, 0.08, 0.04
 """Of `GridEvidence`, for a grid: real and rendered ones reach 0.064, 0.073 and 0.008 (47 of them, to a blur of 3 px or
@@ -176,7 +176,7 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
 
 def _with_all(grey: GreyImage, draft: _Draft) -> _Draft:
     """Return the draft grown by rings of circles that no blob shows."""
-    for _ in range(ROUNDS):
+    for _ in range(MAX_NEW_RINGS):
         grown = _larger(grey, draft) if _enough(draft) else None
         if grown is None:
             break

@@ -25,7 +25,7 @@ MIN_EVEN, MAX_EVEN = 9, 32
 MIN_SHADED = 3
 """The edge of a shadow that crosses a board passes by several corners; one or two are dirt, or where the board ends."""
 
-NEARBY_CELLS = 3
+USUAL_WITHIN_CELLS = 3
 """Corners so near, in cells, say what is usual there."""
 
 MAX_RELIT_GAIN = 3.0
@@ -166,7 +166,7 @@ def _aside(board: Board | None, sides: FloatArray) -> FloatArray:
 
 def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
     """Return those of the cells `even` (R, C) that are near the `suspect` ones, all of them where few are."""
-    reach = np.ones((2 * NEARBY_CELLS + 1, 2 * NEARBY_CELLS + 1), np.uint8)
+    reach = np.ones((2 * USUAL_WITHIN_CELLS + 1, 2 * USUAL_WITHIN_CELLS + 1), np.uint8)
     near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
     return near if np.count_nonzero(near) >= MIN_EVEN else even
 

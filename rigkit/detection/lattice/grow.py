@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.links import (
-    ASIDE,
+    ASIDE_LENGTHS,
     CONTRAST_RATIO,
     EDGE_PLACES,
     MAX_ASIDE_PX,
@@ -142,7 +142,7 @@ def _rules() -> GrowthRules:
         "max_ring": MAX_RING_PX,
         "line_sine": LINE_SINE,
         "contrast_ratio": CONTRAST_RATIO,
-        "aside": ASIDE,
+        "aside": ASIDE_LENGTHS,
         "min_aside": MIN_ASIDE_PX,
         "max_aside": MAX_ASIDE_PX,
         "least_area": MIN_AREA_PX2,

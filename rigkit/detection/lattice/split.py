@@ -59,7 +59,7 @@ two, a lens may have bent the rows, and the parts are asked what lies between th
 AGREES_CELLS, BETWEEN = 0.12, 8
 """So far apart is what the two parts say of the cells between them, in cells, for the cells that both know best."""
 
-LOOSE_CELLS, MAX_GAIN = 0.08, 8.0
+LOOSE_CELLS, MAX_HELD_GAIN = 0.08, 8.0
 """A corner that hangs on to a lattice is this near to where the others say, in cells for a prediction as good as a
 corner itself, and by a prediction whose standard deviation is at most so many times that of a corner."""
 
@@ -161,7 +161,7 @@ def _absorb(lattice: Lattice, groups: list[BoolArray]) -> None:
             distance = np.hypot(*(fit.pixels - lattice.pixels[loose]).T)
             with np.errstate(divide="ignore", invalid="ignore"):
                 cells = distance / (side * np.hypot(1.0, fit.gain))
-            off[number][loose] = np.where((fit.support >= 3) & (fit.gain < MAX_GAIN), cells, np.inf)
+            off[number][loose] = np.where((fit.support >= 3) & (fit.gain < MAX_HELD_GAIN), cells, np.inf)
         best = off.argmin(axis=0)
         added = loose & (off.min(axis=0) < LOOSE_CELLS)
         if not added.any():

@@ -23,7 +23,7 @@ MIN_DEVIATION = 0.02
 MIDDLE, GAIN = 127.5, 50.0
 """Grey levels of the local mean, and of one local deviation."""
 
-DARK, BRIGHT = 25.0, 205.0
+DARK_LEVEL, BRIGHT_LEVEL = 25.0, 205.0
 """Grey levels that the dark and the bright squares are stretched to."""
 
 
@@ -38,7 +38,7 @@ def equalised(grey: GreyImage) -> FloatImage:
 
 
 def stretched(grey: GreyImage, boards: list[FloatArray]) -> GreyImage:
-    """Return `grey` linear in brightness, 0..255, with the squares of `boards` between DARK and BRIGHT.
+    """Return `grey` linear in brightness, 0..255, with the squares of `boards` between DARK_LEVEL and BRIGHT_LEVEL.
 
     `boards` : (R, C, 2) pixels of the corners each, NaN where unknown; without any the image comes back as it is.
     """
@@ -48,6 +48,6 @@ def stretched(grey: GreyImage, boards: list[FloatArray]) -> GreyImage:
     if not len(middles):
         return grey
     low, high = np.quantile(sample(grey, middles), (0.1, 0.9))
-    gain = (BRIGHT - DARK) / max(float(high - low), 1e-6)
-    values = (grey.astype(np.float32) - np.float32(low)) * np.float32(gain) + np.float32(DARK)
+    gain = (BRIGHT_LEVEL - DARK_LEVEL) / max(float(high - low), 1e-6)
+    values = (grey.astype(np.float32) - np.float32(low)) * np.float32(gain) + np.float32(DARK_LEVEL)
     return np.asarray(np.clip(values, 0.0, 255.0), np.float32)

@@ -22,7 +22,7 @@ from rigkit.detection.subpixel.subpixel import LAST_PASS
 LOOKED_AT_PX = 1.5
 """Boards whose edges are as wide, s, are looked at: below, a motion is less than twice the blur that it is added to."""
 
-UNEVEN, WIDE_PX = 1.5, 4.0
+UNEVEN_WIDTHS, WIDE_PX = 1.5, 4.0
 """Blur is made even where its s in one direction is so many times that in the other; or so many px: noise that
 was there before the blur, and what the print and the codec do, is then alike over more pixels than `correlation` looks
 at, and windows begin to end within the edges."""
@@ -52,7 +52,7 @@ def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resam
     widths = np.sqrt(variances).clip(
         MIN_WIDTH_PX, max(MAX_WIDTH_CELLS * float(np.median(shape.cell_px())), MIN_WIDTH_PX)
     )
-    if widths[1] < UNEVEN * widths[0] and widths[1] < WIDE_PX:
+    if widths[1] < UNEVEN_WIDTHS * widths[0] and widths[1] < WIDE_PX:
         return None
     # Symmetric: what is upright stays nearly so.
     per_blur = (axes / widths) @ axes.T

@@ -28,10 +28,10 @@ SUSPECT_RESIDUAL = 1.5
 """Outermost corners that fit worse than this times what is typical of the inner ones may have more in their windows:
 chance makes 1.15."""
 
-STEPS = np.arange(0.1, 1.6001, 0.05)
+STEPS_SQUARES = np.arange(0.1, 1.6001, 0.05)
 """Where brightness is read, in squares outwards."""
 
-ASIDE = 0.4
+ASIDE_SQUARES = 0.4
 """And so far to both sides of the edge, in squares: near the middles of the squares, where blur leaves most of their
 difference, but still inside where the edge is bent."""
 
@@ -127,9 +127,9 @@ def outer_squares(
 @functools.cache
 def _rules() -> PaperRules:
     return PaperRules.of(
-        steps=STEPS,
-        step_count=len(STEPS),
-        aside=ASIDE,
+        steps=STEPS_SQUARES,
+        step_count=len(STEPS_SQUARES),
+        aside=ASIDE_SQUARES,
         first=FIRST,
         last=LAST,
         goes_on=GOES_ON,

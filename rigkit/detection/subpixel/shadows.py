@@ -24,7 +24,7 @@ board, where squares may be cut, only the nearer ones are looked at."""
 MIN_SHADOW_ASIDE_PX = 1.0
 """Nearer to a line its blur is seen, and nothing else."""
 
-UNEVEN = 0.4
+UNEVEN_LIGHT = 0.4
 """Opposite squares differ by more than this part of the contrast beside the edges of shadows that leave less than two
 thirds of the light: REAL images without any had 63 such corners of 10 700, most of them at the ends of boards."""
 
@@ -95,7 +95,7 @@ def beside_shadows(
 
     `aside` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
     """
-    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, MIN_SHADOW_ASIDE_PX, UNEVEN)
+    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, MIN_SHADOW_ASIDE_PX, UNEVEN_LIGHT)
 
 
 def light_steps(

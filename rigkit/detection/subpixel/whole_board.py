@@ -61,7 +61,7 @@ END_SIGMA, PAPER_SIGMA, BLUR_SIGMA = 0.1, 1.0, 0.1
 """How well it is known beforehand how large the outer squares are, in squares, how bright it is beyond them, in half
 contrasts, and that blur is everywhere the same, relative."""
 
-ROUNDS, SETTLED_SIGMAS = 6, 0.3
+MAX_STEPS, SETTLED_SIGMAS = 6, 0.3
 """Gauss-Newton steps at most; one that moves corners by less than this, in their sigmas, is the last: the next one
 would by a fifth of it."""
 
@@ -177,7 +177,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     rows, columns = pixels.shape[:2]
     light = [int(np.ceil((count - 1) / LIGHT_SQUARES)) + 1 for count in (rows, columns)]
     state, there = _State(start, window.ends, np.zeros(4), blur / scale, np.zeros((3, *light))), ~around.holes
-    for turn in range(ROUNDS):
+    for turn in range(MAX_STEPS):
         step = _step(window, state, start=turn == 0)
         if step is None:
             return None

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.lattice.links import (
     ARM_COSINE,
-    ASIDE,
+    ASIDE_LENGTHS,
     CONTRAST_RATIO,
     EDGE_PLACES,
     LENGTH_RATIO,
@@ -356,7 +356,7 @@ def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, e
     """Return whether the edge between the corners is there, with the polarity of the arm."""
     first, last = to_level(level, corners.pixels[start]), to_level(level, corners.pixels[end])
     length = np.linalg.norm(last - first, axis=1)
-    offset = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
+    offset = np.clip(ASIDE_LENGTHS * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
     sign = np.where(arm % 2 == 0, 1.0, -1.0)
     difference = edge_contrast(level.smooth, first, last, sign, offset)
     weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])

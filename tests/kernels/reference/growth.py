@@ -30,7 +30,7 @@ from rigkit.detection.lattice.grow import (
 )
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.links import (
-    ASIDE,
+    ASIDE_LENGTHS,
     CONTRAST_RATIO,
     MAX_ASIDE_PX,
     MIN_ASIDE_PX,
@@ -225,7 +225,7 @@ def _edges_seen(
     end = to_level(level, lattice.pixels[row, column][which, direction])
     length = np.linalg.norm(end - local[which], axis=1)
     side = np.where(direction % 2 == 0, sign[which], -sign[which])
-    aside = np.clip(ASIDE * length, MIN_ASIDE_PX, MAX_ASIDE_PX)
+    aside = np.clip(ASIDE_LENGTHS * length, MIN_ASIDE_PX, MAX_ASIDE_PX)
     difference = edge_contrast(level.smooth, local[which], end, side, aside)
     weakest = CONTRAST_RATIO * np.minimum(lattice.contrast[row, column][which, direction], contrast[which])
     seen = np.ones(len(cell), np.bool_)

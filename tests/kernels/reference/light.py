@@ -14,7 +14,7 @@ from rigkit.detection.subpixel.shadows import (
     MIN_SHADOW_ASIDE_PX,
     SEEN_ALONG,
     SEEN_ASIDE,
-    UNEVEN,
+    UNEVEN_LIGHT,
 )
 from rigkit.kernels.light import LIGHT_ASIDE
 
@@ -55,7 +55,7 @@ def beside_shadows(
     values = sample(image, places)
     contrast: FloatArray = np.abs(values[:, :, :, 1] - values[:, :, :, 0]).max(axis=(2, 3))
     apart = np.abs(values[..., 1] - values[..., 0]).max(axis=(2, 3))
-    uneven: BoolArray = np.asarray(apart > UNEVEN * contrast)
+    uneven: BoolArray = np.asarray(apart > UNEVEN_LIGHT * contrast)
     uneven[ends, 1:] = False
     return np.asarray(seen & uneven.any(axis=1))
 

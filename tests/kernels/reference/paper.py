@@ -13,7 +13,7 @@ from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.edge_model import Geometry
 from rigkit.detection.subpixel.outer_squares import (
-    ASIDE,
+    ASIDE_SQUARES,
     CUT,
     FIRST,
     GOES_ON,
@@ -21,7 +21,7 @@ from rigkit.detection.subpixel.outer_squares import (
     MAX_PAPER,
     NEAR_WITNESS,
     SEEN,
-    STEPS,
+    STEPS_SQUARES,
 )
 
 OUTWARDS: FloatArray = np.array([[0.0, -1.0], [0.0, 1.0], [1.0, 0.0], [-1.0, 0.0]])
@@ -42,13 +42,13 @@ def with_paper(image: GreyImage, geometry: Geometry, fit: EdgeFit, sign: FloatAr
     contrast, blur = _middle(fit.contrast[who], beside), _middle(fit.blur[who], beside)
     with np.errstate(invalid="ignore", divide="ignore"):
         end, found = _end((one - other) / (contrast * _left(geometry, who, which, blur))[:, None])
-        step = STEPS[1] - STEPS[0]
-        at = (end + blur / cell - STEPS[0]) / step
-        first = np.nan_to_num(at).clip(0.0, len(STEPS) - 2.0).astype(np.int64)
+        step = STEPS_SQUARES[1] - STEPS_SQUARES[0]
+        at = (end + blur / cell - STEPS_SQUARES[0]) / step
+        first = np.nan_to_num(at).clip(0.0, len(STEPS_SQUARES) - 2.0).astype(np.int64)
         mean, k = 0.5 * (one + other), np.arange(len(who))
         level = mean[k, first] + (at - first) * (mean[k, first + 1] - mean[k, first])
         bright = (level - sample(image, fit.pixels[who])) / (0.5 * contrast * SEEN)
-        found &= (at <= len(STEPS) - 1.0) & (np.abs(bright) < MAX_PAPER)
+        found &= (at <= len(STEPS_SQUARES) - 1.0) & (np.abs(bright) < MAX_PAPER)
         # Sheets are cut straight, and paper is alike: what noise makes of a single reading, its neighbours do not say.
         end, bright = (_middle(np.where(found, values, np.nan), beside) for values in (end, bright))
         found = np.isfinite(end)
@@ -62,7 +62,7 @@ def _left(geometry: Geometry, who: IntArray, which: IntArray, blur: FloatArray) 
     """Return (M,) what blur leaves of the difference of the two squares beside each way out."""
     # Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares.
     across = geometry.gaps[who, 1 - which // 2].mean(axis=1) / (np.sqrt(2.0) * blur)
-    return np.array([erf(ASIDE * x) + erf((1.0 - ASIDE) * x) - 1.0 for x in across.tolist()])
+    return np.array([erf(ASIDE_SQUARES * x) + erf((1.0 - ASIDE_SQUARES) * x) - 1.0 for x in across.tolist()])
 
 
 def _beside(geometry: Geometry, pixels: FloatArray, owner: IntArray, who: IntArray, which: IntArray) -> BoolArray:
@@ -91,10 +91,10 @@ def _middle(values: FloatArray, beside: BoolArray) -> FloatArray:
 def _beside_the_way_out(
     image: GreyImage, geometry: Geometry, fit: EdgeFit, who: IntArray, which: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, STEPS) each, NaN
+    """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, STEPS_SQUARES) each, NaN
     outside the image."""
-    outwards = OUTWARDS[which][:, None] * STEPS[:, None]
-    across = ASIDE * OUTWARDS[which][:, None, ::-1]
+    outwards = OUTWARDS[which][:, None] * STEPS_SQUARES[:, None]
+    across = ASIDE_SQUARES * OUTWARDS[which][:, None, ::-1]
     cells = np.stack([outwards + across, outwards - across])
     places = fit.pixels[who, None] + np.einsum("ankc,ncp->ankp", cells, geometry.sides[who])
     inside = ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=3)
@@ -103,14 +103,16 @@ def _beside_the_way_out(
 
 
 def _end(differs: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return where (M,), in squares, the relative differences (M, STEPS) end, and which of them do."""
-    k, far = np.arange(len(differs)), np.arange(len(STEPS))
-    near = np.where(np.isfinite(differs) & (STEPS < FIRST), np.abs(differs), -1.0)
+    """Return where (M,), in squares, the relative differences (M, STEPS_SQUARES) end, and which of them do."""
+    k, far = np.arange(len(differs)), np.arange(len(STEPS_SQUARES))
+    near = np.where(np.isfinite(differs) & (STEPS_SQUARES < FIRST), np.abs(differs), -1.0)
     peak = near.argmax(axis=1)
     differs = differs * np.sign(differs[k, peak])[:, None]
     over = (differs < 0.5) & (far > peak[:, None])
     at = np.maximum(over.argmax(axis=1), 1)
     before, after = differs[k, at - 1], differs[k, at]
-    end: FloatArray = STEPS[at] - (0.5 - after) / np.maximum(before - after, 1e-9) * (STEPS[1] - STEPS[0])
+    end: FloatArray = STEPS_SQUARES[at] - (0.5 - after) / np.maximum(before - after, 1e-9) * (
+        STEPS_SQUARES[1] - STEPS_SQUARES[0]
+    )
     goes_on = ((differs < GOES_ON) & (far > at[:, None])).any(axis=1)
     return end, over.any(axis=1) & (end < LAST) & ~(goes_on & (end > CUT))
