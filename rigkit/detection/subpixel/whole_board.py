@@ -45,7 +45,7 @@ SHARP_PX = 0.7
 MAP_RINGS = 2
 """The map goes on so many squares beyond the corners: blur brings no more of what is there into their windows."""
 
-TAIL_SIGMAS, CHANGE_SIGMAS = 4.0, 2.75
+PICTURE_SIGMAS, CHANGE_SIGMAS = 4.0, 2.75
 """Pictures are blurred from so far away, s, and their changes, which only lead to the corners."""
 
 AROUND = 0.25
@@ -170,7 +170,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     # Blur leaves nothing that larger pixels would not show.
     steps = [float(np.linalg.norm(np.diff(pixels, axis=axis), axis=2).min()) for axis in (0, 1)]
     scale = max(int(min(blur / MIN_BLUR_OF_BOARD, min(steps) / MIN_SQUARE)), 1)
-    window = BoardWindow.around(image, pixels, scale, int(np.ceil(TAIL_SIGMAS * blur)), around)
+    window = BoardWindow.around(image, pixels, scale, int(np.ceil(PICTURE_SIGMAS * blur)), around)
     if window is None:
         return None
     start = (pixels - window.first) / scale
@@ -200,7 +200,7 @@ def _step(window: BoardWindow, state: _State, *, start: bool) -> tuple[_State, F
     if count < state.pixels.size:
         return None
     rest_blur = float(np.sqrt(max(state.blur**2 - SHARP_PX**2, 0.25)))
-    taps, short = _taps(rest_blur, TAIL_SIGMAS), _taps(rest_blur, CHANGE_SIGMAS)
+    taps, short = _taps(rest_blur, PICTURE_SIGMAS), _taps(rest_blur, CHANGE_SIGMAS)
     planes = board_picture(places, size, state.ends, state.paper, SHARP_PX)
     pattern = _blurred(planes[0], taps)
     beyond = [_blurred(plane, taps) for plane in planes[3:]]

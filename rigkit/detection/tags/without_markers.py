@@ -21,8 +21,8 @@ from rigkit.detection.subpixel.whole_board import (
     AROUND,
     MAP_RINGS,
     MAX_HOLES,
+    PICTURE_SIGMAS,
     SHARP_PX,
-    TAIL_SIGMAS,
     spline_coefficients,
 )
 from rigkit.kernels.boards import Picture, board_picture, board_places
@@ -64,7 +64,7 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     around = extended(pixels, MAP_RINGS)
     if not np.isfinite(around).all():
         return None
-    left, top, width, height = box = _box(image, around, TAIL_SIGMAS * blur)
+    left, top, width, height = box = _box(image, around, PICTURE_SIGMAS * blur)
     places = board_places(spline_coefficients(around), box, AROUND) - MAP_RINGS
     square_px = float(np.median(fit_cells(pixels, np.ones_like(known), degree=1).cell_px()))
     rest_blur = float(np.sqrt(max(blur**2 - SHARP_PX**2, 0.25)))
