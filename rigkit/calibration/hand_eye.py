@@ -18,11 +18,11 @@ import numpy as np
 
 from rigkit.calibration.clustered import Clustered, clustered_covariance, effective_freedom, widening
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle, skew
 from rigkit.optim.damping import Damping, Stop
@@ -176,10 +176,12 @@ def _moved(state: tuple[Rigid3, Rigid3], step: DenseStep) -> tuple[Rigid3, Rigid
 
 
 def _pose(camera: Camera, view: BoardView) -> Rigid3:
-    rays, valid = camera.unproject(view.pixels)
-    if valid.sum() < MIN_POSES + 1:
-        raise InputError(f"hand-eye: image '{view.image}' has no four corners that the camera can see; leave it out")
-    return board_pose(rays[valid], view.points()[valid]).cam_from_board
+    try:
+        return cam_from_seen_board(camera, view.pixels, view.points())
+    except DegenerateError as error:
+        raise InputError(
+            f"hand-eye: image '{view.image}' has no four corners, not all in line, that the camera can see; leave it out"
+        ) from error
 
 
 def _mismatch(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> FloatArray:

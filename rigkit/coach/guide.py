@@ -11,13 +11,13 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
 from rigkit.coach.look import Glance
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal, projection_goal, px_words, turned_design
@@ -240,9 +240,8 @@ def _distinct(views: Sequence[BoardView]) -> int:
 
 
 def _pose(camera: Camera, view: BoardView) -> Rigid3 | None:
-    rays, valid = camera.unproject(view.pixels)
     try:
-        return board_pose(rays[valid], view.points()[valid]).cam_from_board
+        return cam_from_seen_board(camera, view.pixels, view.points())
     except (InputError, DegenerateError):
         return None
 

@@ -14,13 +14,13 @@ from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.usable import views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.geometry.board_pose import board_pose
 from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
@@ -251,9 +251,8 @@ def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before
     if not same or not view.board.looks_same_turned:
         return view
     first = same[0]
-    rays, valid = watched.cameras[first.camera].unproject(first.view.pixels)
     try:
-        pose = board_pose(rays[valid], first.view.points()[valid]).cam_from_board
+        pose = cam_from_seen_board(watched.cameras[first.camera], first.view.pixels, first.view.points())
     except (InputError, DegenerateError):
         return view
     here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose

@@ -59,9 +59,9 @@ def export_cloud(
     if options.kind != "colmap":
         ensure_writable(options.output, force=options.force, inputs=known.inputs)
     pair.require_images()
-    cameras = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
-    matched, image1, _ = match_images(pair, *(loaded.camera for loaded in cameras), "raw")
-    r = with_whole_sigmas(reconstruct_with(matched, pair, options.method, image1), pair.planes, *cameras)
+    camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
+    matched, image1, _ = match_images(pair, camera1.camera, camera2.camera, "raw")
+    r = with_whole_sigmas(reconstruct_with(matched, pair, options.method, image1), pair.planes, camera1, camera2)
     folder, files = options.output, dict[str, str | bytes]()
     if options.kind == "colmap":
         model, notes = colmap_model(

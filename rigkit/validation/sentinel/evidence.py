@@ -20,11 +20,11 @@ from rigkit.calibration.poses import refine_poses
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.planning.information import MIN_SIGMA_PX, observations_of
@@ -275,13 +275,13 @@ def _posed(watched: Watched, c: int, observations: Observations) -> tuple[State,
     stray."""
     camera, poses = watched.cameras[c], []
     for view in observations.views:
-        rays, valid = camera.unproject(view.pixels)
-        if valid.sum() < 4:
+        try:
+            poses.append(cam_from_seen_board(camera, view.pixels, view.points()))
+        except DegenerateError as error:
             raise DegenerateError(
                 f"image '{view.image}': the lens does not see where board '{view.board.board_id}' is; "
                 "check the board's size"
-            )
-        poses.append(board_pose(rays[valid], view.points()[valid]).cam_from_board)
+            ) from error
     rotation = np.array([pose.rotation for pose in poses])
     translation = np.array([pose.translation_mm for pose in poses])
     state = watched.state(c, observations, rotation, translation)

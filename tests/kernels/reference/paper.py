@@ -91,7 +91,7 @@ def _middle(values: FloatArray, beside: BoolArray) -> FloatArray:
 def _beside_the_way_out(
     image: GreyImage, geometry: Geometry, fit: EdgeFit, who: IntArray, which: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, STEPS_SQUARES) each, NaN
+    """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, steps) each, NaN
     outside the image."""
     outwards = OUTWARDS[which][:, None] * STEPS_SQUARES[:, None]
     across = ASIDE_SQUARES * OUTWARDS[which][:, None, ::-1]
@@ -103,7 +103,7 @@ def _beside_the_way_out(
 
 
 def _end(differs: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return where (M,), in squares, the relative differences (M, STEPS_SQUARES) end, and which of them do."""
+    """Return where (M,), in squares, the relative differences (M, steps) end, and which of them do."""
     k, far = np.arange(len(differs)), np.arange(len(STEPS_SQUARES))
     near = np.where(np.isfinite(differs) & (STEPS_SQUARES < FIRST), np.abs(differs), -1.0)
     peak = near.argmax(axis=1)
