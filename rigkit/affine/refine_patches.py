@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import Affines, BoolArray, FloatArray, Pixels
-from rigkit.kernels.patches import MOST_LEVELS, PatchRules, Pyramid, aligned, starts_of
+from rigkit.kernels.patches import MAX_LEVELS, PatchRules, Pyramid, aligned, starts_of
 
 PATCH_STEPS = 20
 HALF_WIDTH_OF_FEATURE = 16
@@ -61,7 +61,7 @@ def patch_pyramid(grey: NDArray[np.generic]) -> Pyramid:
     import cv2
 
     levels = [np.asarray(cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), BLUR_PX), np.float32)]
-    while len(levels) < MOST_LEVELS and min(levels[-1].shape) >= 2 * MIN_LEVEL_SIDE_PX:
+    while len(levels) < MAX_LEVELS and min(levels[-1].shape) >= 2 * MIN_LEVEL_SIDE_PX:
         levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
     return Pyramid.make(levels)
 

@@ -180,7 +180,7 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3:
         return cam_from_seen_board(camera, view.pixels, view.points())
     except DegenerateError as error:
         raise InputError(
-            f"hand-eye: image '{view.image}' has no four corners, not all in line, that the camera can see; leave it out"
+            f"hand-eye: image '{view.image}' has no four corners that the camera sees, not all in line; leave it out"
         ) from error
 
 

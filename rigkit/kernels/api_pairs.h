@@ -4,9 +4,9 @@
 
 /* five_point.c, with roots.c */
 
-enum { MOST_ROOTS = 10 };
+enum { MAX_ROOTS = 10 };
 
-EXPORT void five_rows(ARRAY(const double, rows, count, 5, 9), int64_t count, ARRAY(double, out, count, MOST_ROOTS, 3, 3));
+EXPORT void five_rows(ARRAY(const double, rows, count, 5, 9), int64_t count, ARRAY(double, out, count, MAX_ROOTS, 3, 3));
 
 /* six_point.c */
 
@@ -55,11 +55,11 @@ EXPORT int64_t minimise(
 /* Levels of a pyramid; the largest half side of a patch in samples; what is said of a patch: place in image 2, affinity row
  * by row, correlation, variance of its brightness, how many levels coarser it was aligned than the images' sharpness asks
  * for, and the upper triangle of the covariance of place and affinity, row by row. */
-enum { MOST_LEVELS = 8, MOST_HALF = 16, PATCH_COLUMNS = 9 + 21 };
+enum { MAX_LEVELS = 8, MAX_HALF = 16, PATCH_COLUMNS = 9 + 21 };
 
 /* An image and its halvings: pixel of level l = pixel of the image / 2^l. */
 typedef struct {
-    image_t levels[MOST_LEVELS];
+    image_t levels[MAX_LEVELS];
     int64_t count;
 } pyramid_t;
 

@@ -185,9 +185,9 @@ INLINE int solve_at(const pencil_t *pencil, double z, double place[3])
  * (minimal.essential_from_five_rows). */
 INLINE void solve_five(const double *rows, double *out)
 {
-    double basis[4 * 9], cubics[CUBICS][MONOMIALS], given[CUBICS][MONOMIALS], p[DEGREE + 1], roots[MOST_ROOTS];
+    double basis[4 * 9], cubics[CUBICS][MONOMIALS], given[CUBICS][MONOMIALS], p[DEGREE + 1], roots[MAX_ROOTS];
     pencil_t pencil;
-    for (int i = 0; i < 9 * MOST_ROOTS; i++)
+    for (int i = 0; i < 9 * MAX_ROOTS; i++)
         out[i] = NAN;
     null_space(rows, 5, basis);
     constraints(basis, cubics);
@@ -211,7 +211,7 @@ INLINE void solve_five(const double *rows, double *out)
         if (violation(E) < NONE)
             written++;
     }
-    for (int i = 9 * written; i < 9 * MOST_ROOTS; i++)
+    for (int i = 9 * written; i < 9 * MAX_ROOTS; i++)
         out[i] = NAN;
 }
 
@@ -219,5 +219,5 @@ INLINE void solve_five(const double *rows, double *out)
 FOR_EACH_PROCESSOR void five_rows(const double *rows, int64_t count, double *out)
 {
     for (int64_t b = 0; b < count; b++)
-        solve_five(rows + 45 * b, out + 9 * MOST_ROOTS * b);
+        solve_five(rows + 45 * b, out + 9 * MAX_ROOTS * b);
 }

@@ -3,7 +3,7 @@
  * The definitions in numpy are in tests/kernels/reference/growth.py, the numbers in rigkit.detection.lattice. */
 #include "kernels.h"
 
-enum { MOST_TERMS = 10, MOST_DEGREE = 3, MOST_RADIUS = 3, MOST_TRIED = 16 };
+enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
 
 /* The smallest pull on any term: no pivot of the exact normal equations is smaller, whatever rounding makes of it. */
 static const double LEAST_PULL = 1e-12;
@@ -15,7 +15,7 @@ typedef struct {
 } fit_t;
 
 /* Solve the n x n symmetric `matrix` for three right-hand sides in place (LDL'). */
-INLINE void solve(double matrix[MOST_TERMS][MOST_TERMS], double right[MOST_TERMS][3], const int n)
+INLINE void solve(double matrix[MAX_TERMS][MAX_TERMS], double right[MAX_TERMS][3], const int n)
 {
     for (int k = 0; k < n; k++) {
         const double pivot = matrix[k][k] > LEAST_PULL ? matrix[k][k] : LEAST_PULL;
@@ -39,15 +39,15 @@ INLINE void solve(double matrix[MOST_TERMS][MOST_TERMS], double right[MOST_TERMS
 }
 
 /* The powers of column and row in a polynomial's terms. */
-static const int POWER_C[MOST_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
-static const int POWER_R[MOST_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
+static const int POWER_C[MAX_TERMS] = {0, 1, 0, 2, 1, 0, 3, 2, 1, 0};
+static const int POWER_R[MAX_TERMS] = {0, 0, 1, 0, 1, 2, 0, 1, 2, 3};
 
 /* What a fit takes from the cells around one: which cells, their weights, sums of weight * column^i * row^j, and those with
  * the positions (from a corner `near`by, against cancellation). */
 typedef struct {
     int64_t row, column, low_r, low_c, high_r, high_c, support;
-    double moment[2 * MOST_DEGREE + 1][2 * MOST_DEGREE + 1], position[MOST_TERMS][2], near[2];
-    double weights[2 * MOST_RADIUS + 1][2 * MOST_RADIUS + 1];
+    double moment[2 * MAX_DEGREE + 1][2 * MAX_DEGREE + 1], position[MAX_TERMS][2], near[2];
+    double weights[2 * MAX_RADIUS + 1][2 * MAX_RADIUS + 1];
 } surroundings_t;
 
 /* Add the known cells of row `r`. */
@@ -55,7 +55,7 @@ INLINE void add_row(
     const double *lattice, int64_t columns, int64_t r, const int degree, const fit_rules_t *rules, const double *bell,
     surroundings_t *at)
 {
-    double line[2 * MOST_DEGREE + 1] = {0.0}, line_u[MOST_DEGREE + 1] = {0.0}, line_v[MOST_DEGREE + 1] = {0.0};
+    double line[2 * MAX_DEGREE + 1] = {0.0}, line_u[MAX_DEGREE + 1] = {0.0}, line_v[MAX_DEGREE + 1] = {0.0};
     const int64_t row = at->row, column = at->column;
     int64_t found = 0;
     for (int64_t c = at->low_c; c <= at->high_c; c++) {
@@ -86,7 +86,7 @@ INLINE void add_row(
         return;
     at->support += found;
     const double y = (double)(r - row);
-    double powers[2 * MOST_DEGREE + 1];
+    double powers[2 * MAX_DEGREE + 1];
     powers[0] = 1.0;
     for (int j = 1; j <= 2 * degree; j++)
         powers[j] = powers[j - 1] * y;
@@ -101,7 +101,7 @@ INLINE void add_row(
 
 /* Return by how much the value at the cell grows with independent errors of the positions around it, `solved` being the
  * polynomial of the cell's own column of the inverse. */
-INLINE double gain_of(const surroundings_t *at, const int degree, double solved[MOST_TERMS][3])
+INLINE double gain_of(const surroundings_t *at, const int degree, double solved[MAX_TERMS][3])
 {
     double gain = 0.0;
     for (int64_t r = at->low_r; r <= at->high_r; r++) {
@@ -136,8 +136,8 @@ INLINE void fit_polynomial(
         add_row(lattice, columns, r, degree, rules, bell, &at);
     const double total = at.moment[0][0] > LEAST_PULL ? at.moment[0][0] : LEAST_PULL;
     const double centre_u = at.position[0][0] / total, centre_v = at.position[0][1] / total;
-    double normal[MOST_TERMS][MOST_TERMS], solved[MOST_TERMS][3];
-    const double pull[MOST_DEGREE + 1] = {LEAST_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
+    double normal[MAX_TERMS][MAX_TERMS], solved[MAX_TERMS][3];
+    const double pull[MAX_DEGREE + 1] = {LEAST_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
     for (int k = 0; k < terms; k++) {
         for (int j = k; j < terms; j++)
             normal[k][j] = at.moment[POWER_C[k] + POWER_C[j]][POWER_R[k] + POWER_R[j]];
@@ -185,7 +185,7 @@ FOR_EACH_PROCESSOR void fit_cells(
 {
     (void)count;
     fit_t *fits = (fit_t *)out;
-    double bell[MOST_RADIUS + 1];
+    double bell[MAX_RADIUS + 1];
     fill_bell(rules, bell);
     for (int64_t row = 0; row < rows; row++)
         for (int64_t column = 0; column < columns; column++)
@@ -204,7 +204,7 @@ int64_t squares_memory(int64_t count) { return SQUARES_MEMORY(count); }
 /* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
 static int64_t nearest_points(const squares_t *squares, double u, double v, double reach, int64_t most, int64_t *found)
 {
-    double distance[MOST_TRIED];
+    double distance[MAX_TRIED];
     int64_t count = 0;
     const int64_t low_c = square_at(u - reach, squares->left, squares->side, squares->columns);
     const int64_t high_c = square_at(u + reach, squares->left, squares->side, squares->columns);
@@ -297,8 +297,8 @@ INLINE int try_cell(
     const double longest = side_a > side_b ? side_a : side_b, area = a[0] * b[1] - a[1] * b[0];
     if (!(area > rules->least_area))
         return 0;
-    int64_t near[MOST_TRIED];
-    double off[MOST_TRIED];
+    int64_t near[MAX_TRIED];
+    double off[MAX_TRIED];
     const int64_t count =
         nearest_points(saddles, fit.pixel[0], fit.pixel[1], rules->reach * longest, rules->tried, near);
     for (int64_t k = 0; k < count; k++) {
@@ -356,7 +356,7 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
         int64_t count = 0;
         for (int way = 0; way < 2 && count == 0; way++) {
             const fit_rules_t *prediction = &rules->predictions[way];
-            double bell[MOST_RADIUS + 1];
+            double bell[MAX_RADIUS + 1];
             fill_bell(prediction, bell);
             for (int64_t row = 0; row < rows; row++)
                 for (int64_t column = 0; column < columns; column++) {
@@ -376,8 +376,8 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             sheet->contrast[where[k]] = fresh[3 * k + 2];
             /* What failed before may be foretold otherwise now, within the reach of the fits. */
             const int64_t row = where[k] / columns, column = where[k] % columns;
-            for (int64_t r = row - MOST_RADIUS; r <= row + MOST_RADIUS; r++)
-                for (int64_t c = column - MOST_RADIUS; c <= column + MOST_RADIUS; c++)
+            for (int64_t r = row - MAX_RADIUS; r <= row + MAX_RADIUS; r++)
+                for (int64_t c = column - MAX_RADIUS; c <= column + MAX_RADIUS; c++)
                     if (r >= 0 && c >= 0 && r < rows && c < columns)
                         sheet->due[r * columns + c] = sheet->due[(rows + r) * columns + c] = 1;
         }

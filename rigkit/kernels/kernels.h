@@ -198,10 +198,10 @@ INLINE int edge_seen(
 
 /* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that
  * are too far. */
-#define MOST_SQUARES(count) ((count) / 2 + 8)
+#define MAX_SQUARES(count) ((count) / 2 + 8)
 
 /* int32_t that `fill_squares` needs. */
-#define SQUARES_MEMORY(count) (MOST_SQUARES(count) + 1 + 2 * (count))
+#define SQUARES_MEMORY(count) (MAX_SQUARES(count) + 1 + 2 * (count))
 
 INLINE int64_t square_at(double position, double least, double side, int64_t count)
 {
@@ -220,7 +220,7 @@ INLINE void fill_squares(const double *points, int64_t count, double side, int32
         top = v < top ? v : top;
         bottom = v > bottom ? v : bottom;
     }
-    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > (double)MOST_SQUARES(count))
+    while (((right - left) / side + 1.0) * ((bottom - top) / side + 1.0) > (double)MAX_SQUARES(count))
         side *= 1.4;
     const int64_t columns = (int64_t)((right - left) / side) + 1, rows = (int64_t)((bottom - top) / side) + 1;
     const int64_t size = columns * rows;

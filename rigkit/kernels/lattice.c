@@ -43,7 +43,7 @@ void uneven_steps(
     every[1] = uneven_columns(pixels, columns, rows, 2, 2 * columns, scratch, typical + inner, seen + inner);
 }
 
-enum { MOST_ORDER = 8, PLANE = 8 };
+enum { MAX_ORDER = 8, PLANE = 8 };
 
 /* A part of a sheet, one row after the other: corners, their variance, and room for four numbers for each of them. */
 typedef struct {
@@ -54,7 +54,7 @@ typedef struct {
 /* Return the typical difference of `order` over the expected one, NaN for few (reference.lattice._roughness). */
 static double roughness(const part_t part, int64_t order, const scatter_rules_t *rules)
 {
-    double factor[MOST_ORDER + 1] = {1.0};
+    double factor[MAX_ORDER + 1] = {1.0};
     for (int64_t k = 1; k <= order; k++)
         factor[k] = -factor[k - 1] * (double)(order + 1 - k) / (double)k;
     int64_t count = 0;

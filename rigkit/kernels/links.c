@@ -143,8 +143,8 @@ INLINE void link_arms(
     const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image,
     double scale, double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
 {
-    enum { MOST_CANDIDATES = 512 };
-    candidate_t candidates[MOST_CANDIDATES];
+    enum { MAX_CANDIDATES = 512 };
+    candidate_t candidates[MAX_CANDIDATES];
     const int64_t i = squares->order[place], wanted = rules->neighbours + 1;
     const home_t home = {places->u[place], places->v[place],
                          {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place],
@@ -160,7 +160,7 @@ INLINE void link_arms(
         if (!any)
             continue;
         const int64_t end = first + TOGETHER < count ? first + TOGETHER : count;
-        for (int64_t k = first; k < end && listed < MOST_CANDIDATES; k++) {
+        for (int64_t k = first; k < end && listed < MAX_CANDIDATES; k++) {
             const float square = near->square[k];
             if (!near->meets[k] || count_nearer(near, count, square) >= wanted)
                 continue;

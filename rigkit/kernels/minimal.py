@@ -14,12 +14,12 @@ from rigkit.core.arrays import FloatArray, Mat3
 from rigkit.kernels import kernels
 from rigkit.kernels.declarations import header
 
-MOST_ROOTS = header().constants["MOST_ROOTS"]
+MAX_ROOTS = header().constants["MAX_ROOTS"]
 
 
 def five_rows(rows: FloatArray) -> Mat3:
     """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
-    rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), MOST_ROOTS, 3, 3))
+    rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), MAX_ROOTS, 3, 3))
     kernels().five_rows(rows, len(rows), out)
     return out
 

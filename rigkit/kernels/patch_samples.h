@@ -19,8 +19,8 @@ typedef float four_t __attribute__((vector_size(16), aligned(4)));
 INLINE void read_samples(
     const image_t image, float u, float v, const float A[4], const float *x, const float *y, int64_t count, float *out)
 {
-    int32_t at[MOST_SAMPLES];
-    float across[4][MOST_SAMPLES], down[4][MOST_SAMPLES], sums[4 * MOST_SAMPLES];
+    int32_t at[MAX_SAMPLES];
+    float across[4][MAX_SAMPLES], down[4][MAX_SAMPLES], sums[4 * MAX_SAMPLES];
     const int32_t width = (int32_t)image.width;
 #pragma omp simd
     for (int64_t n = 0; n < count; n++) {
@@ -53,10 +53,10 @@ INLINE void read_samples(
 /* Read `image` at side x side places a pixel apart, from (u, v), which lies at least a pixel inside. */
 INLINE void read_square(const image_t image, float u, float v, int64_t side, float *out)
 {
-    enum { MOST_LINE = MOST_SIDE + 2 };
+    enum { MAX_LINE = MAX_SIDE + 2 };
     const int32_t left = (int32_t)u, top = (int32_t)v;
     const float s = u - (float)left, t = v - (float)top;
-    float across[4], down[4], lines[(MOST_LINE + 3) * MOST_LINE];
+    float across[4], down[4], lines[(MAX_LINE + 3) * MAX_LINE];
     CUBIC(s, across[0], across[1], across[2], across[3]);
     CUBIC(t, down[0], down[1], down[2], down[3]);
     for (int64_t j = 0; j < side + 3; j++) {

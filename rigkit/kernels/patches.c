@@ -39,7 +39,7 @@ INLINE double product(const float *a, const float *b, int64_t count)
 }
 
 /* The products of six rows of samples with one. */
-INLINE void six_products(float rows[UNKNOWNS][MOST_SAMPLES], const float *with, int64_t count, double out[UNKNOWNS])
+INLINE void six_products(float rows[UNKNOWNS][MAX_SAMPLES], const float *with, int64_t count, double out[UNKNOWNS])
 {
     float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f, s5 = 0.0f;
 #pragma omp simd reduction(+ : s0, s1, s2, s3, s4, s5)
@@ -62,9 +62,9 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
     if (!is_inside(image, u - (double)half - 1.0, v - (double)half - 1.0, 0.0) ||
         !is_inside(image, u + (double)half + 1.0, v + (double)half + 1.0, 0.0))
         return 0;
-    float around[(MOST_SIDE + 2) * (MOST_SIDE + 2)];
+    float around[(MAX_SIDE + 2) * (MAX_SIDE + 2)];
     read_square(image, (float)(u - (double)(half + 1)), (float)(v - (double)(half + 1)), wide, around);
-    float gradient_u[MOST_SAMPLES] = {0.0f}, gradient_v[MOST_SAMPLES] = {0.0f};
+    float gradient_u[MAX_SAMPLES] = {0.0f}, gradient_v[MAX_SAMPLES] = {0.0f};
     memset(p->values + side * side, 0, (size_t)(count - side * side) * sizeof(float));
     double mean = 0.0;
     for (int64_t j = 0, k = 0; j < side; j++) {
@@ -100,7 +100,7 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
         for (int64_t k = 0; k < count; k++)
             p->steep[n][k] -= level + slope * p->values[k];
     }
-    float plain[UNKNOWNS][MOST_SAMPLES];
+    float plain[UNKNOWNS][MAX_SAMPLES];
     memcpy(plain, p->steep, sizeof plain);
     for (int64_t n = 0; n < UNKNOWNS; n++)
         for (int64_t k = 0; k < count; k++)

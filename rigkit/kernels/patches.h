@@ -6,15 +6,15 @@
 #include "kernels.h"
 
 /* Samples of a patch are filled up to whole vectors by ones without weight. */
-enum { MOST_SIDE = 2 * MOST_HALF + 1, MOST_SAMPLES = (MOST_SIDE * MOST_SIDE + 15) / 16 * 16, UNKNOWNS = 6 };
+enum { MAX_SIDE = 2 * MAX_HALF + 1, MAX_SAMPLES = (MAX_SIDE * MAX_SIDE + 15) / 16 * 16, UNKNOWNS = 6 };
 
 /* The window, and a patch of image 1 with what the alignment takes from it: `steep` are the derivatives by the six unknowns
  * (the rows of dA, then dq, in the frame of image 1), free of brightness's gain and offset, times the window. */
 typedef struct {
     int64_t half, count;
-    float window[MOST_SAMPLES], u[MOST_SAMPLES], v[MOST_SAMPLES];
-    float values[MOST_SAMPLES], weighted[MOST_SAMPLES], there[MOST_SAMPLES];
-    float steep[UNKNOWNS][MOST_SAMPLES];
+    float window[MAX_SAMPLES], u[MAX_SAMPLES], v[MAX_SAMPLES];
+    float values[MAX_SAMPLES], weighted[MAX_SAMPLES], there[MAX_SAMPLES];
+    float steep[UNKNOWNS][MAX_SAMPLES];
     float mean;
     double total, effective, energy, normal[UNKNOWNS][UNKNOWNS];
 } patch_t;

@@ -14,7 +14,7 @@ from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf
 
-MOST_LEVELS = header().constants["MOST_LEVELS"]
+MAX_LEVELS = header().constants["MAX_LEVELS"]
 PATCH_COLUMNS = header().constants["PATCH_COLUMNS"]
 UPPER = np.triu_indices(6)
 
@@ -25,9 +25,9 @@ class Pyramid(Struct):
 
     @classmethod
     def make(cls, levels: Sequence[NDArray[np.float32]]) -> Pyramid:
-        images = [ImageOf.make(np.ascontiguousarray(level, np.float32)) for level in levels[:MOST_LEVELS]]
+        images = [ImageOf.make(np.ascontiguousarray(level, np.float32)) for level in levels[:MAX_LEVELS]]
         blank = ImageOf.make(np.zeros((1, 1), np.float32))
-        out = cls.of(levels=(ImageOf * MOST_LEVELS)(*images, *[blank] * (MOST_LEVELS - len(images))), count=len(images))
+        out = cls.of(levels=(ImageOf * MAX_LEVELS)(*images, *[blank] * (MAX_LEVELS - len(images))), count=len(images))
         out._kept["images"] = images, blank
         return out
 

@@ -120,7 +120,7 @@ INLINE int roots_inside(const double *p, double *roots, int found)
         todo[0].low = -1.0, todo[0].high = 1.0, todo[0].at_low = first, todo[0].at_high = last;
         depth = 1;
     }
-    while (depth > 0 && found < MOST_ROOTS) {
+    while (depth > 0 && found < MAX_ROOTS) {
         depth--;
         const double low = todo[depth].low, high = todo[depth].high, middle = 0.5 * (low + high);
         const int at_low = todo[depth].at_low, at_high = todo[depth].at_high;
@@ -151,7 +151,7 @@ INLINE int roots_inside(const double *p, double *roots, int found)
 
 /* Return the real roots of the polynomial p of degree ten: those within the unit circle, and the others as inverses of
  * roots of the reversed polynomial, so that no root lies far out. */
-FOR_EACH_PROCESSOR int real_roots(const double p[DEGREE + 1], double roots[MOST_ROOTS])
+FOR_EACH_PROCESSOR int real_roots(const double p[DEGREE + 1], double roots[MAX_ROOTS])
 {
     double reversed[DEGREE + 1];
     for (int d = 0; d <= DEGREE; d++)

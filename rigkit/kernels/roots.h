@@ -7,6 +7,6 @@
 enum { DEGREE = 10 };
 
 /* Set `roots` to the real roots of the polynomial p, the lowest coefficient first; return how many. */
-int real_roots(const double p[DEGREE + 1], double roots[MOST_ROOTS]);
+int real_roots(const double p[DEGREE + 1], double roots[MAX_ROOTS]);
 
 #endif

@@ -9,7 +9,7 @@ const CLOUD_DISTANCE = 2.6;
 const CLOUD_FILL = 1.3;
 const CLOUD_TURN = 0.008;
 const NEAREST = 0.1;
-const MOST_PX = 7;
+const MAX_PX = 7;
 
 function cloudView(canvas) {
   const packed = Uint8Array.from(atob(document.getElementById(canvas.dataset.cloud).textContent), (c) => c.charCodeAt(0));
@@ -42,7 +42,7 @@ function cloudView(canvas) {
       const aside = cy * x + sy * z, ahead = cy * z - sy * x;
       const down = cp * y + sp * ahead, far = cp * ahead - sp * y + CLOUD_DISTANCE;
       if (far < NEAREST) continue;
-      const here = scale / far, side = Math.min(MOST_PX, Math.ceil(spacing * here));
+      const here = scale / far, side = Math.min(MAX_PX, Math.ceil(spacing * here));
       const left = Math.round(middle + here * aside - side / 2), top = Math.round(centre + here * down - side / 2);
       if (left < 0 || top < 0 || left + side > width || top + side > height) continue;
       let red = colours[j], green = colours[j + 1], blue = colours[j + 2];
