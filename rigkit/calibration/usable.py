@@ -166,7 +166,7 @@ def _without_small_copies(found: Sequence[BoardDetection], board: Board) -> list
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _Extent:
     """A grid in an image: its size, how far its corners reach, whether it is whole."""
 
     size: tuple[int, int]
@@ -174,9 +174,9 @@ class _Seen:
     whole: bool
 
 
-def _put_together(own: Sequence[BoardDetection]) -> list[_Seen]:
+def _put_together(own: Sequence[BoardDetection]) -> list[_Extent]:
     """Return the grids of an image; two that touch along a whole side are one, out of which a size was cut."""
-    seen = [_Seen((one.columns, one.rows), _reach(one), one.complete) for one in own]
+    seen = [_Extent((one.columns, one.rows), _reach(one), one.complete) for one in own]
     for i, j in combinations(range(len(own)), 2):
         sides = set(seen[i].size) & set(seen[j].size)
         touching = _touching(own[i], own[j]) if sides else 0
@@ -184,7 +184,7 @@ def _put_together(own: Sequence[BoardDetection]) -> list[_Seen]:
         if side is not None:
             size = sum(own[k].columns * own[k].rows for k in (i, j)) // side, side
             others = [seen[k] for k in range(len(own)) if k not in (i, j)]
-            return [_Seen(size, size, seen[i].whole and seen[j].whole), *others]
+            return [_Extent(size, size, seen[i].whole and seen[j].whole), *others]
     return seen
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.optim.damping import Damping, Stop
 
-State = tuple[FloatArray, ...]
+Values = tuple[FloatArray, ...]
 """Arrays whose first axis is that of the problems."""
 
 
@@ -29,15 +29,15 @@ class BatchedProblem(NamedTuple):
 
 
 def minimise_each(
-    state: State,
-    linearise: Callable[[State], BatchedProblem],
-    moved: Callable[[State, FloatArray], State],
+    state: Values,
+    linearise: Callable[[Values], BatchedProblem],
+    moved: Callable[[Values, FloatArray], Values],
     damping: Damping,
     stop: Stop,
     *,
-    small: Callable[[State, FloatArray], BoolArray] | None = None,
+    small: Callable[[Values, FloatArray], BoolArray] | None = None,
     until_all: bool = False,
-) -> tuple[State, FloatArray]:
+) -> tuple[Values, FloatArray]:
     """Return states each at its own minimum, and their costs (K,).
 
     Parameters

@@ -192,7 +192,7 @@ def apart(
     directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
     out: dict[Key, float] = {}
     best = [_most_seen(own) for own in seen]
-    all_corners = [_Corners.of(own) for own in seen]
+    all_corners = [_CameraCorners.of(own) for own in seen]
     for i in range(len(seen)):
         for j in range(i, len(seen)):
             there = _transfer_px(best[i], all_corners[j], mounts[j] @ mounts[i].inverse(), cameras[j], places)
@@ -205,7 +205,7 @@ def apart(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Corners:
+class _CameraCorners:
     """All corners that a camera saw, entry by entry: the entries, how many corners each has, the corners on their
     boards (N, 3) mm and in the image (N, 2), and which were kept (N,)."""
 
@@ -216,7 +216,7 @@ class _Corners:
     kept: BoolArray
 
     @classmethod
-    def of(cls, own: FrameObservations) -> _Corners:
+    def of(cls, own: FrameObservations) -> _CameraCorners:
         entries = list(own.values())
         boards = {e.board_id: e.view.board for e in entries}
         table = {name: board.points() for name, board in boards.items()}
@@ -227,7 +227,7 @@ class _Corners:
 
 
 def _transfer_px(
-    first: Mapping[Key, Observation], second: _Corners, motion: Rigid3, camera: Camera, places: Places
+    first: Mapping[Key, Observation], second: _CameraCorners, motion: Rigid3, camera: Camera, places: Places
 ) -> dict[Key, float]:
     """Return the RMS distance of each target's corners in the second camera from where the first's pose puts them, the
     worst board where there are several."""

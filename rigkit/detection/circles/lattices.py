@@ -48,7 +48,7 @@ class LabelledBlobs:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Links:
+class _Neighbours:
     """Directed links between neighbours, each in both directions."""
 
     source: IntArray
@@ -71,14 +71,14 @@ def blob_lattices(blobs: Blobs) -> list[LabelledBlobs]:
     out = []
     for number in np.flatnonzero(sizes >= MIN_LABELLED):
         here = member[links.source] == number
-        own = _Links(links.source[here], links.target[here], links.vector[here])
+        own = _Neighbours(links.source[here], links.target[here], links.vector[here])
         found = _labelled(blobs, own)
         if found is not None:
             out.append(found)
     return out
 
 
-def _links(blobs: Blobs) -> _Links:
+def _links(blobs: Blobs) -> _Neighbours:
     from scipy.sparse import coo_array
     from scipy.spatial import cKDTree
 
@@ -107,10 +107,10 @@ def _links(blobs: Blobs) -> _Links:
     fair = alike & (distance < limit[source]) & (distance < limit[target])
     one = coo_array((np.ones(int(fair.sum())), (source[fair], target[fair])), shape=(len(blobs),) * 2).tocsr()
     both = coo_array(one.multiply(one.T))
-    return _Links(both.row, both.col, blobs.pixels[both.col] - blobs.pixels[both.row])
+    return _Neighbours(both.row, both.col, blobs.pixels[both.col] - blobs.pixels[both.row])
 
 
-def _labelled(blobs: Blobs, links: _Links) -> LabelledBlobs | None:
+def _labelled(blobs: Blobs, links: _Neighbours) -> LabelledBlobs | None:
     """Return the blobs of one component with their places, or None where they make no lattice."""
     index, flat = np.unique(np.concatenate([links.source, links.target]), return_inverse=True)
     source, target = flat.reshape(2, -1)

@@ -112,7 +112,7 @@ class WholeBoard:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _State:
+class _Sought:
     """What is sought: corners (R, C, 2), ends (2, 2), paper (4,), blur s, and light, contrast and by how much the blur
     is wider, relative, (3, r, c) at nodes LIGHT_SQUARES apart."""
 
@@ -176,7 +176,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     start = (pixels - window.first) / scale
     rows, columns = pixels.shape[:2]
     light = [int(np.ceil((count - 1) / LIGHT_SQUARES)) + 1 for count in (rows, columns)]
-    state, there = _State(start, window.ends, np.zeros(4), blur / scale, np.zeros((3, *light))), ~around.holes
+    state, there = _Sought(start, window.ends, np.zeros(4), blur / scale, np.zeros((3, *light))), ~around.holes
     for turn in range(MAX_STEPS):
         step = _step(window, state, start=turn == 0)
         if step is None:
@@ -190,7 +190,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     return None
 
 
-def _step(window: BoardWindow, state: _State, *, start: bool) -> tuple[_State, FloatArray, FloatArray, float] | None:
+def _step(window: BoardWindow, state: _Sought, *, start: bool) -> tuple[_Sought, FloatArray, FloatArray, float] | None:
     """Return the state after a Gauss-Newton step, how far each corner moved, its spread, and the residual before it."""
     size = state.pixels.shape[0], state.pixels.shape[1]
     coefficients = spline_coefficients(extended(state.pixels, MAP_RINGS))
@@ -227,8 +227,8 @@ def _step(window: BoardWindow, state: _State, *, start: bool) -> tuple[_State, F
 
 
 def _solved(
-    window: BoardWindow, state: _State, products: FloatArray, right: FloatArray, rest: Picture, count: int
-) -> tuple[_State, FloatArray, FloatArray, float] | None:
+    window: BoardWindow, state: _Sought, products: FloatArray, right: FloatArray, rest: Picture, count: int
+) -> tuple[_Sought, FloatArray, FloatArray, float] | None:
     """Return what `_step` does, from the normal equations without what is known beforehand."""
     shape, unknowns, corners = state.pixels.shape, len(right), state.pixels.size
     variance = float((rest.astype(np.float64) ** 2).sum()) / max(count - unknowns, 1)
@@ -249,7 +249,7 @@ def _solved(
     spread = np.sqrt(np.maximum(np.diag(inverse)[:corners].reshape(shape).mean(axis=2), 0.0))
     moves = step[:corners].reshape(shape).clip(-MAX_MOVE_PX, MAX_MOVE_PX)
     blur = state.blur * (1.0 + float(np.clip(step[-1], -MAX_BLUR_CHANGE, MAX_BLUR_CHANGE)))
-    after = _State(
+    after = _Sought(
         state.pixels + moves,
         state.ends + (OUTWARDS * step[ends].clip(-END_SIGMA, END_SIGMA)).reshape(2, 2),
         (state.paper + step[paper]).clip(-MAX_PAPER, MAX_PAPER),
@@ -259,7 +259,7 @@ def _solved(
     return after, np.hypot(moves[..., 0], moves[..., 1]), spread, float(np.sqrt(variance))
 
 
-def _with_light(grey: Picture, pattern: Picture, used: BoolArray, state: _State, beyond: Sequence[Picture]) -> _State:
+def _with_light(grey: Picture, pattern: Picture, used: BoolArray, state: _Sought, beyond: Sequence[Picture]) -> _Sought:
     """Return the state with the light, contrast and paper that fit best if they are everywhere the same."""
     columns = np.stack([np.ones(np.count_nonzero(used)), *(part[used] for part in (pattern, *beyond))], axis=1)
     normal = columns.T @ columns + np.diag([0.0, FREE, 1.0, 1.0, 1.0, 1.0])
