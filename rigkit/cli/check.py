@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from rigkit.cli.aim_arguments import length_of
-from rigkit.core.errors import ExitCode
+from rigkit.core.errors import ExitCode, InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +44,8 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.check import CheckOptions, check_pictures
 
     length = length_of(args, "check")
+    if args.temperature is not None and args.register is None:
+        raise InputError("check: --temperature goes into a register; give --register, too")
     ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
     options = CheckOptions(
         boards=tuple(board_of_words(words) for words in args.board),

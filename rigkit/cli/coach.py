@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, progress_on_stderr
+    from rigkit.cli.console import progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.board_words import board_of_words
     from rigkit.workflows.coach import CoachOptions, run_coach
@@ -77,6 +77,5 @@ def run(args: argparse.Namespace) -> int:
         port=args.port,
         lan=args.lan,
     )
-    note("open this page in a browser; Ctrl-C ends, and the same command goes on from there")
     run_coach(options, lambda words: print(words, flush=True), progress_on_stderr())
     return ExitCode.WELL

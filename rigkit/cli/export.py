@@ -73,6 +73,9 @@ def _export_cloud(args: argparse.Namespace) -> int:
     if kind not in known:
         what = "a PLY" if is_ply else "a cloud"
         raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
+    unused = {"--names": args.names, "--size": args.size, "--from": args.source_format, "--pair": is_ply and args.pair}
+    if (option := next((name for name, given in unused.items() if given), None)) is not None:
+        raise InputError(f"export: {option} says nothing of {'a PLY' if is_ply else 'a cloud'}; leave it out")
     options = ExportCloudOptions(output=args.output, kind=kind, pair=args.pair, method=args.method, force=args.force)
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")

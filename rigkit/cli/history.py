@@ -27,6 +27,8 @@ def run(args: argparse.Namespace) -> int:
 
     if (args.add is None) != (args.to is None):
         raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the one that it is compared with")
+    if args.temperature is not None and args.add is None:
+        raise InputError("history: --temperature is of a calibration that is added; give --add and --to, too")
     if args.add is not None:
         add_calibration(args.register, args.add, args.to, temperature_c=args.temperature)
         note(f"{args.register} has one entry more")

@@ -183,7 +183,8 @@ def serve(app: Starlette, host: str, port: int, ready: Callable[[int], None]) ->
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listening.bind((host, port))
-        except OSError as error:
-            raise InputError(f"coach: port {port} of {host}: {error.strerror}; give another --port") from error
+        except (OSError, OverflowError) as error:
+            fault = error.strerror if isinstance(error, OSError) else "there are 0 to 65535"
+            raise InputError(f"coach: port {port} of {host}: {fault}; give another --port") from error
         ready(int(listening.getsockname()[1]))
         uvicorn.Server(uvicorn.Config(app, log_level="warning")).run(sockets=[listening])

@@ -15,10 +15,11 @@ from typing import Any
 from rigkit.core.errors import InputError, printable
 from rigkit.io.files import ensure_writable
 from rigkit.io.json_reader import parse_json, real, whole
-from rigkit.io.reading import read_text
+from rigkit.io.reading import MAX_NUMBER, read_text
 from rigkit.validation.sentinel.judge import SentinelCheck
 
 HISTORY_SCHEMA = "rigkit.history/1"
+ABSOLUTE_ZERO_C = -273.15
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -144,11 +145,14 @@ def as_seen_from(register: Path, source: Path) -> Path:
         return source.resolve()
 
 
-def ensure_register(path: Path, inputs: Iterable[Path] = ()) -> None:
+def ensure_register(path: Path, inputs: Iterable[Path] = (), temperature_c: float | None = None) -> None:
     """Raise InputError where no entry could be added to the register at `path`: call it before the work.
 
-    It is refused where it is one of `inputs`, which the work reads, or a file that is none.
+    It is refused where it is one of `inputs`, which the work reads, or a file that is none; so is a temperature that
+    there is not.
     """
+    if temperature_c is not None and not ABSOLUTE_ZERO_C <= temperature_c <= MAX_NUMBER:
+        raise InputError(f"temperature {temperature_c:g}: give degrees Celsius")
     if path.exists():
         if path.resolve() in {other.resolve() for other in inputs}:
             raise InputError(f"cannot add to '{path}': this command reads it; give another name for the register")

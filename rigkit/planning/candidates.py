@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points
 from rigkit.core.boards import Board
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import HeldBoards
 
@@ -41,6 +41,13 @@ class Reach:
     nearest_mm: float = 0.0
     farthest_mm: float = np.inf
     field_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise InputError for distances, or a field, that there are not."""
+        if not 0.0 <= self.nearest_mm < self.farthest_mm:
+            raise InputError(f"boards held from {self.nearest_mm:g} to {self.farthest_mm:g} mm: give the nearer first")
+        if self.field_deg is not None and not 0.0 < self.field_deg <= 360.0:
+            raise InputError(f"a lens that sees {self.field_deg:g} degrees: give its full angle, up to 360")
 
 
 def outline_mm(board: Board) -> Points:

@@ -16,14 +16,19 @@ CURVE_END = 1.05
 MAX_THETA_RAD = 3.0
 
 
+def check_field(hfov_deg: float) -> None:
+    """Raise InputError for an angle that no lens sees across the width of its image."""
+    if not 0.5 <= hfov_deg <= 300.0:
+        raise InputError(f"a lens of {hfov_deg:g} degrees: give the field of view across the image's width, 0.5 to 300")
+
+
 def guessed_camera(hfov_deg: float, size_px: tuple[int, int], model: str | None = None) -> Camera:
     """Return a camera that sees `hfov_deg` across the width of its image: perspective where that is less than 100
     degrees, else equidistant; of `model`, by default Brown's or Kannala and Brandt's.
 
     Raises InputError for an angle that no lens has, or a model that cannot see so much.
     """
-    if not 0.5 <= hfov_deg <= 300.0:
-        raise InputError(f"a lens of {hfov_deg:g} degrees: give the field of view across the image's width, 0.5 to 300")
+    check_field(hfov_deg)
     half_px, half_rad = 0.5 * size_px[0], np.radians(0.5 * hfov_deg)
     straight = hfov_deg < PERSPECTIVE_DEG
     corner_px = CURVE_END * 0.5 * float(np.hypot(*size_px))

@@ -99,7 +99,7 @@ def check_pictures(
     inputs = [source, *(image for frame in frames for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
-        ensure_register(options.history, inputs)
+        ensure_register(options.history, inputs, options.temperature_c)
     cost = [] if options.length is None else length_costs(watched, options.length)
     left_out: list[tuple[str, str]] = []
     unreadable: list[str] = []

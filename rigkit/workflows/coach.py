@@ -29,6 +29,7 @@ from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
 from rigkit.io.video import Video
 from rigkit.planning.goal import Goal
+from rigkit.planning.guess import check_field
 from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibrate_any import calibrate_session_file
@@ -74,6 +75,7 @@ def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored) -> 
 
     Raises InputError where the folder holds another session, or cannot be one.
     """
+    check_field(options.guide.hfov_deg)
     ensure_folder_writable(options.folder)
     options.folder.mkdir(parents=True, exist_ok=True)
     names = _names(options)
@@ -222,9 +224,12 @@ def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Prog
         threading.Thread(target=work, daemon=True).start()
     if options.lan:
         _log.warning("%s", LAN_WARNING)
-    serve(
-        app, EVERYWHERE if options.lan else LOCALHOST, options.port, lambda port: told(f"http://{host}:{port}/{token}/")
-    )
+
+    def ready(port: int) -> None:
+        _log.info("open this page in a browser; Ctrl-C ends, and the same command goes on from there")
+        told(f"http://{host}:{port}/{token}/")
+
+    serve(app, EVERYWHERE if options.lan else LOCALHOST, options.port, ready)
 
 
 def _frames(options: CoachOptions) -> Iterator[Frame] | None:

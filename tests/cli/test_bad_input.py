@@ -320,6 +320,35 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "point-not-finite" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("coach new --board 9x6x25 --port 99999999", "port 99999999"),
+        ("coach new --board 9x6x25 --lens 400", "400 degrees"),
+        ("coach new --board 9x6x25 --near 500 --far 200", "from 500 to 200 mm"),
+        ("coach new --board 9x6x25 --watch nowhere", "'nowhere' is not a folder"),
+        ("plan LENS --near 300 --far 100", "from 300 to 100 mm"),
+        ("plan LENS --field 500", "500 degrees"),
+        ("check LENS VIEW --temperature nan --register new.jsonl", "temperature nan"),
+        ("check LENS VIEW --temperature -400 --register new.jsonl", "temperature -400"),
+        ("check LENS VIEW --temperature 20", "--register"),
+        ("history new.jsonl --temperature 20", "--add"),
+        ("history new.jsonl --add LENS --to LENS", "the same file"),
+        ("export LAB -p regular-general --names a -o x.ply", "--names"),
+        ("export LAB -p regular-general --size 640x480 -o x.ply", "--size"),
+        ("export cloud.ply -p regular-general -o x.las", "--pair"),
+    ],
+)
+def test_options_of_one_verb(
+    words: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"LENS": CALIBRATION, "VIEW": IMAGES / "view1.jpg", "LAB": IMAGES.parents[1]}
+    monkeypatch.chdir(tmp_path)
+    code = main([str(places.get(word, word)) for word in words.split()])
+    check(code, capsys.readouterr().err.strip(), 2, told)
+    assert not list(tmp_path.glob("*.*"))
+
+
 def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["diff", "a.json", "b.json", "--nonsense"])

@@ -99,7 +99,7 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
     def no_pose(*_: object) -> None:
         raise DegenerateError("no pose")
 
-    monkeypatch.setattr("rigkit.workflows.check.board_pose", no_pose)
+    monkeypatch.setattr("rigkit.workflows.check.cam_from_seen_board", no_pose)
     turned = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,))).check
     assert turned.unexplained and turned.rms_px > 10.0
 
