@@ -31,7 +31,7 @@ import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.core.arrays import FloatArray, IntArray, symmetric_pinv
-from rigkit.kernels.leverage import chebyshev_series
+from rigkit.kernels.linearise import chebyshev_series
 
 MIN_CLUSTERS = 2
 """One image (or frame) says nothing about how they differ."""

@@ -12,7 +12,7 @@ from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.kernels.schur import schur_step
+from rigkit.kernels.linearise import schur_step
 
 MAX_CONDITION = 1e12
 """A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""

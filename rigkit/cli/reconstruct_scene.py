@@ -1,4 +1,4 @@
-"""`rigkit reconstruct --images A B` and `--correspondences FILE`: pairs of views of any scene, without boards."""
+"""`rigkit reconstruct --images A B` and `--correspondences FILE`: any scene without boards, by two views or more."""
 
 from __future__ import annotations
 
@@ -61,9 +61,7 @@ def is_scene(args: argparse.Namespace) -> bool:
 
 def run_scene(args: argparse.Namespace) -> int:
     if args.images and len(args.images) > 2:
-        from rigkit.cli.reconstruct_rig import run_rig
-
-        return run_rig(args)
+        return _run_rig(args)
     from rigkit.workflows.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
 
     for option, given in (("--images", args.images), ("--names", args.names)):
@@ -99,5 +97,43 @@ def run_scene(args: argparse.Namespace) -> int:
         print(
             f"{out / CLOUD}: {len(r.cloud)} points ({scene.unit}) of {len(done.correspondences)} correspondences, "
             f"{scene.inliers.sum()} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
+        )
+    return ExitCode.WELL
+
+
+def _run_rig(args: argparse.Namespace) -> int:
+    from rigkit.workflows.reconstruct_rig import RigSceneOptions, reconstruct_rig_views
+    from rigkit.workflows.reconstruct_scene import CLOUD
+
+    if not args.rig:
+        raise InputError(
+            f"reconstruct: {len(args.images)} images need --rig RIG, a file that says where their cameras stand; or "
+            "give two of them with --camera"
+        )
+    for option in ("correspondences", "camera", "camera2", "pose", "baseline_mm", "pose_type", "sparse"):
+        if getattr(args, option):
+            word = option.replace("_", "-")
+            raise InputError(f"reconstruct: --{word} is for two images; with three and more the rig's file says it all")
+    name = args.rig.stem
+    out = results_folder(args, name)
+    options = RigSceneOptions(
+        rig=args.rig,
+        images=tuple(args.images),
+        names=tuple(args.names) if args.names else None,
+        output=out,
+        force=args.force,
+        single_precision=args.float,
+        confidence=args.confidence,
+        pictures=not args.no_pictures,
+    )
+    done = reconstruct_rig_views(options, progress=progress_on_stderr())
+    for words in done.notes:
+        note(f"{name}: {words}")
+    if args.json:
+        print_json({"output": str(out), "ply": CLOUD, **done.figures()})
+    else:
+        print(
+            f"{out / CLOUD}: {len(done.cloud)} points (mm) of {len(done.pairs)} pairs, {done.merged} seen by more "
+            "than one of them"
         )
     return ExitCode.WELL

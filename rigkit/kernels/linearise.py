@@ -1,4 +1,4 @@
-"""Calls of the kernels in linearise.c: the normal equations of views of boards."""
+"""Calls of the kernels in linearise.c, schur.c and leverage.c: the normal equations of views of boards."""
 
 from __future__ import annotations
 
@@ -93,3 +93,42 @@ class ViewSums:
         kernels().add_views(
             self.seen, first, count, parameters, by_point, by_parameters, u, v, valid, lever, self._memory, self._struct
         )
+
+
+@structure("normal_equations_t")
+class _BlockSystem(Struct):
+    """Blocks of the normal equations."""
+
+
+def schur_step(
+    gg: FloatArray, gp: FloatArray, pp: FloatArray, g: FloatArray, p: FloatArray, damping: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return the step of globals (G,) and poses (V, 6) with `damping` times the diagonal (times one where that
+    vanishes) added to it, and the decrease of the cost that the undamped quadratic model promises for it; None where
+    the damped system is not positive definite.
+
+    Parameters
+    ----------
+    gg, gp, pp : (G, G), (V, G, 6) and (V, 6, 6) of J^T W J: globals, globals with poses, poses.
+    g, p : (G,) and (V, 6) of J^T W r.
+    """
+    gg, gp, pp, g, p = (np.ascontiguousarray(block, np.float64) for block in (gg, gp, pp, g, p))
+    views, count, _ = gp.shape
+    normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p, globals=count, views=views)
+    step_g, step_p, predicted = np.empty(count), np.empty((views, 6)), np.empty(1)
+    memory = np.empty(kernels().schur_memory(count, views))
+    if not kernels().solve_schur(normal, damping, memory, step_g, step_p, predicted):
+        return None
+    return step_g, step_p, float(predicted[0])
+
+
+def chebyshev_series(matrices: FloatArray, vectors: FloatArray, bound: float, series: FloatArray) -> FloatArray:
+    """Return sum_k series[k] T_k(2 M / bound - 1) z for symmetric matrices M (N, n, n) and vectors z (N, n).
+
+    `series` has two terms or more; the eigenvalues of M lie between 0 and `bound`.
+    """
+    matrices, vectors, series = (np.ascontiguousarray(a, np.float64) for a in (matrices, vectors, series))
+    out = np.empty_like(vectors)
+    memory = np.empty(3 * vectors.shape[1])
+    kernels().sum_series(matrices, vectors, *vectors.shape, bound, series, len(series), memory, out)
+    return out

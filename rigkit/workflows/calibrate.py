@@ -19,10 +19,9 @@ from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, files_of_session, load_session
-from rigkit.workflows.corners import Cache, SessionCorners, session_corners, session_views
+from rigkit.workflows.corners import Cache, SessionCorners, given_corners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.folder_session import Known
-from rigkit.workflows.given_corners import given_corners
 from rigkit.workflows.identify_board import misread
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page

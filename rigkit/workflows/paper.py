@@ -14,10 +14,10 @@ from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
 from rigkit.io.reading import csv_table, is_number
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
-from rigkit.report.paper_page import paper_page
+from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.paper_claims import claim_table, estimator_order_table
+from rigkit.validation.paper_claims import NOTHING_TO_COMPARE, claim_table, estimator_order_table
 from rigkit.validation.tables import (
     PaperTables,
     average_table,
@@ -152,3 +152,22 @@ def _tables(reports: Sequence[ValidationReport], printed: PaperTables, images: s
         tables.append(averages)
     tables += [estimator_order_table(reports, printed), claim_table(reports, method, printed), estimator_table(reports)]
     return tuple(tables)
+
+
+def paper_page(name: str, images: str | None, tables: Sequence[Table], provenance: Mapping[str, str]) -> str:
+    """Return the page of a data set; `images` says whether they are "real" or "rendered", None where nobody did."""
+    claims = next(table for table in tables if table.key == "claims")
+    judged = [row[1] for row in claims.rows if row[1].value != NOTHING_TO_COMPARE]
+    held = sum(not cell.failed for cell in judged)
+    sentences = (
+        "The paper's own pipeline: chords to neighbouring corners, equal weights, its linear solvers with the formulas "
+        "corrected, no refinement, planes by principal components.",
+        f"The images are {images}." if images else "Nobody said whether the images are real or rendered.",
+        "What the paper claims passes or fails no check of ours.",
+    )
+    facts = PageFacts(
+        headline=f"{held} of {len(judged)} statements of the paper that this data set can test hold on it",
+        sentences=sentences,
+        tables=(claims, *(table for table in tables if table.key != "claims")),
+    )
+    return build_facts_page(f"rigkit, as the paper: {name}", facts, provenance)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.kernels.schur import schur_step
+from rigkit.kernels.linearise import schur_step
 
 
 @pytest.mark.parametrize(("count", "views"), [(3, 1), (9, 7), (24, 40)])
