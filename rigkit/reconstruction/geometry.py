@@ -15,6 +15,7 @@ from rigkit.core.arrays import Mat3
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
+from rigkit.core.printing import brief
 from rigkit.reconstruction.metric import MetricPose, TriangulatedPoints, metric_pose, triangulate_matches
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
@@ -82,6 +83,8 @@ class PairGeometry:
     points: TriangulatedPoints
     scatter: float
     notes: tuple[str, ...]
+
+    __repr__ = brief
 
     @property
     def pose_type(self) -> PoseType:

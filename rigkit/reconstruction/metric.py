@@ -11,6 +11,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.matches import Matches
+from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
 from rigkit.geometry.triangulation import point_uncertainty, triangulate_rays
@@ -32,6 +33,8 @@ class MetricPose:
     covariance: FloatArray
     baseline_mm: float
     baseline_sigma_mm: float
+
+    __repr__ = brief
 
 
 class TriangulatedPoints(NamedTuple):

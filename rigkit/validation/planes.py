@@ -17,6 +17,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3, Normals, Points, as_array
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
 from rigkit.geometry.rotation import angle_between
 from rigkit.interop.open3d import mean_and_covariance, plane_inliers
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
@@ -75,6 +76,8 @@ class Plane:
     noise_mm2: FloatArray
     used: BoolArray
     gross: int = 0
+
+    __repr__ = brief
 
     def distances(self, points: Points) -> FloatArray:
         """Return the signed distances (...) of points (..., 3) in mm, positive on the camera's side."""

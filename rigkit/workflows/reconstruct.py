@@ -38,6 +38,8 @@ class PairReconstruction:
     ply: str
     files: Mapping[str, bytes]
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DatasetReconstruction:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.result import Calibration
+from rigkit.core.printing import brief
 from rigkit.io.manifest import Dataset
 from rigkit.report.page import PairSection, build_page, validation_facts
 from rigkit.report.page_facts import PageFacts
@@ -43,6 +44,8 @@ class PairValidation:
     causes: tuple[str, ...]
     files: Mapping[str, bytes]
     section: PairSection | None
+
+    __repr__ = brief
 
     @property
     def pair_id(self) -> str:

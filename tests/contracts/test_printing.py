@@ -17,6 +17,12 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.compare import compare_cameras
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
+from rigkit.reconstruction.geometry import PairGeometry
+from rigkit.reconstruction.metric import MetricPose
+from rigkit.relative_pose.refinement.refine import RefinedPose
+from rigkit.validation.planes import Plane
+from rigkit.workflows.reconstruct import PairReconstruction
+from rigkit.workflows.validation_files import PairValidation
 
 MAX_LINES = 5
 COLUMNS = 120
@@ -26,6 +32,9 @@ PUBLIC: dict[str, type[Any]] = {
     for name, found in ((name, getattr(rigkit, name)) for name in rigkit.__all__)
     if inspect.isclass(found) and dataclasses.is_dataclass(found)
 }
+HELD = (PairGeometry, MetricPose, RefinedPose, Plane, PairReconstruction, PairValidation)
+"""What public results hold, and a person looks at."""
+PUBLIC |= {kind.__name__: kind for kind in HELD}
 BULK = (
     np.arange(6000.0).reshape(1000, 6),
     tuple(f"a note that says much, number {k}" for k in range(400)),

@@ -16,6 +16,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
+from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.geometry.sampson import epipolar_normals, sampson_of_matches
@@ -60,6 +61,8 @@ class RefinedPose:
     weights: FloatArray
     iterations: int
     converged: bool
+
+    __repr__ = brief
 
 
 def refine_pose(
