@@ -47,9 +47,7 @@ def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fi
         found["warp"] = warp = fit_kept(observations, state, kept, settle=True)
         state, kept = warp.state, warp.kept
     if board == "released" or (board == "auto" and _stray(observations, state, kept)):
-        first, shape = state.shape.count, shape_model("released", observations)
-        shape = replace(shape, sigma=np.concatenate([state.shape.sigma, shape.sigma[first:]]))
-        unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - first)])
+        shape, unknowns = state.shape.richer("released", observations, state.unknowns)
         state, kept = _evident(observations, replace(state, shape=shape, unknowns=unknowns), kept)
         found["released"] = fit_kept(observations, state, kept, settle=True)
     return found

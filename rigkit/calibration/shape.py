@@ -8,7 +8,7 @@ the views say themselves: see `rigkit.calibration.evidence`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,6 +75,13 @@ class ShapeModel:
         points: Points = self.flat + self.basis @ unknowns[:count]
         points[self.released] += unknowns[count:].reshape(-1, 3)
         return points
+
+    def richer(self, kind: str, observations: Observations, unknowns: FloatArray) -> tuple[ShapeModel, FloatArray]:
+        """Return the shape of a richer kind, with the priors of the unknowns that this one has, and all its unknowns:
+        the further ones zero."""
+        shape = shape_model(kind, observations)
+        sigma = np.concatenate([self.sigma, shape.sigma[self.count :]])
+        return replace(shape, sigma=sigma), np.concatenate([unknowns, np.zeros(shape.count - self.count)])
 
     def held(self, unknowns: FloatArray) -> ShapeModel:
         """Return the shape with nothing left to solve for: boards as the unknowns have them."""

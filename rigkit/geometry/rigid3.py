@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.core.arrays import FloatArray, Mat3, Points, as_array, as_floats
 from rigkit.core.errors import InputError
-from rigkit.geometry.rotation import exp_so3, nearest_rotation, unit
+from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation, unit
 
 ROTATION_TOLERANCE = 1e-4
 """A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
@@ -92,6 +92,11 @@ class Rigid3:
         Every covariance of a pose in the package is of such a step.
         """
         return Rigid3(exp_so3(step[:3]) @ self.rotation, self.translation_mm + step[3:])
+
+    def step_from(self, other: Rigid3) -> FloatArray:
+        """Return the small change (6,) that takes `other` to this motion: `other.moved(step)` is this one."""
+        turn = log_so3(self.rotation @ other.rotation.T)
+        return np.concatenate([turn, self.translation_mm - other.translation_mm])
 
     def inverse(self) -> Rigid3:
         back = self.rotation.T.copy()

@@ -216,7 +216,7 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     moved = np.rad2deg([rotation_angle(turned), swung])
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
-    step = np.r_[log_so3(two_view.rotation @ own.rotation.T), two_view.translation_mm - own.translation_mm]
+    step = two_view.step_from(own)
     of_two_view = covariance + np.outer(step, step) if settled else np.full((6, 6), np.nan)
     counts = result.inliers, excluded
     return [

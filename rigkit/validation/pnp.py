@@ -12,7 +12,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import BoardPose, board_pose, moved_board_poses
 from rigkit.geometry.relative_pose import relative_pose, relative_pose_covariance
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3, skew
+from rigkit.geometry.rotation import skew
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.validation.planes import angle_jacobian, face_angle
 
@@ -140,8 +140,7 @@ def _mean_pose(found: list[tuple[Rigid3, FloatArray]], near: Rigid3) -> tuple[Ri
     for pose, covariance in found:
         inverse = np.linalg.inv(covariance)
         information += inverse
-        turn = log_so3(pose.rotation @ near.rotation.T)
-        pull += inverse @ np.concatenate([turn, pose.translation_mm - near.translation_mm])
+        pull += inverse @ pose.step_from(near)
     mean: FloatArray = np.asarray(np.linalg.solve(information, pull), dtype=np.float64)
     return near.moved(mean), np.asarray(np.linalg.inv(information), dtype=np.float64)
 

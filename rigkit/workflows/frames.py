@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -110,9 +110,7 @@ def frames_of_videos(
         return kept
     keeper = _FrameFolder(folder, FrameChoice(most))
     looked_at = with_boards = 0
-    with ExitStack() as stack:
-        videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
-        moments = None if timestamps is None else read_timestamps(timestamps, list(sources))
+    with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
         _take_folder(folder, live)
         total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
@@ -166,13 +164,21 @@ def _moments(
             yield number, pictures
 
 
+@contextmanager
+def _opened(
+    sources: Mapping[str, Path], timestamps: Path | None
+) -> Iterator[tuple[dict[str, Video], Mapping[int, Mapping[str, int]] | None]]:
+    """Open videos, by camera, and yield them with the moments that `timestamps` tell of, as `_moments` takes them."""
+    with ExitStack() as stack:
+        videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
+        yield videos, None if timestamps is None else read_timestamps(timestamps, list(sources))
+
+
 def moments_of_videos(
     sources: Mapping[str, Path], numbers: Collection[int], timestamps: Path | None = None
 ) -> Iterator[dict[str, Image]]:
     """Yield what all cameras show at some moments, by their numbers; those that one of them lacks are left out."""
-    with ExitStack() as stack:
-        videos = {name: stack.enter_context(Video(path)) for name, path in sources.items()}
-        moments = None if timestamps is None else read_timestamps(timestamps, list(sources))
+    with _opened(sources, timestamps) as (videos, moments):
         for number, pictures in _moments(videos, moments):
             if number in numbers and len(pictures) == len(sources):
                 yield pictures

@@ -95,3 +95,9 @@ def test_look_at() -> None:
     assert below[1] > 0.0
     with pytest.raises(InputError):
         cam_from_world_look_at([0, 0, 0], [0, 0, 0])
+
+
+def test_a_step_leads_from_one_motion_to_another(rng: np.random.Generator) -> None:
+    one, other = random_motion(rng), random_motion(rng)
+    assert one.moved(other.step_from(one)).allclose(other, translation_tol_mm=1e-12)
+    assert not one.moved(one.step_from(other)).allclose(other)

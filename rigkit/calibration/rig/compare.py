@@ -27,7 +27,7 @@ from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import log_so3, skew
+from rigkit.geometry.rotation import skew
 
 LENS_GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
@@ -95,7 +95,7 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
     for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
         # As the axes of the first rig's lenses have it.
         moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm)
-        off.append(_off(here, moved))
+        off.append(here.step_from(moved))
     known = None
     if a.covariance is not None and b.covariance is not None:
         parts = _moved(a, a.covariance, weights), _moved(b, b.covariance, weights)
@@ -113,7 +113,7 @@ def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDiffere
         raise InputError(
             f"other boards: {', '.join(a.names)} and {', '.join(b.names)}; compare mounts of the same boards"
         )
-    off = [_off(p.target_from_board, q.target_from_board) for p, q in zip(a.boards[1:], b.boards[1:], strict=True)]
+    off = [p.target_from_board.step_from(q.target_from_board) for p, q in zip(a.boards[1:], b.boards[1:], strict=True)]
     known = _known((a.covariance, b.covariance), (a.freedom, b.freedom), seed)
     return _difference(a.names[1:], np.concatenate([np.zeros(0), *off]), known)
 
@@ -137,12 +137,6 @@ def _difference(names: Sequence[str], apart: FloatArray, known: Known | None) ->
         chance = None if known is None else _chance(apart[own], known[0][own, own], known[1][own])
         mounts.append(MountDifference(name, float(angle), float(shift), chance))
     return RigDifference(tuple(mounts), None if known is None else _chance(apart, *known))
-
-
-def _off(first: Rigid3, second: Rigid3) -> FloatArray:
-    """Return the left perturbation that takes the second to the first."""
-    turn = log_so3(first.rotation @ second.rotation.T)
-    return np.concatenate([turn, first.translation_mm - second.translation_mm])
 
 
 def _weights(rig: Mounted, k: int) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.shape import SHAPES, shape_model
+from rigkit.calibration.shape import SHAPES
 from rigkit.core.arrays import FloatArray
 
 CHANCE_SIGMAS = 3.0
@@ -35,14 +35,11 @@ def shape_error(observations: RigObservations, state: RigState, sigma_px: float)
     # Which boards are seen often enough, all cameras together.
     boards = np.concatenate([own.board for own in observations.cameras])
     everything = replace(observations.cameras[0], board=boards)
-    known = observations.shape.count
     for kind in SHAPES[SHAPES.index(observations.shape.kind) + 1 :]:
-        shape = shape_model(kind, everything)
-        shape = replace(shape, sigma=np.concatenate([observations.shape.sigma, shape.sigma[known:]]))
-        unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - known)])
+        shape, unknowns = observations.shape.richer(kind, everything, state.unknowns)
         normal = rig_normal(replace(observations, shape=shape), replace(state, unknowns=unknowns), sigma_px)
         step = normal.step(STEP_DAMPING)
-        more = shape.count - known
+        more = shape.count - observations.shape.count
         if step is None or step.predicted < sigma_px**2 * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more)):
             break
         found = step.globals[:count]

@@ -106,12 +106,12 @@ def _by_squares(
         if not part.count or (part.known & whole.known).any():
             left.append(item)
         else:
-            whole = _united(whole, part)
+            whole = whole.filled(part)
     if not whole.count:
         return whole, left
     pixels = beside_markers(image, whole.pixels, board)
     seeds = np.where(np.isfinite(pixels[..., 0]), SEED_CONTRAST, np.nan)
-    return _united(whole, Lattice(pixels, seeds, whole.rising)), left
+    return whole.filled(Lattice(pixels, seeds, whole.rising)), left
 
 
 def _by_outlines(
@@ -127,8 +127,8 @@ def _by_outlines(
         if placed is None:
             left.append(item)
         else:
-            whole = _united(whole, placed)
-    return _united(whole, _of(board, grid, pixels)), left
+            whole = whole.filled(placed)
+    return whole.filled(_of(board, grid, pixels)), left
 
 
 def _marked_corners(image: np.ndarray, board: Board) -> tuple[IntArray, FloatArray]:
@@ -194,14 +194,6 @@ def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:
     out.pixels[grid[:, 1], grid[:, 0]] = pixels
     out.contrast[grid[:, 1], grid[:, 0]] = SEED_CONTRAST
     return out
-
-
-def _united(one: Lattice, two: Lattice) -> Lattice:
-    """Return the corners of `one`, and those of `two` where it has none."""
-    known = one.known
-    return Lattice(
-        np.where(known[..., None], one.pixels, two.pixels), np.where(known, one.contrast, two.contrast), one.rising
-    )
 
 
 def _placed(lattice: Lattice, grid: IntArray, pixels: FloatArray, board: Board) -> Lattice | None:
