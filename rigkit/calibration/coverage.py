@@ -26,7 +26,7 @@ def outline_of_corners(calibration: Calibration) -> Pixels:
     """Return the convex outline of all corners used, (N, 2), each of its corners once."""
     from scipy.spatial import ConvexHull
 
-    corners = calibration.corners.pixels[calibration.corners.kept]
+    corners, _ = calibration.corners.used
     # QJ: corners on one line have an outline as well, a thin one.
     return np.asarray(corners[ConvexHull(corners, qhull_options="QJ").vertices])
 

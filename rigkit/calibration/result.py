@@ -270,6 +270,11 @@ class CalibrationCorners:
     rotation: FloatArray
     translation_mm: Points
 
+    @property
+    def used(self) -> tuple[Pixels, FloatArray]:
+        """Pixels and residuals (M, 2) of the corners kept."""
+        return self.pixels[self.kept], self.residuals_px[self.kept]
+
     def in_cam(self, chosen: IntArray) -> Points:
         """Return the corners `chosen` (M,) in the camera frame, (M, 3)."""
         view = self.view[chosen]

@@ -135,7 +135,7 @@ def _short(names: Sequence[str]) -> list[str]:
 def radius_svg(calibration: Calibration) -> str:
     """Draw the error of every corner against its distance from the image's centre, and the RMS of rings: a lens that
     the model does not follow shows in the outer ones."""
-    pixels, residuals = _kept(calibration)
+    pixels, residuals = calibration.corners.used
     centre = 0.5 * (np.array(calibration.camera.size_px) - 1.0)
     radius, error = np.linalg.norm(pixels - centre, axis=1), np.linalg.norm(residuals, axis=1)
     top = round_up(float(np.quantile(error, 0.995)))
@@ -159,7 +159,7 @@ def radius_svg(calibration: Calibration) -> str:
 
 def histogram_svg(calibration: Calibration) -> str:
     """Draw how often residuals of each size are, u and v together, beside the normal curve of their scatter."""
-    _, residuals = _kept(calibration)
+    _, residuals = calibration.corners.used
     values = residuals.reshape(-1)
     sigma = float(SIGMA_OF_MEDIAN * np.median(np.abs(values)))
     reach = round_up(max(4.0 * sigma, 1e-6), HALF_STEPS)
@@ -217,12 +217,6 @@ def lens_svg(calibration: Calibration) -> str:
     )
     plot.below(_ticks(0.0, reach))
     return plot.done()
-
-
-def _kept(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
-    """Return pixels and residuals of the corners used."""
-    pixels = np.concatenate([view.pixels[view.kept] for view in calibration.views])
-    return pixels, np.concatenate([view.residuals_px[view.kept] for view in calibration.views])
 
 
 def _ticks(low: float, high: float) -> list[float]:

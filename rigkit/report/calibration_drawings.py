@@ -13,7 +13,7 @@ from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.core.arrays import FloatArray
 from rigkit.report import svg
 from rigkit.report.svg import DRAWN_WIDTH, INK, MARK, SOFT, WRONG, dots, round_down, strokes
 
@@ -39,13 +39,13 @@ VIRIDIS = np.array([[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [
 
 def residuals_svg(calibration: Calibration) -> str:
     """Draw how far each corner was measured from where the calibration puts it, magnified; outliers as crosses."""
-    pixels, residuals, kept = _corners(calibration)
+    corners, (pixels, residuals) = calibration.corners, calibration.corners.used
     times = round_down(RMS_LENGTH * calibration.camera.size_px[0] / max(calibration.rms_px, 1e-9))
-    step = -(-int(kept.sum()) // MAX_VECTORS)
-    q, d = pixels[kept][::step], residuals[kept][::step]
+    step = -(-len(pixels) // MAX_VECTORS)
+    q, d = pixels[::step], residuals[::step]
     words = f"{len(q)} residuals, measured minus projected, magnified {times:g} times"
     words += f" (every {_ordinal(step)} drawn)" if step > 1 else ""
-    crossed = pixels[~kept]
+    crossed = corners.pixels[~corners.kept]
     zoom = _zoom(calibration)
     out = [
         _open(calibration, words),
@@ -63,16 +63,16 @@ def residuals_svg(calibration: Calibration) -> str:
 def pattern_svg(calibration: Calibration) -> str:
     """Draw the mean residual of each part of the image: chance leaves short grey arrows, a lens or board that the
     model does not follow long coloured ones that agree with their neighbours."""
-    pixels, residuals, kept = _corners(calibration)
+    pixels, residuals = calibration.corners.used
     width, height = calibration.camera.size_px
     size = width / CELLS_ACROSS
-    cell = (pixels[kept] / size).astype(np.int64).clip(0)
+    cell = (pixels / size).astype(np.int64).clip(0)
     rows = int(np.ceil(height / size))
     index = cell[:, 1].clip(max=rows - 1) * CELLS_ACROSS + cell[:, 0].clip(max=CELLS_ACROSS - 1)
     cells = rows * CELLS_ACROSS
     count = np.bincount(index, minlength=cells)
-    total = np.stack([np.bincount(index, weights=r, minlength=cells) for r in residuals[kept].T], axis=-1)
-    squared = np.bincount(index, weights=(residuals[kept] ** 2).sum(axis=1), minlength=cells)
+    total = np.stack([np.bincount(index, weights=r, minlength=cells) for r in residuals.T], axis=-1)
+    squared = np.bincount(index, weights=(residuals**2).sum(axis=1), minlength=cells)
     enough = count >= MIN_IN_CELL
     mean = total[enough] / count[enough, None]
     # Corners far out scatter more: each cell is judged by its own scatter about its mean.
@@ -98,11 +98,11 @@ def pattern_svg(calibration: Calibration) -> str:
 
 def coverage_svg(calibration: Calibration) -> str:
     """Draw where corners were seen: every corner used, over cells as dark as they hold corners."""
-    pixels, _, kept = _corners(calibration)
+    pixels, _ = calibration.corners.used
     width, height = calibration.camera.size_px
     columns, rows = 12, max(round(12 * height / width), 1)
     size = np.array([width / columns, height / rows])
-    i, j = ((pixels[kept] + 0.5) / size).astype(np.int64).clip(0, [columns - 1, rows - 1]).T
+    i, j = ((pixels + 0.5) / size).astype(np.int64).clip(0, [columns - 1, rows - 1]).T
     count = np.bincount(i * rows + j, minlength=columns * rows).reshape(columns, rows)
     zoom = _zoom(calibration)
     w, h = zoom * width / columns, zoom * height / rows
@@ -112,14 +112,12 @@ def coverage_svg(calibration: Calibration) -> str:
             shade = 0.08 + 0.42 * min(count[i, j] / max(np.quantile(count[count > 0], 0.9), 1.0), 1.0)
             place = f'x="{i * w:.1f}" y="{j * h:.1f}" width="{w:.1f}" height="{h:.1f}"'
             out.append(f'<rect {place} fill="{INK}" fill-opacity="{shade:.2f}"/>')
-    step = -(-int(kept.sum()) // MAX_VECTORS)
-    out.append(
-        f'<path d="{dots(zoom * pixels[kept][::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>'
-    )
+    step = -(-len(pixels) // MAX_VECTORS)
+    out.append(f'<path d="{dots(zoom * pixels[::step])}" stroke="{MARK}" stroke-width="2.2" stroke-linecap="round"/>')
     middles = (np.stack(np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"), axis=-1) + 0.5) * size - 0.5
     seen = calibration.camera.unproject(middles)[1] | (count > 0)
     empty = int((seen & (count == 0)).sum())
-    words = f"{int(kept.sum())} corners of {len(calibration.views)} boards seen"
+    words = f"{len(pixels)} corners of {len(calibration.views)} boards seen"
     return "".join(
         [*out, _foot(calibration, words, f"{empty} of the {int(seen.sum())} cells that the lens sees are empty")]
     )
@@ -221,13 +219,6 @@ def _numbers(calibration: Calibration) -> list[str]:
             f'font-weight="600" fill="#111" stroke="#fff" stroke-width="3" paint-order="stroke">{words}</text>'
         )
     return out
-
-
-def _corners(calibration: Calibration) -> tuple[Pixels, FloatArray, np.ndarray]:
-    """Return pixels, residuals and kept of all corners of all views."""
-    pixels = np.concatenate([v.pixels for v in calibration.views])
-    residuals = np.concatenate([v.residuals_px for v in calibration.views])
-    return pixels, residuals, np.concatenate([v.kept for v in calibration.views])
 
 
 def _zoom(calibration: Calibration) -> float:

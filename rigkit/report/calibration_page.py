@@ -11,7 +11,6 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.core.arrays import Pixels
 from rigkit.core.findings import gravest_first
 from rigkit.core.printing import brief
 from rigkit.core.tables import Table
@@ -120,7 +119,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
         **_said(c, facts, "images"),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
-        "next": [] if section.plan is None else shown_views(section.plan, _kept(c)),
+        "next": [] if section.plan is None else shown_views(section.plan, c.corners.used[0]),
         "next_words": "" if section.plan is None else next_words(section.plan),
         "tables": [shown_table(table, _pictures(table, sources)) for table in facts.tables if table.key != NEXT_KEY],
     }
@@ -132,10 +131,6 @@ def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
         return []
     names = [str(row[0].value) for row in table.rows]
     return [sources.get(name) if name not in names[:k] else None for k, name in enumerate(names)]
-
-
-def _kept(c: Calibration) -> Pixels:
-    return np.concatenate([view.pixels[view.kept] for view in c.views])
 
 
 def _said(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:

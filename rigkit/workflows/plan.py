@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -117,7 +115,7 @@ def plan_session(
         calibration = load_calibration(source)
         with about(source):
             boards = tuple(shape.board for shape in calibration.boards)
-    taken = np.concatenate([view.pixels[view.kept] for view in calibration.views])
+    taken = calibration.corners.used[0]
     if options.check:
         return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)
     with about(source):
