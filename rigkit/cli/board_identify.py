@@ -18,7 +18,7 @@ def identify(args: argparse.Namespace) -> int:
     from rigkit.workflows.detect import images_in
     from rigkit.workflows.identify_board import identify_board
 
-    if args.square_mm is not None and not args.square_mm > 0.0:
+    if args.square_mm is not None and not 0.0 < args.square_mm < float("inf"):
         raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")
     path = None if args.output is None else Path(args.output).with_suffix(".toml")
     if path is not None and args.square_mm is None:

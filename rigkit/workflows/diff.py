@@ -106,6 +106,8 @@ def diff(a: Path, b: Path, options: DiffOptions | None = None) -> CameraPair | R
         other = b if rigs[0] else a
         raise InputError(f"diff: a rig and a camera; compare '{other}' with the calibration beside the rig")
     ensure_writable(options.output, force=options.force, inputs=(a, b))
+    if options.output is not None and options.output.suffix.lower() != ".png":
+        raise InputError(f"diff: the map is a picture, '{options.output}' is no name of one; give a name in .png")
     with about(a, b):
         pair = _cameras(a, b)
     if options.output is not None:

@@ -145,6 +145,9 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     the same; DegenerateError: the correspondences do not determine the pose.
     """
     name = options.name
+    for what, value in (("baseline", options.baseline_mm), ("sigma of a level", options.level_sigma_deg)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise InputError(f"'{name}': the {what} must be positive, got {value}")
     if options.output is not None:
         require_folder(options.output, force=options.force)
     camera1, camera2, known_pose, notes = _cameras(options)

@@ -327,6 +327,10 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
         ("coach new --board 9x6x25 --lens 400", "400 degrees"),
         ("coach new --board 9x6x25 --near 500 --far 200", "from 500 to 200 mm"),
         ("coach new --board 9x6x25 --watch nowhere", "'nowhere' is not a folder"),
+        ("diff LENS LENS -o map.gif", ".png"),
+        ("board identify VIEW --square-mm inf -o new", "--square-mm inf"),
+        ("reconstruct --images VIEW SECOND --camera LENS --baseline-mm -5", "baseline"),
+        ("reconstruct --images VIEW SECOND --camera LENS --level-sigma-deg nan", "level"),
         ("plan LENS --near 300 --far 100", "from 300 to 100 mm"),
         ("plan LENS --field 500", "500 degrees"),
         ("check LENS VIEW --temperature nan --register new.jsonl", "temperature nan"),
@@ -342,7 +346,12 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
 def test_options_of_one_verb(
     words: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    places = {"LENS": CALIBRATION, "VIEW": IMAGES / "view1.jpg", "LAB": IMAGES.parents[1]}
+    places = {
+        "LENS": CALIBRATION,
+        "VIEW": IMAGES / "view1.jpg",
+        "SECOND": IMAGES / "view2.jpg",
+        "LAB": IMAGES.parents[1],
+    }
     monkeypatch.chdir(tmp_path)
     code = main([str(places.get(word, word)) for word in words.split()])
     check(code, capsys.readouterr().err.strip(), 2, told)
