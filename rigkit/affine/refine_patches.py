@@ -108,11 +108,7 @@ def levels_of_larger(A21: Affines) -> FloatArray:
 
 
 def refine_patches(
-    pyramid1: Pyramid,
-    pyramid2: Pyramid,
-    pixels1: Pixels,
-    pixels2: Pixels,
-    A21: Affines,
+    pyramid1: Pyramid, pyramid2: Pyramid, pixels1: Pixels, pixels2: Pixels, A21: Affines
 ) -> RefinedPatches:
     """Return the affinities and points of image 2 that align the surroundings of `pixels1` best.
 

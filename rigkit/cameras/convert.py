@@ -56,12 +56,7 @@ class Conversion:
 
 
 def convert_camera(
-    camera: Camera,
-    model: str,
-    *,
-    order: int | None = None,
-    fixed: Sequence[str] = (),
-    outline: Pixels | None = None,
+    camera: Camera, model: str, *, order: int | None = None, fixed: Sequence[str] = (), outline: Pixels | None = None
 ) -> Conversion:
     """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
 

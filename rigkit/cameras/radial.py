@@ -127,10 +127,7 @@ _Focal = TypeVar("_Focal", bound=FocalCamera)
 
 
 def fit_shape(
-    model: type[_Focal],
-    size_px: tuple[int, int],
-    curve: RadialCurve,
-    starts: Sequence[Sequence[float]],
+    model: type[_Focal], size_px: tuple[int, int], curve: RadialCurve, starts: Sequence[Sequence[float]]
 ) -> _Focal:
     """Return the camera of `model` nearest to the curve: one focal length and its shape, by least squares.
 

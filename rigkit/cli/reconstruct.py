@@ -46,11 +46,7 @@ def run(args: argparse.Namespace) -> int:
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)
     options = ReconstructOptions(
-        **common,
-        **direction_options(args),
-        method=args.method,
-        planes=args.planes,
-        pictures=not args.no_pictures,
+        **common, **direction_options(args), method=args.method, planes=args.planes, pictures=not args.no_pictures
     )
     done = reconstruct_dataset(dataset, options, progress=progress_on_stderr())
     results = [_summary(pair) for pair in done.pairs]

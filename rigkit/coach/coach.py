@@ -65,11 +65,7 @@ class Coach:
     each is dealt with by itself."""
 
     def __init__(
-        self,
-        options: GuideOptions,
-        keeper: Keeper,
-        finish: Callable[[], str],
-        tell: Callable[[str], None] = ignored,
+        self, options: GuideOptions, keeper: Keeper, finish: Callable[[], str], tell: Callable[[str], None] = ignored
     ) -> None:
         """Go on with what the keeper has. `finish` calibrates the session and says what came of it; `tell` is given a
         line for every frame that is kept, for every photo that is not, and for what came of it."""

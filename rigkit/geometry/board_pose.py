@@ -222,12 +222,7 @@ def _both_tilts(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArr
 
 
 def _refine(
-    rays: Rays,
-    bases: FloatArray,
-    flat: FloatArray,
-    weight: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
+    rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Levenberg-Marquardt on weighted ray residuals, all start poses (K, ...) at once; returns poses and costs (K,)."""
 

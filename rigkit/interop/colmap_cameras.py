@@ -24,10 +24,7 @@ LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "SIMPLE_RADIAL": ("brown", ("f", "cx", "cy", "k1")),
     "RADIAL": ("brown", ("f", "cx", "cy", "k1", "k2")),
     "OPENCV": ("brown", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    "FULL_OPENCV": (
-        "brown",
-        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    ),
+    "FULL_OPENCV": ("brown", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     "SIMPLE_FISHEYE": ("kannala_brandt", ("f", "cx", "cy")),
     "FISHEYE": ("kannala_brandt", ("fx", "fy", "cx", "cy")),
     "SIMPLE_RADIAL_FISHEYE": ("kannala_brandt", ("f", "cx", "cy", "k1")),

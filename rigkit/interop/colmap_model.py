@@ -53,11 +53,7 @@ def colmap_model(
     for n, (x, colour) in enumerate(zip(cloud.points_mm, cloud.colours, strict=True)):
         place = " ".join(f"{v:.17g}" for v in x)
         points.append(f"{n + 1} {place} {' '.join(map(str, colour))} {error_px:.6g} 1 {n} 2 {n}")
-    files = {
-        "cameras.txt": text,
-        "images.txt": "\n".join(lines) + "\n",
-        "points3D.txt": "\n".join(points) + "\n",
-    }
+    files = {"cameras.txt": text, "images.txt": "\n".join(lines) + "\n", "points3D.txt": "\n".join(points) + "\n"}
     return files, notes
 
 

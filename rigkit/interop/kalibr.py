@@ -28,10 +28,7 @@ from rigkit.interop.exchange import (
 )
 from rigkit.interop.yaml_text import flow, parse_yaml
 
-KALIBR_ACCEPTS = (
-    *PERSPECTIVE[:2],
-    *(Accepted(model) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")),
-)
+KALIBR_ACCEPTS = (*PERSPECTIVE[:2], *(Accepted(model) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")))
 CAMERA = re.compile(r"cam[0-9]{1,3}")
 
 

@@ -14,15 +14,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import (
-    PERSPECTIVE,
-    Accepted,
-    Written,
-    best_accepted,
-    field,
-    numbers,
-    written_size,
-)
+from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, field, numbers, written_size
 from rigkit.interop.opencv import camera_from_arrays
 from rigkit.interop.yaml_text import flow, parse_yaml
 

@@ -116,12 +116,7 @@ class CornerCache:
         if not self.current:
             self._entries, self.current = {}, True
         if lens is None:
-            self._entries[name] = {
-                "sha256": digest,
-                "size_px": list(found.size_px),
-                "boards": boards,
-                "lens": None,
-            }
+            self._entries[name] = {"sha256": digest, "size_px": list(found.size_px), "boards": boards, "lens": None}
         else:
             self._entries[name]["lens"] = {"key": lens, "boards": boards}
         self._changed = True

@@ -210,11 +210,7 @@ def manifest_text(new: NewManifest, root: Path) -> str:
 
 
 def _pair_lines(
-    pair: FoundPair,
-    root: Path,
-    cameras: tuple[str, str],
-    pose_type: str,
-    boards: Sequence[str],
+    pair: FoundPair, root: Path, cameras: tuple[str, str], pose_type: str, boards: Sequence[str]
 ) -> list[str]:
     seen = " and ".join(_words(s) for s in (pair.first, pair.second))
     out = [f"# Complete boards found: {seen}.", "[[pairs]]", f'id = "{pair.name}"']

@@ -98,11 +98,7 @@ def square_sigmas(boards: Sequence[Board]) -> FloatArray:
 
 
 def _fit_boards(
-    points_unit: Points,
-    board_index: IntArray,
-    grid: IntArray,
-    boards: Sequence[Board],
-    covariances: FloatArray | None,
+    points_unit: Points, board_index: IntArray, grid: IntArray, boards: Sequence[Board], covariances: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return scale and sigma of every board (B,), NaN where it has none, and the scales' gradients (B, N, 3)."""
     points = np.asarray(points_unit, dtype=np.float64)

@@ -227,11 +227,7 @@ def _affinities(found: Correspondences, fit: ScenePose) -> Affinities:
 
 
 def _cloud(
-    fit: ScenePose,
-    found: Correspondences,
-    pose: Rigid3,
-    covariance: FloatArray,
-    image1: NDArray[np.generic] | None,
+    fit: ScenePose, found: Correspondences, pose: Rigid3, covariance: FloatArray, image1: NDArray[np.generic] | None
 ) -> tuple[OrientedCloud, NDArray[np.int64], Affinities]:
     """Return the cloud, which matches are in it, and the affinities of all."""
     affinities = _affinities(found, fit)

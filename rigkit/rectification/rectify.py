@@ -71,12 +71,7 @@ class RectifyMap:
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(pixels)))))
 
     def image(
-        self,
-        image: NDArray[Any],
-        *,
-        interpolation: Interpolation = "spline",
-        antialias: bool = True,
-        fill: float = 0.0,
+        self, image: NDArray[Any], *, interpolation: Interpolation = "spline", antialias: bool = True, fill: float = 0.0
     ) -> NDArray[Any]:
         """Return the image (h, w) or (h, w, channels) as `target` sees it, in the same dtype.
 

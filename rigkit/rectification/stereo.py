@@ -63,11 +63,7 @@ class StereoRectification:
 
 
 def rectify_pair(
-    camera1: Camera,
-    camera2: Camera,
-    cam2_from_cam1: Rigid3,
-    *,
-    projection: StereoProjection = "perspective",
+    camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, *, projection: StereoProjection = "perspective"
 ) -> StereoRectification:
     """Return the rectification of a pair of cameras of any models.
 

@@ -138,11 +138,7 @@ def plan_lead(plan: Plan, then: str) -> str:
 
 
 def plan_page(
-    plan: Plan,
-    title: str,
-    provenance: Mapping[str, str],
-    taken: Pixels | None = None,
-    found: Sequence[Table] = (),
+    plan: Plan, title: str, provenance: Mapping[str, str], taken: Pixels | None = None, found: Sequence[Table] = ()
 ) -> str:
     """Return the plan as an HTML page that needs no other file."""
     facts = plan_facts(plan, found)

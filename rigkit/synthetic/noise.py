@@ -30,11 +30,7 @@ def turn(vectors: FloatArray, angle_rad: FloatArray) -> FloatArray:
 
 
 def rotate_directions(
-    directions: DirectionPairs,
-    sigma_rad: float,
-    rng: np.random.Generator,
-    *,
-    images: NoisyImages = NoisyImages.BOTH,
+    directions: DirectionPairs, sigma_rad: float, rng: np.random.Generator, *, images: NoisyImages = NoisyImages.BOTH
 ) -> DirectionPairs:
     """Return the directions, each turned by its own normally distributed angle; lengths are kept.
 

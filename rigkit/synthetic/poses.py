@@ -77,11 +77,7 @@ class PairBatch:
 
 
 def general_pairs(
-    board: Board,
-    trials: int,
-    rng: np.random.Generator,
-    *,
-    parallax_deg: tuple[float, float] = (40.0, 70.0),
+    board: Board, trials: int, rng: np.random.Generator, *, parallax_deg: tuple[float, float] = (40.0, 70.0)
 ) -> PairBatch:
     """Return pairs of free views of three boards in the corner of a room.
 

@@ -187,12 +187,7 @@ def room_walls(
 
 
 def place_board(
-    board: Board,
-    camera: Camera,
-    target_px: FloatArray,
-    square_px: float,
-    max_tilt_deg: float,
-    rng: np.random.Generator,
+    board: Board, camera: Camera, target_px: FloatArray, square_px: float, max_tilt_deg: float, rng: np.random.Generator
 ) -> PlacedBoard | None:
     """Return the board with its centre seen at `target_px`, or None where the lens does not see there."""
     ray, valid = camera.unproject(target_px)

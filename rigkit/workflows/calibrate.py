@@ -128,12 +128,7 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
     with about(session.path):
         try:
             result = calibrate(
-                views,
-                size_px,
-                model=session.model,
-                degree=session.degree,
-                board=session.board_shape,
-                progress=progress,
+                views, size_px, model=session.model, degree=session.degree, board=session.board_shape, progress=progress
             )
         except DegenerateError as error:
             shown = misread(session.images, session.boards)

@@ -78,11 +78,7 @@ class CheckedPictures:
 
 
 def check_pictures(
-    path: str | Path,
-    images: Sequence[str | Path],
-    options: CheckOptions | None = None,
-    *,
-    progress: Progress = silent,
+    path: str | Path, images: Sequence[str | Path], options: CheckOptions | None = None, *, progress: Progress = silent
 ) -> CheckedPictures:
     """Check a calibration, or a rig, with fresh images (or folders of them).
 

@@ -126,11 +126,7 @@ def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Sever
 
 
 def coach_frames(
-    coach: Coach,
-    frames: Iterator[Frame],
-    *,
-    photos: bool,
-    show: Callable[[Sequence[Image]], None] = ignored,
+    coach: Coach, frames: Iterator[Frame], *, photos: bool, show: Callable[[Sequence[Image]], None] = ignored
 ) -> None:
     """Offer frames to the coach until there are enough, or no more, or somebody finished it."""
     for images, source in frames:

@@ -196,10 +196,7 @@ def _files(options: RigSceneOptions, fused: FusedCloud, first: DenseScene | None
     comments = [f"fused of several pairs; {int((fused.pairs_of > 1).sum())} points were seen by more than one"]
     files: dict[str, str | bytes] = {
         CLOUD: ply_bytes(
-            fused.cloud,
-            single_precision=options.single_precision,
-            confidence=options.confidence,
-            comments=comments,
+            fused.cloud, single_precision=options.single_precision, confidence=options.confidence, comments=comments
         )
     }
     if options.pictures and first is not None:

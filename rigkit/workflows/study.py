@@ -116,12 +116,7 @@ def study_key(study: Study) -> str:
 
 
 def run_study(
-    study: Study,
-    *,
-    jobs: int = 1,
-    dask: str | None = None,
-    parts: Path | None = None,
-    progress: Progress = silent,
+    study: Study, *, jobs: int = 1, dask: str | None = None, parts: Path | None = None, progress: Progress = silent
 ) -> list[Errors]:
     """Return the errors of every chunk of a study; the numbers do not depend on who computes them.
 

@@ -104,11 +104,7 @@ def fetch_public_set(described: PublicSet, root: Path | None = None, *, progress
                 _write(data, f"{url}: {member}", folder / name, described.sha256[name])
     progress(f"fetch {described.name}", len(described.sha256), len(described.sha256))
     return FetchedSet(
-        described=described,
-        folder=folder,
-        present=tuple(present),
-        fetched=tuple(fetched),
-        missing=tuple(missing),
+        described=described, folder=folder, present=tuple(present), fetched=tuple(fetched), missing=tuple(missing)
     )
 
 

@@ -34,14 +34,7 @@ from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
 from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import (
-    find_boards,
-    geometry_of,
-    match_found,
-    planes_of,
-    reconstruct_other_chain,
-    shifts_of,
-)
+from rigkit.workflows.pairs import find_boards, geometry_of, match_found, planes_of, reconstruct_other_chain, shifts_of
 from rigkit.workflows.paper import printed_tables
 from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
 
@@ -188,14 +181,7 @@ def _judge(
         drawn = pair_pictures(shown, image1, image2, pdf=job.options.pdf)
         files |= drawn
         section = _section(reconstructions, shown, reports, compared, drawn)
-    return PairValidation(
-        reports=reports,
-        best=best,
-        crosscheck=compared,
-        causes=causes,
-        files=files,
-        section=section,
-    )
+    return PairValidation(reports=reports, best=best, crosscheck=compared, causes=causes, files=files, section=section)
 
 
 def _fitted(geometry: PairGeometry, job: PairJob[ValidateOptions]) -> FittedPlanes:

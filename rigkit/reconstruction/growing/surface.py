@@ -191,12 +191,7 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     valid = np.isfinite(measured.z[..., 0])
     covariance = np.where(valid[..., None, None], measured.covariance, np.eye(3))
     plane, normal, support = fitted_planes(
-        measured.z,
-        np.linalg.inv(covariance),
-        measured.frame,
-        reach=reach,
-        rounds=SMOOTHING_ROUNDS,
-        turn=TURN_OF_LOSS,
+        measured.z, np.linalg.inv(covariance), measured.frame, reach=reach, rounds=SMOOTHING_ROUNDS, turn=TURN_OF_LOSS
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         ray = measured.frame[..., 0, :]

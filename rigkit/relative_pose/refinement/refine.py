@@ -26,12 +26,7 @@ from rigkit.relative_pose.refinement.residuals import whitened_affinities
 from rigkit.relative_pose.solvers.planar_ambiguity import ambiguous_poses, compare_poses
 from rigkit.relative_pose.solvers.pose import cheirality_margin, choose_pose, essential_from_pose, translation_basis
 from rigkit.relative_pose.solvers.registry import fundamental_for
-from rigkit.relative_pose.solvers.weights import (
-    MIN_SIGMA_A,
-    WeightRule,
-    estimate_sigma_A,
-    usable_affinities,
-)
+from rigkit.relative_pose.solvers.weights import MIN_SIGMA_A, WeightRule, estimate_sigma_A, usable_affinities
 
 SIGNIFICANT = 3.0
 """Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""

@@ -136,12 +136,7 @@ def robust_pose(
 
 
 def _finalists(
-    matches: Matches,
-    rows: SampsonRows,
-    rng: np.random.Generator,
-    kind: str,
-    sample: Sample,
-    max_noise: float,
+    matches: Matches, rows: SampsonRows, rng: np.random.Generator, kind: str, sample: Sample, max_noise: float
 ) -> tuple[Mat3, int]:
     """Return the best essential matrices (H, 3, 3) of the samples, and how many were drawn; options of `robust_pose`.
 
