@@ -11,7 +11,7 @@ import numpy as np
 
 from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, as_indices
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, keep_arrays, keep_indices
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -48,10 +48,10 @@ class ViewResult:
     kept: BoolArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "grid", as_indices(self.grid, (None, 2), "grid"))
+        keep_indices(self, grid=(None, 2))
         n = len(self.grid)
-        object.__setattr__(self, "pixels", as_array(self.pixels, (n, 2), "pixels"))
-        object.__setattr__(self, "residuals_px", as_array(self.residuals_px, (n, 2), "residuals_px", finite=False))
+        keep_arrays(self, pixels=(n, 2))
+        keep_arrays(self, residuals_px=(n, 2), finite=False)
         kept = np.array(self.kept, dtype=bool)
         if kept.shape != (n,):
             raise InputError(f"view '{self.image}': `kept` must have one entry a corner ({n}), got {kept.shape}")
@@ -176,7 +176,7 @@ class BoardShape:
     declared: Board | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points_mm", as_array(self.points_mm, (None, 3), "points_mm"))
+        keep_arrays(self, points_mm=(None, 3))
         if self.declared is not None and self.declared.corner_count != len(self.points_mm):
             raise InputError(
                 f"board '{self.board_id}': {len(self.points_mm)} corners, but {self.declared.corner_count} are declared"
@@ -355,9 +355,7 @@ class Calibration:
 
     def __post_init__(self) -> None:
         p = self.camera.parameters.size
-        object.__setattr__(self, "covariance", as_array(self.covariance, (p, p), "covariance"))
-        frame = as_array(self.frame_covariance, (p + 6, p + 6), "frame_covariance")
-        object.__setattr__(self, "frame_covariance", frame)
+        keep_arrays(self, covariance=(p, p), frame_covariance=(p + 6, p + 6))
         if not self.views:
             raise InputError(
                 "calibration: no view was used; a calibration without data cannot be built; give images with boards"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.clustered import widening
-from rigkit.core.arrays import FloatArray, Points, as_array
+from rigkit.core.arrays import FloatArray, Points, keep_arrays
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature
@@ -24,7 +24,7 @@ class MountedBoard:
     target_from_board: Rigid3
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points_mm", as_array(self.points_mm, (self.board.corner_count, 3), "points_mm"))
+        keep_arrays(self, points_mm=(self.board.corner_count, 3))
 
     def __repr__(self) -> str:
         return f"MountedBoard({self.board!r}, {len(self.points_mm)} solved corners, {self.target_from_board!r})"
@@ -67,7 +67,7 @@ class BoardRig:
 
     def __post_init__(self) -> None:
         size = 6 * (len(self.boards) - 1)
-        object.__setattr__(self, "covariance", as_array(self.covariance, (size, size), "covariance"))
+        keep_arrays(self, covariance=(size, size))
 
     def __repr__(self) -> str:
         return f"BoardRig of {', '.join(self.names)}, in {self.image_count} images"

@@ -13,7 +13,7 @@ from rigkit.calibration.result import Calibration, Convergence
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import FloatArray, as_array
+from rigkit.core.arrays import FloatArray, keep_arrays
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import drawn
@@ -91,7 +91,7 @@ class RigCalibration:
 
     def __post_init__(self) -> None:
         count = Layout.of_cameras(c.camera for c in self.cameras).count
-        object.__setattr__(self, "covariance", as_array(self.covariance, (count, count), "covariance"))
+        keep_arrays(self, covariance=(count, count))
 
     def __repr__(self) -> str:
         held = "not available" if self.heldout_rms_px is None else f"{self.heldout_rms_px:.4f} px"
