@@ -182,7 +182,7 @@ def _solved_for(
         views = evidence.views
         zoom = amounts[:, 0] if way != "shift" else np.zeros(len(views))
         shift = amounts[:, -2:] if way != "focus" else np.zeros((len(views), 2))
-        centre, _ = start.camera.project(np.array([0.0, 0.0, 1.0]))
+        centre = start.camera.axis_px
         pixels = observations.pixels.copy()
         pixels[views] -= zoom[:, None, None] * (pixels[views] - centre) + shift[:, None]
         observations = replace(observations, pixels=pixels)

@@ -140,7 +140,7 @@ def _without(column: FloatArray, turn: FloatArray) -> FloatArray:
 def _touched(camera: Camera, pixels: Pixels) -> list[FloatArray]:
     """Return what happens to lenses, as ways to differ (2 N, K) at pixels (N, 2): focus or zoom make the image larger
     about the principal point; lens or sensor shift."""
-    centre = camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    centre = camera.axis_px
     if not np.isfinite(centre).all():
         centre = image_center(camera.size_px)
     return [(pixels - centre).reshape(-1, 1), np.tile(np.eye(2), (len(pixels), 1))]

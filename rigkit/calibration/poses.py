@@ -70,9 +70,8 @@ def refine_each(
 def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:
     """Return the state with every pose found anew from its corners: radial alignment around the camera's centre, both
     signs of the tilt refined, and the pose in `state` as a third start; the cheapest of the three wins."""
-    centre, _ = state.camera.project(np.array([0.0, 0.0, 1.0]))
     board = np.swapaxes(observations.table()[observations.corner][..., :2], 1, 2)
-    alignment = align(np.swapaxes(observations.pixels - centre, 1, 2), board, weight)
+    alignment = align(np.swapaxes(observations.pixels - state.camera.axis_px, 1, 2), board, weight)
     rays, seen = state.camera.unproject(observations.pixels)
     s = np.linalg.norm(alignment.camera_xy(board), axis=1)
     across = np.maximum(np.linalg.norm(rays[..., :2], axis=-1), 1e-9)

@@ -186,7 +186,7 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     pixels = np.where(valid, [u, v], np.nan)
     lever, flat = centred(turned), centred(points[:2])
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
-    centre, _ = calibration.camera.project(np.array([0.0, 0.0, 1.0]))
+    centre = calibration.camera.axis_px
     along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3

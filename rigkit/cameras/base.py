@@ -290,6 +290,11 @@ class Camera(ABC):
             return np.asarray(((pixels >= -0.5) & (pixels <= limit)).all(axis=-1))
 
     @property
+    def axis_px(self) -> Pixels:
+        """Pixel (2,) of the optical axis; NaN where the camera does not see it."""
+        return self.project(np.array([0.0, 0.0, 1.0]))[0]
+
+    @property
     def focal_px(self) -> float:
         """Pixels per radian on the optical axis: the scale of an angular error, whatever the model."""
         _, _, d_pixels_d_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))

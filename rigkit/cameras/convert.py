@@ -74,7 +74,7 @@ def convert_camera(
     if len(pixels) < MIN_COVERED_SAMPLES:
         raise InputError("camera conversion: the source sees next to nothing of its own image; calibrate it again")
     theta = _off_axis_rad(rays)
-    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
+    centre = camera.axis_px
     inside = np.ones(len(pixels), dtype=bool) if outline is None else _inside(outline, pixels)
     if not inside.any():
         raise InputError("camera conversion: nothing was seen where the camera looks; calibrate it again")

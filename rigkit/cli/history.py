@@ -30,8 +30,6 @@ def run(args: argparse.Namespace) -> int:
     if args.temperature is not None and args.add is None:
         raise InputError("history: --temperature is of a calibration that is added; give --add and --to, too")
     if args.add is not None:
-        if args.add.resolve() == args.to.resolve():
-            raise InputError(f"history: '{args.add}' and '{args.to}' are the same file; give a calibration made anew")
         add_calibration(args.register, args.add, args.to, temperature_c=args.temperature)
         note(f"{args.register} has one entry more")
     entries, written = show_history(args.register, report=args.report, force=args.force)

@@ -154,8 +154,7 @@ def _spline_of(camera: Camera) -> tuple[str, FloatArray]:
             "not follow; check its fx and fy"
         )
     lens = f"LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx={KNOTS_X}_Ny={ny}_fov_x_deg={fov_x}"
-    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
-    focal = camera.focal_px
+    focal, centre = camera.focal_px, camera.axis_px
     basis, inside = _basis(u, lens)
     target = ((pixels - centre) / focal - u)[inside]
     normal = (basis[inside].T @ basis[inside]).toarray()

@@ -248,8 +248,7 @@ def _axis_view(camera: Camera, rays: FloatArray, pair_id: str) -> Pinhole:
             f"pair '{pair_id}': a corner lies {np.rad2deg(widest):.0f} deg off the axis, too far for a perspective "
             "view; use the raw chain (--chain raw)"
         )
-    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
-    return Pinhole(camera.size_px, np.array([camera.focal_px, camera.focal_px, centre[0], centre[1]]))
+    return Pinhole(camera.size_px, np.array([camera.focal_px, camera.focal_px, *camera.axis_px]))
 
 
 def _in_view(detection: BoardDetection, camera: Camera, view: Pinhole) -> BoardDetection:

@@ -69,8 +69,7 @@ def target_camera(
 
 def field_across(camera: Camera) -> float:
     """Return the angle, rad, between the rays at the left and the right edge of the image, on the row of the axis."""
-    centre, _ = camera.project(np.array([0.0, 0.0, 1.0]))
     u = np.linspace(-0.5, camera.size_px[0] - 0.5, 201)
-    rays, valid = camera.unproject(np.stack([u, np.full_like(u, centre[1])], axis=-1))
+    rays, valid = camera.unproject(np.stack([u, np.full_like(u, camera.axis_px[1])], axis=-1))
     across = np.arctan2(rays[valid, 0], rays[valid, 2])
     return float(np.ptp(across)) if across.size else float(2.0 * camera.max_angle_rad)

@@ -337,7 +337,6 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
         ("check LENS VIEW --temperature -400 --register new.jsonl", "temperature -400"),
         ("check LENS VIEW --temperature 20", "--register"),
         ("history new.jsonl --temperature 20", "--add"),
-        ("history new.jsonl --add LENS --to LENS", "the same file"),
         ("export LAB -p regular-general --names a -o x.ply", "--names"),
         ("export LAB -p regular-general --size 640x480 -o x.ply", "--size"),
         ("export cloud.ply -p regular-general -o x.las", "--pair"),

@@ -264,7 +264,7 @@ class _Squares:
         """Return which squares (M,) and the paper beyond them lie in the image, large enough, and well predicted."""
         shape = self.shape
         sound = shape.gain < MAX_BORDER_GAIN
-        side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+        side = shape.shorter_px()
         sound &= side > MIN_CELL_PX
         inside = self.inside(image, 1.0, 0.5) & self.inside(image, float(BEYOND[-1]), 0.5)
         return np.asarray(inside & self.near & self.supported(MIN_SUPPORT) & self._of_squares(sound))

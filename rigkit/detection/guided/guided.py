@@ -244,7 +244,7 @@ def _added(image: GreyImage, guide: Guide, state: BoardState) -> BoardState | No
     if not missing.any():
         return None
     shape, predicted = guide.at(state, missing)
-    side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+    side = shape.shorter_px()
     height, width = image.shape
     with np.errstate(invalid="ignore"):
         inside = (shape.pixels > MARGIN_PX) & (shape.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)

@@ -72,6 +72,10 @@ class LocalFit:
         """Return the areas (M,) of the cells, px^2, negative where they are folded over."""
         return _cross(*self.sides.transpose(1, 2, 0))
 
+    def shorter_px(self) -> FloatArray:
+        """Return the shorter sides (M,) of the cells, px."""
+        return np.asarray(np.linalg.norm(self.sides, axis=2).min(axis=1))
+
     def cell_px(self) -> FloatArray:
         """Return the sides (M,) of squares as large as the cells, px, at least 1."""
         side: FloatArray = np.sqrt(np.maximum(self.areas(), 1.0))

@@ -99,7 +99,7 @@ def _continues(lattice: Lattice, part: slice, at: int) -> bool:
     cells = np.zeros(lattice.known.shape, bool)
     cells[:, at] = lattice.known[:, at]
     shape = fit_cells(pixels, cells, degree=STIFF.degree, ridge=STIFF.ridge)
-    side = np.minimum(np.linalg.norm(shape.along_column, axis=1), np.linalg.norm(shape.along_row, axis=1))
+    side = shape.shorter_px()
     off = np.linalg.norm(shape.pixels - lattice.pixels[cells], axis=1)
     return bool(np.median(off / np.maximum(side, 1e-9)) < CONTINUES_CELLS)
 
