@@ -19,19 +19,21 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, TagSightings, guessed_grids
-from rigkit.detection.whole_grids import MIN_SURE_CORNERS, GridSeen, Size, grid_seen, size_of_parts, whole_sizes
-
-MIN_IMAGES_OF_GUESS = 2
-"""A size of chessboards is told from so many images, or from the only one."""
+from rigkit.detection.whole_grids import (
+    MIN_IMAGES_OF_GUESS,
+    MIN_SURE_CORNERS,
+    GridSeen,
+    Size,
+    grid_seen,
+    told_size,
+    whole_sizes,
+)
 
 LOOKING = "looking which board it is"
 """What progress is told of."""
 
 IMAGES_OF_PATTERN = 4
 """Images whose corners tell which of two patterns a board has, where its markers do not."""
-
-MAX_SHARE_ALIKE_PARTS = 0.5
-"""Parts of a board that the frame cuts are of one size in fewer of the images."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
@@ -50,13 +52,18 @@ class BoardGuess:
     board : with squares, or tags, of 1 mm.
     images : indices of the images that show it.
     beside : other boards that images show.
-    cut : the frame cuts the board in every image: it has so many columns and rows, or more.
+    sizes : empty where the images tell how large the board is. Otherwise it has so many columns and rows, or more; or
+        one of several sizes, between which images do not decide.
     """
 
     board: Board
     images: tuple[int, ...]
     beside: tuple[Board, ...] = ()
-    cut: bool = False
+    sizes: tuple[Size, ...] = ()
+
+    @property
+    def told(self) -> bool:
+        return not self.sizes
 
 
 def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
@@ -102,7 +109,7 @@ def _guess_of(
     if charuco:
         return BoardGuess(_of_pattern(charuco, [images[k] for k in markers.images]), tuple(markers.images))
     guess = _plain_guess(images, plain)
-    if guess is not None and not guess.cut:
+    if guess is not None and guess.told:
         return guess
     # Last, as the markers of ChArUco boards stand in rows, too.
     aruco = TagSightings(ARUCO_TAGS)
@@ -155,42 +162,19 @@ def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if not (found and settled):
             circles.look(k, image)
-    best = _size(plain)
+    best = told_size(plain)
     grid = guessed_circles(circles)
     if grid is not None and (best is None or len(grid[1]) > len(best[1])):
         return BoardGuess(*grid)
     if best is not None:
-        return BoardGuess(Board("board", *best[0], 1.0, 1.0), best[1])
+        sizes, shown = best
+        board = Board("board", *sizes[0], 1.0, 1.0)
+        return BoardGuess(board, shown, sizes=sizes if len(sizes) > 1 else ())
     shown = tuple(k for k, found in enumerate(plain) if found)
     if len(shown) < 0.5 * len(plain) or not shown:
         return None
-    sizes = np.array([grid.size for found in plain for grid in found])
-    columns, rows = sizes.max(axis=0).tolist()
-    return BoardGuess(Board("board", columns, rows, 1.0, 1.0), shown, cut=True)
-
-
-def _size(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:
-    """Return the size of the chessboard that images show, and the images that show it; None where none tells."""
-    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
-    whole, whole_images = _most_seen([whole_sizes(found) for found in plain])
-    # Of the outermost squares the frame may cut a part.
-    full, full_images = _most_seen([{grid.size for grid in found} for found in plain])
-    if whole_images < MIN_IMAGES_OF_GUESS:
-        parts = size_of_parts(plain, MIN_IMAGES_OF_GUESS)
-        if parts is not None:
-            return parts
-        if whole is None and full_images > MAX_SHARE_ALIKE_PARTS * len(plain):
-            whole = full
-    if whole is None:
-        return None
-    return whole, tuple(k for k, found in enumerate(plain) if any(grid.size == whole for grid in found))
-
-
-def _most_seen(sizes: Sequence[set[Size]]) -> tuple[Size | None, int]:
-    """Return the size that most images show, the larger one of two, and how many; None where none shows any."""
-    counts = Counter(size for own in sizes for size in own)
-    best = max(counts, key=lambda size: (counts[size], size[0] * size[1]), default=None)
-    return best, counts[best] if best is not None else 0
+    least: Size = tuple(np.array([grid.size for found in plain for grid in found]).max(axis=0).tolist())
+    return BoardGuess(Board("board", *least, 1.0, 1.0), shown, sizes=(least,))
 
 
 def difference(guess: Board, declared: Board) -> str | None:

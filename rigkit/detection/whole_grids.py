@@ -23,16 +23,35 @@ MIN_SURE_CORNERS = 20
 UNSEEN_BORDER_PX = 5.0
 """Corners nearer to the image's border may be missed (sharp ones are found from 3 px on): a grid may go on there."""
 
+MIN_IMAGES_OF_GUESS = 2
+"""A size of chessboards is told from so many images, or from the only one."""
+
+MAX_SHARE_ALIKE_PARTS = 0.5
+"""Parts of a board that the frame cuts are of one size in fewer of the images."""
+
+FEW, MANY = 0.25, 0.5
+"""Images that show more of a board than others, in those that show the others' size: so few may see a row beside it
+that is none of it (of 1100 REAL images, sharp and made worse, none does), and so many are believed: rows where blur,
+the rim of a lens or poor light hide corners are missed in any number of images. Between the two nothing decides."""
+
 Size = tuple[int, int]
 """Corners along the longer side of a grid, and along the other."""
 
 
 @dataclass(frozen=True, slots=True)
 class GridSeen:
-    """How far a grid goes, along its columns and rows, and whether it ends there: else the frame cuts it."""
+    """How far a grid goes, along its columns and rows.
+
+    Attributes
+    ----------
+    lengths : corners.
+    ends : whether it is seen to end there: else the frame cuts it, or few corners of the last line are seen.
+    cut : the frame cuts it somewhere.
+    """
 
     lengths: tuple[int, int]
     ends: tuple[bool, bool]
+    cut: bool = False
 
     @property
     def size(self) -> Size:
@@ -60,20 +79,27 @@ def grid_seen(found: BoardDetection, shape: tuple[int, int]) -> GridSeen | None:
     lattice = found.lattice()
     borders = np.array(shape[::-1]) - 1.0
     along_columns = lattice.transpose(1, 0, 2)
-    ends = tuple(_ends(lines, borders) and _ends(lines[::-1], borders) for lines in (along_columns, lattice))
-    return GridSeen((found.columns, found.rows), (ends[0], ends[1]))
+    first, last, top, bottom = (
+        _next_line(lines, borders) for every in (along_columns, lattice) for lines in (every, every[::-1])
+    )
+    ends = tuple(
+        min(inside for inside, _ in both) >= MIN_SHARE_OF_LINE * lines.shape[1]
+        for both, lines in (((first, last), along_columns), ((top, bottom), lattice))
+    )
+    cut = any(outside > inside for inside, outside in (first, last, top, bottom))
+    return GridSeen((found.columns, found.rows), (ends[0], ends[1]), cut)
 
 
-def _ends(lines: FloatArray, borders: FloatArray) -> bool:
-    """Say whether the corners of a grid (lines, corners of each, 2), NaN where there is none, end with the first line:
-    what would be the next line is in the image, and was not found there."""
+def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
+    """Return how many corners before the first line of a grid (lines, corners of each, 2), NaN where there is none,
+    would be in the image, and were not found there, and how many would not, as far as the first line foretells it."""
     first, second, third = (lines[k] if k < len(lines) else np.full_like(lines[0], np.nan) for k in range(3))
     # Lenses bend lines; where the third corner is missing they are taken for straight.
     bend = np.nan_to_num(first - 2.0 * second + third)
     beyond = 2.0 * first - second + bend
     # Corners that are missing are NaN, and not inside.
     inside = ((beyond >= UNSEEN_BORDER_PX) & (beyond <= borders - UNSEEN_BORDER_PX)).all(axis=1)
-    return bool(np.count_nonzero(inside) >= MIN_SHARE_OF_LINE * lines.shape[1])
+    return int(np.count_nonzero(inside)), int(np.count_nonzero(np.isfinite(beyond[:, 0]) & ~inside))
 
 
 def whole_sizes(seen: Sequence[GridSeen]) -> set[Size]:
@@ -81,12 +107,71 @@ def whole_sizes(seen: Sequence[GridSeen]) -> set[Size]:
     return {grid.size for grid in seen if grid.whole}
 
 
-def size_of_parts(plain: Sequence[Sequence[GridSeen]], min_images: int) -> tuple[Size, tuple[int, ...]] | None:
+def told_size(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
+    """Return the size of the chessboard that images show, and the images that show it; several sizes where they do not
+    decide, None where they tell nothing.
+
+    plain : the grids of each image.
+
+    Corners seen are there, corners not seen may have been missed. So a size is not told where other images show more
+    of the board, and a larger one is where not too many whole grids are smaller (`FEW`, `MANY`).
+    """
+    wholes = Counter(size for grids in plain for size in whole_sizes(grids))
+    # Of its last lines blur may hide most.
+    hidden = Counter(size for grids in plain for size in {g.size for g in grids if any(g.ends) and not g.cut})
+    # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
+    often = [size for seen in (wholes, hidden) for size in _by_count(seen) if seen[size] >= MIN_IMAGES_OF_GUESS]
+    ways = [(size, _showing(plain, size)) for size in often]
+    parts = _size_of_parts(plain)
+    ways += [] if parts is None else [parts]
+    weighed = [(_weighed(plain, size, shown), shown) for size, shown in ways]
+    if weighed:
+        return min(weighed, key=lambda way: len(way[0]))
+    full = Counter(size for grids in plain for size in {grid.size for grid in grids})
+    once = _by_count(wholes) or [size for size in _by_count(full) if full[size] > MAX_SHARE_ALIKE_PARTS * len(plain)]
+    if not once or _more(plain, once[0]):
+        return None
+    return (once[0],), _showing(plain, once[0])
+
+
+def _weighed(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
+    """Return `size`, `shown` by these images, and with it another one where images do not decide between the two."""
+    more = _more(plain, size)
+    if more and (more.total() > len(shown) or max(more.values()) > FEW * len(shown)):
+        return size, _by_count(more)[0]
+    less = Counter(other for k, grids in enumerate(plain) if k not in shown for other in whole_sizes(grids))
+    inside = [other for other in _by_count(less) if other != size and _within(other, size)]
+    return (inside[0], size) if inside and MANY * less[inside[0]] > len(shown) else (size,)
+
+
+def _by_count(counts: Counter[Size]) -> list[Size]:
+    """Return sizes, those of most images first, of these the larger ones."""
+    return sorted(counts, key=lambda size: (-counts[size], -size[0] * size[1]))
+
+
+def _within(size: Size, other: Size) -> bool:
+    return size[0] <= other[0] and size[1] <= other[1]
+
+
+def _showing(plain: Sequence[Sequence[GridSeen]], size: Size) -> tuple[int, ...]:
+    """Return the images with a grid of this size."""
+    return tuple(k for k, grids in enumerate(plain) if any(grid.size == size for grid in grids))
+
+
+def _more(plain: Sequence[Sequence[GridSeen]], size: Size) -> Counter[Size]:
+    """Return in how many images grids of which sizes have a row or column more than a board of this size, where they do
+    not show it; what other images show beside it is another board."""
+    beside = {grid.size for k in _showing(plain, size) for grid in plain[k]}
+    seen = ({grid.size for grid in grids} for grids in plain)
+    return Counter(other for sizes in seen if size not in sizes for other in sizes - beside if not _within(other, size))
+
+
+def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int, ...]] | None:
     """Return the size of the board of which images show parts, and the images that show where one of its sides ends;
     None where they do not show both.
 
-    plain : the grids of each image. Each side of the board is seen from end to end in `min_images` or more, and no
-    size explains more images. Parts of a board as long as wide do not tell which of its sides they show.
+    plain : the grids of each image. Each side of the board is seen from end to end in `MIN_IMAGES_OF_GUESS` or more,
+    and no size explains more images. Parts of a board as long as wide do not tell which of its sides they show.
     """
     lengths = sorted({n for grids in plain for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends})
     best: tuple[int, Size, tuple[int, ...]] | None = None
@@ -94,7 +179,8 @@ def size_of_parts(plain: Sequence[Sequence[GridSeen]], min_images: int) -> tuple
         fit = [[g for g in grids if any(g.ends) and g.may_be_of(size)] for grids in plain]
         shown = tuple(k for k, grids in enumerate(fit) if grids)
         told = Counter(side for grids in fit for side in _sides_told(grids, size))
-        if min(told[0], told[1]) >= min_images and (best is None or len(shown) > best[0]):
+        enough = min(told[0], told[1]) >= MIN_IMAGES_OF_GUESS
+        if enough and (best is None or len(shown) > best[0]):
             best = len(shown), size, shown
     return None if best is None else best[1:]
 

@@ -161,7 +161,7 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     shown = _shown(places, progress)
     if shown.words is None:
         if shown.part is not None:
-            raise InputError(f"calibrate: the images show only {shown.part}, and give it as --board {WORDS_HELP}")
+            raise InputError(f"calibrate: the images show {shown.part}, and give it as --board {WORDS_HELP}")
         raise InputError(f"calibrate: no board is seen in the images; give it, such as --board {WORDS_HELP}")
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 

@@ -16,6 +16,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
+from rigkit.detection.whole_grids import Size
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
 from rigkit.io.video import Video, is_video
@@ -79,8 +80,8 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
         nothing = "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {nothing}")
-    if guess.cut:
-        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show only {_part(guess.board)}")
+    if not guess.told:
+        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess.sizes)}")
     pictures = list(images.values())
     twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
@@ -100,7 +101,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     if mirrored is not None:
         return mirrored
     guess = _guess(paths)
-    if guess is None or guess.cut:
+    if guess is None or not guess.told:
         return None
     told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
     words = [one for one in told if one is not None]
@@ -176,14 +177,20 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     guess = _guess(paths, progress)
     if guess is None:
         return Suggestion()
-    if guess.cut:
-        return Suggestion(part=_part(guess.board))
+    if not guess.told:
+        return Suggestion(part=_untold(guess.sizes))
     return Suggestion(" --board ".join(words_of_board(board) for board in (guess.board, *guess.beside)))
 
 
-def _part(board: Board) -> str:
-    size = f"{board.columns} x {board.rows} inner corners"
-    return f"parts of a chessboard, of at least {size}: the frame cuts it everywhere; count them on the board"
+def _untold(sizes: Sequence[Size]) -> str:
+    """Say what images show of a chessboard that has one of several sizes, or the only one at least."""
+    words = " or ".join(f"{columns} x {rows}" for columns, rows in sizes)
+    if len(sizes) > 1:
+        return f"a chessboard of {words} inner corners and do not tell which; count them on the board"
+    return (
+        f"only parts of a chessboard, of at least {words} inner corners: none shows all of its sides; count them on "
+        "the board"
+    )
 
 
 def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | None:
@@ -195,7 +202,7 @@ def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | N
             guess = guess_board(pictures, progress)
         except (InputError, DegenerateError):
             return None
-        told = guess is not None and not guess.cut and len(guess.images) > 1
+        told = guess is not None and guess.told and len(guess.images) > 1
         if told or (len(paths) <= most and not any(map(is_video, paths))):
             break
     return guess

@@ -122,15 +122,38 @@ def test_a_board_that_the_frame_cuts_in_every_image() -> None:
     images = [framed(CUT, 560, 250, (0.0, 200.0), s) for s in (0.0, 8.0)]
     images += [framed(CUT, 300, 480, (x, 0.0)) for x in (150.0, 160.0)]
     guess = guess_board(images)
-    assert guess is not None and not guess.cut
+    assert guess is not None and guess.told
     assert guess.board.size == (10, 7) and guess.images == (0, 1, 2, 3)
 
 
 def test_images_that_do_not_tell_how_large_a_board_is() -> None:
     """No image shows the shorter side from end to end: it may be longer than what is seen."""
     guess = guess_board([framed(CUT, 560, 250, (0.0, y)) for y in (250.0, 200.0, 140.0)])
-    assert guess is not None and guess.cut
+    assert guess is not None and not guess.told
     assert guess.board.columns == 10 and guess.board.rows in (5, 6)
+
+
+def dimmed(columns: int, count: int) -> list[GreyImage]:
+    """Return images of a board, of which the rim of a lens hides all but so many columns."""
+    images = []
+    for k in range(count):
+        image = framed(CUT, 800, 560, (2.0 * k, 5.0 * k))
+        right = round(400 + k + 30.0 * (columns - 0.5 * CUT.columns))
+        image[:, right:] = 12.0 + 0.01 * (image[:, right:] - 128.0)
+        images.append(image)
+    return images
+
+
+def test_columns_at_the_rim_of_a_lens_are_of_the_board() -> None:
+    """Three images show eight columns and two all ten: what is seen is there."""
+    guess = guess_board([*dimmed(8, 3), *dimmed(11, 2)])
+    assert guess is not None and guess.told
+    assert guess.board.size == (10, 7) and guess.images == (3, 4)
+
+
+def test_images_that_do_not_decide_how_large_a_board_is() -> None:
+    guess = guess_board([*dimmed(8, 5), *dimmed(11, 2)])
+    assert guess is not None and set(guess.sizes) == {(8, 7), (10, 7)}
 
 
 def test_a_board_with_hidden_corners_is_as_large_as_its_grid() -> None:
