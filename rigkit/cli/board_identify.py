@@ -39,6 +39,11 @@ def identify(args: argparse.Namespace) -> int:
     if found.alike:
         seen = f"{len(found.alike)} of {len(found.looked_at)} images, such as '{found.alike[0]}'"
         note(f"two boards alike in {seen}: detect and calibrate find only one of them; {ALIKE_REMEDY}")
+    if found.either_pattern:
+        note(
+            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows: if "
+            "OpenCV made the board, set legacy_pattern by its version"
+        )
     for error in found.unreadable:
         note(f"left out: {error}")
     return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL

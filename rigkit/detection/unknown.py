@@ -17,6 +17,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
+from rigkit.detection.tags.in_squares import likeness_at
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, TagSightings, guessed_grids
 from rigkit.detection.whole_grids import (
@@ -32,8 +33,11 @@ from rigkit.detection.whole_grids import (
 LOOKING = "looking which board it is"
 """What progress is told of."""
 
-IMAGES_OF_PATTERN = 4
-"""Images whose corners tell which of two patterns a board has, where its markers do not."""
+IMAGES_OF_PATTERN = 8
+"""Images that are asked which of two patterns a board has, where the places of its markers do not tell."""
+
+SURE_OF_PATTERN = 3.0
+"""They tell where this many standard deviations speak for one of the two."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
@@ -54,12 +58,15 @@ class BoardGuess:
     beside : other boards that images show.
     sizes : empty where the images tell how large the board is. Otherwise it has so many columns and rows, or more; or
         one of several sizes, between which images do not decide.
+    either_pattern : nothing tells whether a ChArUco board is of the pattern of today or the one before OpenCV 4.6: the
+        images do not show the column in which the two differ.
     """
 
     board: Board
     images: tuple[int, ...]
     beside: tuple[Board, ...] = ()
     sizes: tuple[Size, ...] = ()
+    either_pattern: bool = False
 
     @property
     def told(self) -> bool:
@@ -107,7 +114,8 @@ def _guess_of(
         return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:]))
     charuco = guessed_charuco(markers)
     if charuco:
-        return BoardGuess(_of_pattern(charuco, [images[k] for k in markers.images]), tuple(markers.images))
+        board, sure = _of_pattern(charuco, [images[k] for k in markers.images])
+        return BoardGuess(board, tuple(markers.images), either_pattern=not sure)
     guess = _plain_guess(images, plain)
     if guess is not None and guess.told:
         return guess
@@ -119,17 +127,35 @@ def _guess_of(
     return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else guess
 
 
-def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> Board:
-    """Return the board of which the images show most corners, of the pattern of today or the one before it. Where a row
-    has an odd number of squares, the two are numbered alike but for one column, whose markers the images may not show:
-    with the wrong one the corners beside that column have no place on the board."""
+def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
+    """Return the board of the pattern of today or of the one before it, and whether the images tell which.
+
+    Where a row has an odd number of squares, the two are numbered alike but for one marker in every second row, which
+    has its place at one end or at the other: there that marker is like what is seen, or it is not.
+    """
     if len(boards) == 1:
-        return boards[0]
+        return boards[0], True
     some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
-    seen = in_threads(
-        lambda image: [sum(len(d.grid) for d in detect_boards(image, [b]) if d.board_id) for b in boards], some
-    )
-    return boards[int(np.sum(list(seen), axis=0).argmax())]
+    excess, places = np.sum(list(in_threads(lambda image: _for_the_second(boards, image), some)), axis=0)
+    return boards[int(excess > 0.0)], bool(abs(excess) >= SURE_OF_PATTERN * np.sqrt(max(places, 1.0)))
+
+
+def _for_the_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, int]:
+    """Return by how much more the markers that two boards have in different places are like what is seen where the
+    second has them, in standard deviations of one, and at how many places."""
+    found = next((item for item in detect_boards(image, boards[:1]) if item.board_id is not None), None)
+    pattern = boards[0].pattern
+    if found is None or not isinstance(pattern, Charuco):
+        return 0.0, 0
+    # Where both have them in this board's grid: the second's may be moved by a column.
+    own, others = (board.pattern.places(*board.size) for board in boards if isinstance(board.pattern, Charuco))
+    steps, counts = np.unique(own - others, axis=0, return_counts=True)
+    others = others + steps[counts.argmax()]
+    apart = np.flatnonzero((own != others).any(axis=1))
+    ways = [
+        likeness_at(image, found.lattice(), at[apart], pattern.first_marker + apart, boards[0]) for at in (own, others)
+    ]
+    return float(ways[1].sum() - ways[0].sum()), sum(int(np.count_nonzero(way)) for way in ways)
 
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:

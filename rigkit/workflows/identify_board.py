@@ -43,6 +43,7 @@ class IdentifiedBoard:
     beside : the words of other boards that the images show.
     unreadable : why other images could not be read.
     alike : names of images that show two of these boards: nothing tells whose marks are whose.
+    either_pattern : it may as well be of the other ChArUco pattern (`BoardGuess.either_pattern`).
     """
 
     board: Board
@@ -52,6 +53,7 @@ class IdentifiedBoard:
     beside: tuple[str, ...] = ()
     unreadable: tuple[InputError, ...] = ()
     alike: tuple[str, ...] = ()
+    either_pattern: bool = False
 
 
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
@@ -92,6 +94,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
         beside=tuple(words_of_board(board) for board in guess.beside),
         unreadable=tuple(unreadable),
         alike=twice,
+        either_pattern=guess.either_pattern,
     )
 
 
@@ -202,7 +205,8 @@ def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | N
             guess = guess_board(pictures, progress)
         except (InputError, DegenerateError):
             return None
-        told = guess is not None and guess.told and len(guess.images) > 1
+        # Where some do not show it, more are asked.
+        told = guess is not None and guess.told and 1 < len(guess.images) == len(pictures)
         if told or (len(paths) <= most and not any(map(is_video, paths))):
             break
     return guess

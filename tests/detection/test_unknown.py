@@ -208,22 +208,48 @@ def test_markers_without_order_are_no_board() -> None:
     assert guessed_charuco(seen) == []
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_corners_tell_the_pattern_where_markers_fit_both(legacy: bool) -> None:
-    """Nine squares a row: the two patterns are numbered alike but for one column, at either end, hidden here."""
+def of_nine_squares_a_row(legacy: bool) -> tuple[GreyImage, float, float]:
+    """Return an image of a board of either pattern, which are numbered alike but for one column, at either end, and the
+    middles of the squares there, px from the left."""
     board = Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_4X4_50", 45.0, legacy=legacy))
     camera = Pinhole((900, 700), np.array([800.0, 800.0, 449.5, 349.5]))
     facing = Rigid3(np.eye(3), np.array([-210.0, -120.0, 600.0]))
     image = grey_image(render([PlacedBoard(board, facing)], camera, Rigid3.identity(), optics=Optics(0.5)))
     left, right = camera.project(facing.apply(np.array([[-30.0, 0.0, 0.0], [450.0, 0.0, 0.0]])))[0][:, 0]
-    paper = image.copy()
+    return image, left, right
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_half_markers_tell_the_pattern_where_those_read_fit_both(legacy: bool) -> None:
+    paper, left, right = of_nine_squares_a_row(legacy)
     paper[:, : int(left)] = paper[:, int(right) :] = 200.0
     seen = MarkerSightings()
     assert seen.look(0, paper)
     assert len(guessed_charuco(seen)) == 2
     guess = guess_board([paper])
     assert guess is not None and isinstance(guess.board.pattern, Charuco)
-    assert guess.board.pattern.legacy is legacy
+    assert guess.board.pattern.legacy is legacy and not guess.either_pattern
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_markers_too_blurred_to_be_read_tell_the_pattern_by_their_place(legacy: bool) -> None:
+    image, left, right = of_nine_squares_a_row(legacy)
+    blurred = np.asarray(cv2.GaussianBlur(image, (0, 0), 6.0), np.float32)
+    for end in (slice(0, int(left) + 50), slice(int(right) - 50, None)):
+        image[:, end] = blurred[:, end]
+    seen = MarkerSightings()
+    assert seen.look(0, image)
+    boards = guessed_charuco(seen)
+    assert len(boards) == 2
+    guess = guess_board([image])
+    assert guess is not None and isinstance(guess.board.pattern, Charuco)
+    assert guess.board.pattern.legacy is legacy and not guess.either_pattern
+
+
+def test_images_that_do_not_show_which_pattern_it_is() -> None:
+    image, left, right = of_nine_squares_a_row(legacy=True)
+    guess = guess_board([np.ascontiguousarray(image[:, int(left) + 50 : int(right) - 50])])
+    assert guess is not None and guess.board.size == (8, 5) and guess.either_pattern
 
 
 def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyPatch) -> None:

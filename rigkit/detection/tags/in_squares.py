@@ -15,7 +15,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import foretold
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, homographies, read_tags, transferred
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.placing import squares_of, voted_place
 
@@ -80,6 +80,30 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
     return grown[1:-1, 1:-1]
 
 
+def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers: IntArray, board: Board) -> FloatArray:
+    """Return how like the markers of these `numbers` (N,) squares of the grid of a ChArUco board are, (N,), as
+    `excess_likeness`: by chance of mean 0 and standard deviation 1; 0 where the corners do not foretell the square.
+
+    pixels : (R, C, 2) corners, NaN where unknown.
+    squares : (N, 2) column and row, the one before the first corner (0, 0), or one beyond the board's.
+    """
+    grown = np.pad(pixels, ((2, 2), (2, 2), (0, 0)), constant_values=np.nan)
+    wanted = np.zeros(grown.shape[:2], np.bool_)
+    rows, columns = (squares[:, k, None] + 1 + np.array(step) for k, step in ((1, (0, 0, 1, 1)), (0, (0, 1, 1, 0))))
+    wanted[rows, columns] = True
+    wanted &= np.isnan(grown[..., 0])
+    ahead = foretold(grown, wanted)
+    grown[wanted] = np.where(ahead.gain[:, None] < MAX_FORETOLD_GAIN, ahead.pixels, np.nan)
+    quads = grown[rows, columns]
+    inside = ((quads >= 0.0) & (quads <= np.array(image.shape[::-1]) - 1.0)).all(axis=(1, 2))
+    out, codes = np.zeros(len(squares)), marker_codes(board)
+    if inside.any():
+        excess = excess_likeness(_as_printed(image, board), _within(quads[inside], board), codes)
+        upright = {int(n): k for k, (n, turns) in enumerate(zip(codes.numbers, codes.turns, strict=True)) if turns == 0}
+        out[inside] = excess[np.arange(len(excess)), [upright[int(n)] for n in numbers[inside]]]
+    return out
+
+
 def _pattern(board: Board) -> Charuco:
     pattern = board.pattern
     assert isinstance(pattern, Charuco)
@@ -99,8 +123,16 @@ def marker_codes(board: Board) -> Codes:
 
 def _read(image: GreyImage, squares: FloatArray, board: Board) -> TagCode:
     """Return the codes in the squares (N, 4, 2) of a board."""
-    pattern = _pattern(board)
-    margin = 0.5 * (1.0 - pattern.marker_mm / np.array(board.squares_mm))
+    return read_tags(_as_printed(image, board), _within(squares, board), marker_codes(board))
+
+
+def _as_printed(image: GreyImage, board: Board) -> GreyImage:
+    """Return the image with markers dark on white."""
+    return 255 - image if _pattern(board).inverted else image
+
+
+def _within(squares: FloatArray, board: Board) -> FloatArray:
+    """Return the outlines of the markers in squares (N, 4, 2)."""
+    margin = 0.5 * (1.0 - _pattern(board).marker_mm / np.array(board.squares_mm))
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    quads = transferred(homographies(squares), margin + unit * (1.0 - 2.0 * margin))
-    return read_tags(255 - image if pattern.inverted else image, quads, marker_codes(board))
+    return transferred(homographies(squares), margin + unit * (1.0 - 2.0 * margin))
