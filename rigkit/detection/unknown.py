@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
@@ -60,6 +61,7 @@ class BoardGuess:
         one of several sizes, between which images do not decide.
     either_pattern : nothing tells whether a ChArUco board is of the pattern of today or the one before OpenCV 4.6: the
         images do not show the column in which the two differ.
+    marked : no image shows that the squares of this chessboard are empty: there may be marks that were not read.
     """
 
     board: Board
@@ -67,6 +69,7 @@ class BoardGuess:
     beside: tuple[Board, ...] = ()
     sizes: tuple[Size, ...] = ()
     either_pattern: bool = False
+    marked: bool = False
 
     @property
     def told(self) -> bool:
@@ -100,6 +103,8 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
                 markers.look(k, images[k])
     guess = _guess_of(images, plain, tags, markers)
     progress(LOOKING, len(images), len(images))
+    if guess is not None and guess.board.pattern.type == Chessboard.type:
+        return replace(guess, marked=not sure)
     return guess
 
 

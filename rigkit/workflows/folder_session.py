@@ -160,9 +160,12 @@ def boards_seen(places: Sequence[Path], side_mm: float, progress: Progress = sil
     """
     shown = _shown(places, progress)
     if shown.words is None:
+        if shown.fault is not None:
+            raise InputError(f"calibrate: {shown.fault}")
         if shown.part is not None:
             raise InputError(f"calibrate: the images show {shown.part}, and give it as --board {WORDS_HELP}")
-        raise InputError(f"calibrate: no board is seen in the images; give it, such as --board {WORDS_HELP}")
+        doubt = f" ({shown.doubt})" if shown.doubt is not None else ""
+        raise InputError(f"calibrate: no board is seen in the images{doubt}; give it, such as --board {WORDS_HELP}")
     return tuple(with_length(words, side_mm) for words in shown.words.split(" --board "))
 
 
@@ -176,6 +179,8 @@ def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
 def _untold(folders: Sequence[Path]) -> str:
     """Return what to say where no board is given: what the images show of it."""
     shown = _shown(folders)
+    if shown.fault is not None:
+        return f"calibrate: {shown.fault}"
     if shown.words is None:
         such = f"give the board, such as --board {WORDS_HELP}, or --board board.toml"
     else:

@@ -10,9 +10,11 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
@@ -26,6 +28,9 @@ ENOUGH_IMAGES = 12
 
 EXPLAINING_IMAGES = 4
 """Images looked at to say what is wrong with a session."""
+
+MIN_SHARE_OF_IMAGES = 0.5
+"""A board is in this part of the images, at least, or something else may be in them."""
 
 FRAMES_APART = 10
 """Frames from one that is looked at to the next, of a video that does not say how many it has."""
@@ -77,11 +82,14 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     progress("reading", ENOUGH_IMAGES, ENOUGH_IMAGES)
     guess = guess_board(list(images.values()), progress)
     names = tuple(Path(name).name for name in images)
+    otherwise = _otherwise(list(images.items()), guess)
+    if otherwise is not None:
+        raise CheckFailed(otherwise)
     if guess is None:
         if unreadable:
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
-        nothing = "no chessboard, ChArUco board, AprilGrid or grid of circles"
-        raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {nothing}")
+        seen = _doubtful(list(images.items())) or "no chessboard, ChArUco board, AprilGrid or grid of circles"
+        raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {seen}")
     if not guess.told:
         raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess.sizes)}")
     pictures = list(images.values())
@@ -103,7 +111,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     mirrored = _mirrored(paths, [board for board in boards if board.identified])
     if mirrored is not None:
         return mirrored
-    guess = _guess(paths)
+    guess, _ = _guess(paths)
     if guess is None or not guess.told:
         return None
     told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
@@ -147,17 +155,59 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
             continue
         straight, flipped = (
             any(found.board_id is not None for found in detect_boards(seen, boards))
-            for seen in (image, np.ascontiguousarray(image[:, ::-1]))
+            for seen in (image, _flipped(image))
         )
         if straight:
             return None
         if flipped:
             names.append(name)
-    if not names:
+    return _in_a_mirror(names[0]) if names else None
+
+
+def _otherwise(pictures: Sequence[tuple[str, GreyImage]], guess: BoardGuess | None) -> str | None:
+    """Say that images are mirrored, or negatives, where boards with marks are seen in them when that is undone, and
+    without it only `guess`, which may be wrong: nothing, few chessboards, or some with something in their squares."""
+    if guess is not None and (
+        guess.board.pattern.type != Chessboard.type
+        or (not guess.marked and len(guess.images) >= MIN_SHARE_OF_IMAGES * len(pictures))
+    ):
         return None
+    some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
+    for undone, said in ((_flipped, _in_a_mirror), (_exchanged, _in_negatives)):
+        marks = guess_board([undone(image) for _, image in some])
+        if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
+            return said(some[marks.images[0]][0])
+    return None
+
+
+def _doubtful(pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
+    """Say what is seen in images that may be a board; None for nothing."""
+    for name, image in pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]:
+        words = doubtful_grid(image)
+        if words is not None:
+            return f"in '{Path(name).name}' {words}"
+    return None
+
+
+def _flipped(image: GreyImage) -> GreyImage:
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def _exchanged(image: GreyImage) -> GreyImage:
+    return np.asarray(image.max() + image.min() - image, image.dtype)
+
+
+def _in_a_mirror(name: str) -> str:
     return (
-        f"the images are mirrored: '{Path(names[0]).name}' shows its board only when it is flipped left to right; "
+        f"the images are mirrored: '{Path(name).name}' shows its board only when it is flipped left to right; "
         "switch off mirroring in the camera or the program that writes them, or flip all of them"
+    )
+
+
+def _in_negatives(name: str) -> str:
+    return (
+        f"the images are negatives: '{Path(name).name}' shows its board only with black and white exchanged; "
+        "exchange them in all images"
     )
 
 
@@ -169,17 +219,24 @@ class Suggestion:
     ----------
     words : as `--board` takes them; None where they do not tell.
     part : what they do show, in words, where it is not enough.
+    fault : what is wrong with the images, in words.
+    doubt : what is seen in them that may be a board, in words.
     """
 
     words: str | None = None
     part: str | None = None
+    fault: str | None = None
+    doubt: str | None = None
 
 
 def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion:
     """Return the board that images show."""
-    guess = _guess(paths, progress)
+    guess, pictures = _guess(paths, progress)
+    otherwise = _otherwise(pictures, guess)
+    if otherwise is not None:
+        return Suggestion(fault=otherwise)
     if guess is None:
-        return Suggestion()
+        return Suggestion(doubt=_doubtful(pictures))
     if not guess.told:
         return Suggestion(part=_untold(guess.sizes))
     return Suggestion(" --board ".join(words_of_board(board) for board in (guess.board, *guess.beside)))
@@ -196,20 +253,20 @@ def _untold(sizes: Sequence[Size]) -> str:
     )
 
 
-def _guess(paths: Sequence[Path], progress: Progress = silent) -> BoardGuess | None:
-    """Return the board that a few images show, or more of them where those do not tell."""
-    guess = None
+def _guess(paths: Sequence[Path], progress: Progress = silent) -> tuple[BoardGuess | None, list[tuple[str, GreyImage]]]:
+    """Return the board that a few images show, or more of them where those do not tell, and what was looked at."""
+    guess, pictures = None, []
     for most in (EXPLAINING_IMAGES, ENOUGH_IMAGES):
         try:
-            pictures = [image for _, image in _pictures(paths, most) if not isinstance(image, InputError)]
-            guess = guess_board(pictures, progress)
+            pictures = [(name, one) for name, one in _pictures(paths, most) if not isinstance(one, InputError)]
+            guess = guess_board([image for _, image in pictures], progress)
         except (InputError, DegenerateError):
-            return None
+            return None, []
         # Where some do not show it, more are asked.
         told = guess is not None and guess.told and 1 < len(guess.images) == len(pictures)
         if told or (len(paths) <= most and not any(map(is_video, paths))):
             break
-    return guess
+    return guess, pictures
 
 
 def _pictures(paths: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage | InputError]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,11 @@ from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.unknown import BoardGuess
+from rigkit.workflows import identify_board
+
+BLUR_PX, NOISE_LEVELS = 8.0, 10.0
+"""Together too much for a board of unknown size."""
 
 
 @pytest.mark.parametrize("pattern", [AprilGrid(0.3), Charuco("DICT_4X4_50", 30.0)])
@@ -27,3 +33,70 @@ def test_two_boards_alike_are_told(pattern: Pattern, tmp_path: Path, capsys: pyt
         err = capsys.readouterr().err
         assert ("two boards alike in 1 of 1 images, such as 'two.png'" in err) == (name == "two.png")
         assert ("first_marker, first_tag" in err) == (name == "two.png")
+
+
+def mirrored(image: np.ndarray) -> np.ndarray:
+    return image[:, ::-1]
+
+
+def negative(image: np.ndarray) -> np.ndarray:
+    return np.asarray(255 - image, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "done", "said"),
+    [
+        (Charuco("DICT_4X4_50", 30.0), mirrored, "mirrored"),
+        # Markers this small pass for ink in the squares of a chessboard.
+        (Charuco("DICT_4X4_50", 18.0), mirrored, "mirrored"),
+        (AprilGrid(0.3), mirrored, "mirrored"),
+        (AprilGrid(0.3), negative, "negatives"),
+    ],
+)
+def test_images_changed_so_that_marks_cannot_be_read(
+    pattern: Pattern,
+    done: Callable[[np.ndarray], np.ndarray],
+    said: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    board = Board("b", 8, 6, 40.0, 40.0, pattern=pattern)
+    for k in range(2):
+        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render())
+        cv2.imwrite(str(tmp_path / f"{k}.png"), done(picture))
+    assert main(["board", "identify", str(tmp_path)]) == 1
+    assert f"the images are {said}: '0.png' shows its board only" in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert f"calibrate: the images are {said}: '0.png' shows its board only" in capsys.readouterr().err
+
+
+def test_a_chessboard_in_a_mirror_is_a_chessboard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = np.asarray(one_board(np.random.default_rng(0), board=Board("b", 8, 6, 40.0, 40.0)).render())
+    cv2.imwrite(str(tmp_path / "0.png"), mirrored(picture))
+    assert main(["board", "identify", str(tmp_path)]) == 0
+    assert "--board 8x6xMM" in capsys.readouterr().out
+
+
+def test_a_grid_too_blurred_to_be_believed_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With its size given it may be found."""
+    picture = np.asarray(one_board(np.random.default_rng(0), board=Board("b", 8, 6, 20.0, 20.0)).render(), np.float32)
+    noise = np.random.default_rng(1).normal(0.0, NOISE_LEVELS, picture.shape)
+    worse = np.clip(cv2.GaussianBlur(picture, (0, 0), BLUR_PX) + noise, 0.0, 255.0)
+    cv2.imwrite(str(tmp_path / "0.png"), worse.astype(np.uint8))
+    assert main(["board", "identify", str(tmp_path)]) == 1
+    assert "in '0.png' a 8x6 grid is seen, corners uncertain by" in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert "no board is seen in the images (in '0.png' a 8x6 grid is seen" in capsys.readouterr().err
+
+
+def test_images_that_do_not_decide_between_two_sizes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))
+    seen = BoardGuess(Board("b", 9, 6, 1.0, 1.0), (0,), sizes=((9, 6), (10, 6)))
+    monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
+    assert main(["board", "identify", str(tmp_path)]) == 1
+    words = "a chessboard of 9 x 6 or 10 x 6 inner corners and do not tell which; count them on the board"
+    assert f"1 image of 1 show {words}" in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert f"the images show {words}, and give it as --board" in capsys.readouterr().err
