@@ -200,11 +200,19 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
     assert board.size == (8, 5) and board.pattern == pattern
 
 
-def test_markers_without_order_are_no_board() -> None:
+@pytest.mark.parametrize(
+    ("numbers", "places"),
+    [
+        ([10, 19, 500, 900], [[0, 0], [0, 2], [2, 0], [2, 2]]),
+        # Two of three fit a board of 189 squares a row, as any two would.
+        ([197, 334, 523], [[0, 0], [-1, -1], [-1, 1]]),
+    ],
+)
+def test_markers_without_order_are_no_board(numbers: list[int], places: list[list[int]]) -> None:
     """Chance reads numbers of which none is where another has it."""
     seen, kind = MarkerSightings(images=[0]), ("DICT_4X4_1000", False)
-    seen.kinds[kind] = 4
-    seen.markers.append((kind, (np.array([10, 19, 500, 900]), np.array([[0, 0], [0, 2], [2, 0], [2, 2]]), 0.75)))
+    seen.kinds[kind] = len(numbers)
+    seen.markers.append((kind, (np.array(numbers), np.array(places), 0.75)))
     assert guessed_charuco(seen) == []
 
 

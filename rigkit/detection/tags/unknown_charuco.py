@@ -146,7 +146,8 @@ def guessed_charuco(seen: MarkerSightings) -> list[Board]:
     if columns < 2:
         return []
     count = sum(len(numbers) for numbers, *_ in own)
-    own = [read for markers in own if len((read := _in_order(*markers, columns))[0])]
+    # From two markers alone a number of columns follows that puts both in order.
+    own = [read for markers in own if len((read := _in_order(*markers, columns))[0]) >= MIN_MARKERS_READ]
     if not own:
         return []
     first = _first_marker(own)
