@@ -41,7 +41,7 @@ def identify(args: argparse.Namespace) -> int:
         note(f"two boards alike in {seen}: detect and calibrate find only one of them; {ALIKE_REMEDY}")
     if found.either_pattern:
         note(
-            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows: if "
+            "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows well: if "
             "OpenCV made the board, set legacy_pattern by its version"
         )
     for error in found.unreadable:

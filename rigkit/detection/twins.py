@@ -21,8 +21,8 @@ from rigkit.detection.tags.quads import quadrilaterals
 ALIKE_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
 """What is to be done about boards that nothing tells apart."""
 
-MIN_TWINS = 3
-"""Marks that are seen twice: one may be misread."""
+MIN_TWINS, MIN_SHARE_OF_TWINS = 3, 0.05
+"""Marks that are seen twice, and of all that are seen: some may be misread, of hundreds in REAL images up to three."""
 
 APART_SIDES = 1.5
 """The same mark is not seen in two places so far apart, in sides of it: at its outer and inner border it is."""
@@ -33,7 +33,7 @@ def alike_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | N
     without one."""
     grey = without_mosaic(grey_image(image))
     for board in boards:
-        if board.identified and _twins(*_marks(grey, board)) >= MIN_TWINS:
+        if board.identified and _are_alike(*_marks(grey, board)):
             return (
                 f"the marks of '{board.board_id}' are seen twice: of boards alike in one image only one is found; "
                 f"{ALIKE_REMEDY}"
@@ -55,8 +55,9 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
     return quads[seen], tags.number[seen]
 
 
-def _twins(quads: FloatArray, numbers: IntArray) -> int:
-    """Return how many marks are seen in two places."""
+def _are_alike(quads: FloatArray, numbers: IntArray) -> bool:
+    """Return whether so many marks are seen in two places that they are of two boards."""
     middle, side = quads.mean(axis=1), np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1)
     away = np.linalg.norm(middle[:, None] - middle, axis=2) > APART_SIDES * np.maximum(side[:, None], side)
-    return len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))
+    twins = len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))
+    return twins >= max(MIN_TWINS, MIN_SHARE_OF_TWINS * len(np.unique(numbers)))
