@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.patterns.chessboard import Chessboard
@@ -190,11 +188,11 @@ def _doubtful(pictures: Sequence[tuple[str, GreyImage]]) -> str | None:
 
 
 def _flipped(image: GreyImage) -> GreyImage:
-    return np.ascontiguousarray(image[:, ::-1])
+    return image[:, ::-1].copy()
 
 
 def _exchanged(image: GreyImage) -> GreyImage:
-    return np.asarray(image.max() + image.min() - image, image.dtype)
+    return 255 - image
 
 
 def _in_a_mirror(name: str) -> str:

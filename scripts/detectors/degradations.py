@@ -61,6 +61,13 @@ def moved(values: Values, length_px: float, rng: np.random.Generator) -> Values:
     return np.asarray(cv2.filter2D(values, -1, kernel / kernel.sum()), np.float32)
 
 
+def salted(values: Values, percent: float, rng: np.random.Generator) -> Values:
+    """Return the image with so many pixels in a hundred black or white: a damaged line, a hot sensor."""
+    drawn = rng.random(values.shape)
+    dark, bright = 0.005 * percent, 1.0 - 0.005 * percent
+    return np.asarray(np.where(drawn < dark, 0.0, np.where(drawn > bright, 255.0, values)), np.float32)
+
+
 def _squared_distance(shape: tuple[int, ...], middle: FloatArray) -> FloatArray:
     v, u = np.ogrid[: shape[0], : shape[1]]
     return np.asarray((u - middle[0]) ** 2 + (v - middle[1]) ** 2, np.float64)
@@ -120,6 +127,7 @@ LIGHT: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
     "webcam": webcam,
     "motion": moved,
     "glare": glare,
+    "salt": salted,
     "vignetting": vignetted,
     "covered": covered,
     "inverted": inverted,
@@ -152,6 +160,12 @@ def turned(grey: Grey, degrees: float) -> Degraded:
     return np.ascontiguousarray(quarter), map_
 
 
+def mirrored(grey: Grey) -> Degraded:
+    """Return the image as in a mirror: as many webcams show it."""
+    map_ = np.array([[-1.0, 0.0, grey.shape[1] - 1.0], [0.0, 1.0, 0.0]])
+    return np.ascontiguousarray(grey[:, ::-1]), map_
+
+
 def cut(grey: Grey, part: float, rng: np.random.Generator) -> Degraded:
     """Return the image without up to the `part` of its left and top."""
     left, top = (int(size * part * rng.random()) for size in grey.shape[::-1])
@@ -167,6 +181,7 @@ FRAME: dict[str, Callable[[Grey, float, np.random.Generator], Degraded]] = {
     "jpeg": lambda grey, quality, _: compressed(grey, quality),
     "size": lambda grey, factor, _: resized(grey, factor),
     "turned": lambda grey, degrees, _: turned(grey, degrees),
+    "mirrored": lambda grey, _, __: mirrored(grey),
     "cut": cut,
     "bits": lambda grey, bits, _: deep(grey, bits),
 }

@@ -256,7 +256,7 @@ def test_markers_too_blurred_to_be_read_tell_the_pattern_by_their_place(legacy: 
 
 def test_images_that_do_not_show_which_pattern_it_is() -> None:
     image, left, right = of_nine_squares_a_row(legacy=True)
-    guess = guess_board([np.ascontiguousarray(image[:, int(left) + 50 : int(right) - 50])])
+    guess = guess_board([image[:, int(left) + 50 : int(right) - 50].copy()])
     assert guess is not None and guess.board.size == (8, 5) and guess.either_pattern
 
 
