@@ -54,8 +54,8 @@ def test_another_board_beside_the_one_told_contradicts_nothing() -> None:
 def test_a_grid_ends_where_most_of_its_last_line_is_seen(missing: int, ends: tuple[bool, bool]) -> None:
     row, column = np.indices((6, 8)).reshape(2, -1)
     grid = np.stack([column, row], axis=1)[missing:]
-    pixels = 60.0 + 40.0 * grid
-    board = BoardDetection(None, 8, 6, grid, pixels, np.array([0.1] * len(grid)))
+    pixels = np.asarray(60.0 + 40.0 * grid, np.float64)
+    board = BoardDetection(None, 8, 6, grid, pixels, np.array([0.1] * len(grid), np.float64))
     assert grid_seen(board, (500, 500)) == GridSeen((8, 6), ends)
     cut = grid_seen(board, (290, 500))
     assert cut is not None and cut.cut
