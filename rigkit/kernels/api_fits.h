@@ -67,24 +67,25 @@ EXPORT void find_paper(
 /* Degree of the polynomial that a lens adds to a perspective, at most, and how many terms x^i y^j that has. */
 enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGREE + 2) / 2 };
 
+/* What is known of a place on a board: where it is seen, first derivatives along x and along y, second ones likewise, the standard
+ * deviation of the first for points of standard deviation 1, the curvatures of the lines along x and along y, and how far a unit of
+ * the board lies from these. */
+enum { SEEN = 0, SIDES = 2, SECOND = 6, GAIN = 10, CURVATURE = 11, HEIGHTS = 13, SURFACE_COLUMNS = 15 };
+
 EXPORT void project_places(
     ARRAY(const double, places, count, 2), int64_t count, ARRAY(const double, homography, 3, 3),
-    ARRAY(double, out, 5, count, 2));
+    ARRAY(double, out, count, SURFACE_COLUMNS));
 EXPORT double fit_perspective(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(
-    ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, double middle_x,
-    double middle_y, double size, int64_t terms, double most_leverage, ARRAY(double, basis, terms, count),
-    ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, scratch, 4, count),
-    ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, foretold, count, 2), ARRAY(double, leverage, count));
-EXPORT void polynomial_at(
-    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
-    int64_t degree, ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
-    ARRAY(double, out, 5, count, 2));
-EXPORT void surest_polynomial(
-    ARRAY(const double, wanted, count, 2), int64_t count, double middle_x, double middle_y, double size, int64_t terms,
+    ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
+    double most_leverage, ARRAY(double, scratch, terms + 5, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
+    ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, off, count),
+    ARRAY(double, gain, count), ARRAY(double, scatter, 1));
+EXPORT void add_polynomial(
+    ARRAY(const double, wanted, count, 2), int64_t count, ARRAY(const double, unit, 3), int64_t terms, int64_t degree,
     ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
-    ARRAY(const double, misses, SURFACE_DEGREE + 1), ARRAY(double, out, count, 3));
+    ARRAY(const double, misses, SURFACE_DEGREE + 1), int64_t surest, ARRAY(double, out, count, SURFACE_COLUMNS));
 EXPORT void read_modules(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
     ARRAY(const double, maps, count, 3, 3), int64_t count, int64_t side,

@@ -71,15 +71,14 @@ static void centred(const double *points, int64_t count, double middle[2], doubl
 void project_places(const double *places, int64_t count, const double *homography, double *out)
 {
     const double *h = homography;
-    for (int64_t i = 0; i < count; i++) {
+    for (int64_t i = 0; i < count; i++, out += SURFACE_COLUMNS) {
         const double x = places[2 * i], y = places[2 * i + 1], per_depth = 1.0 / (h[6] * x + h[7] * y + h[8]);
+        out[GAIN] = 0.0;
         for (int64_t k = 0; k < 2; k++) {
-            const double at = (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
-            out[2 * i + k] = at;
+            const double at = out[SEEN + k] = (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
             for (int64_t axis = 0; axis < 2; axis++) {
-                const double side = (h[3 * k + axis] - h[6 + axis] * at) * per_depth;
-                out[2 * ((1 + axis) * count + i) + k] = side;
-                out[2 * ((3 + axis) * count + i) + k] = -2.0 * h[6 + axis] * per_depth * side;
+                const double side = out[SIDES + 2 * axis + k] = (h[3 * k + axis] - h[6 + axis] * at) * per_depth;
+                out[SECOND + 2 * axis + k] = -2.0 * h[6 + axis] * per_depth * side;
             }
         }
     }
@@ -190,16 +189,26 @@ INLINE void add_column(
 }
 
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
-    const double *places, const double *values, int64_t count, double middle_x, double middle_y, double size, int64_t terms,
-    double most_leverage, double *basis, double *triangle, double *told, double *scratch, double *misses, double *foretold,
-    double *leverage)
+    const double *places, const double *values, int64_t count, int64_t terms, double most_leverage, double *scratch, double *unit,
+    double *triangle, double *told, double *misses, double *off, double *gain, double *scatter)
 {
-    double *off = scratch, *left = scratch + count, *gain = scratch + 3 * count;
+    double *left = scratch, *leverage = scratch + 2 * count, *missed = scratch + 3 * count, *ranked_off = scratch + 4 * count;
+    double *basis = scratch + 5 * count;
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
     for (int64_t i = 0; i < count; i++) {
         left[i] = values[2 * i];
         left[count + i] = values[2 * i + 1];
-        gain[i] = 0.0;
+        leverage[i] = 0.0;
+        for (int64_t axis = 0; axis < 2; axis++) {
+            const double place = places[2 * i + axis];
+            low[axis] = place < low[axis] ? place : low[axis];
+            high[axis] = place > high[axis] ? place : high[axis];
+        }
     }
+    for (int64_t axis = 0; axis < 2; axis++)
+        unit[axis] = 0.5 * (low[axis] + high[axis]);
+    const double across = high[0] - low[0], down = high[1] - low[1], size = 0.5 * (across > down ? across : down);
+    unit[2] = size > 1e-9 ? size : 1e-9;
     int64_t best = 0;
     for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE; degree++) {
         misses[degree] = INFINITY;
@@ -208,34 +217,78 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             continue;
         for (int64_t i = 0; i < count; i++) {
             double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
-            powers_of((places[2 * i] - middle_x) / size, px);
-            powers_of((places[2 * i + 1] - middle_y) / size, py);
+            powers_of((places[2 * i] - unit[0]) / unit[2], px);
+            powers_of((places[2 * i + 1] - unit[1]) / unit[2], py);
             for (int64_t j = 0; j <= degree; j++)
                 basis[(k + j) * count + i] = px[degree - j] * py[j];
         }
         for (; k < TERMS_TO(degree); k++)
-            add_column(basis, count, terms, k, triangle, told, left, gain);
+            add_column(basis, count, terms, k, triangle, told, left, leverage);
         for (int64_t i = 0; i < count; i++) {
-            const double rest = 1.0 - (gain[i] < most_leverage ? gain[i] : most_leverage);
-            off[i] = sqrt(left[i] * left[i] + left[count + i] * left[count + i]) / rest;
+            const double rest = 1.0 - (leverage[i] < most_leverage ? leverage[i] : most_leverage);
+            missed[i] = ranked_off[i] = sqrt(left[i] * left[i] + left[count + i] * left[count + i]) / rest;
         }
-        misses[degree] = quick_median(off, count);
+        misses[degree] = quick_median(ranked_off, count);
         if (degree > 0 && !(misses[degree] < misses[best]))
             continue;
         best = degree;
+        memcpy(off, missed, (size_t)count * sizeof(double));
         for (int64_t i = 0; i < count; i++) {
-            leverage[i] = gain[i] < most_leverage ? gain[i] : most_leverage;
-            foretold[2 * i] = left[i] / (1.0 - leverage[i]);
-            foretold[2 * i + 1] = left[count + i] / (1.0 - leverage[i]);
+            const double own = leverage[i] < most_leverage ? leverage[i] : most_leverage;
+            gain[i] = sqrt(own / (1.0 - own));
         }
     }
+    for (int64_t i = 0; i < count; i++)
+        missed[i] = off[i] / sqrt(1.0 + gain[i] * gain[i]);
+    *scatter = quick_median(missed, count);
     return best;
 }
 
-void polynomial_at(
-    const double *wanted, int64_t count, double middle_x, double middle_y, double size, int64_t terms, int64_t degree,
-    const double *triangle, const double *told, double *out)
+/* Set `out` to the values at a place whose terms are `row`, by the degree that is surest there, and to their gain. */
+static void surest_values(
+    const double *row, int64_t terms, const double *triangle, const double *told, const double *misses, double out[3])
 {
+    double part[SURFACE_TERMS], square = 0.0, u = 0.0, v = 0.0, least = INFINITY;
+    memcpy(part, row, (size_t)terms * sizeof(double));
+    for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE && isfinite(misses[degree]); degree++) {
+        for (; k < TERMS_TO(degree); k++) {
+            for (int64_t j = 0; j < k; j++)
+                part[k] -= triangle[j * terms + k] * part[j];
+            const double pivot = triangle[k * terms + k];
+            part[k] = pivot > 0.0 ? part[k] / pivot : 0.0;
+            square += part[k] * part[k];
+            u += part[k] * told[2 * k];
+            v += part[k] * told[2 * k + 1];
+        }
+        const double gain = sqrt(square), off = misses[degree] * (gain > 1.0 ? gain : 1.0);
+        if (degree == 0 || off < least) {
+            least = off;
+            out[0] = u;
+            out[1] = v;
+            out[2] = gain;
+        }
+    }
+}
+
+/* Set the curvatures and heights of a place whose derivatives are known. */
+INLINE void line_shapes(double *row)
+{
+    const double *x = row + SIDES, *y = x + 2, area = fabs(x[0] * y[1] - y[0] * x[1]);
+    for (int64_t axis = 0; axis < 2; axis++) {
+        const double *side = row + SIDES + 2 * axis, *bend = row + SECOND + 2 * axis;
+        double squared = side[0] * side[0] + side[1] * side[1];
+        const double length = sqrt(squared);
+        squared = squared > 1e-12 ? squared : 1e-12;
+        row[CURVATURE + axis] = (side[0] * bend[1] - side[1] * bend[0]) / (squared * sqrt(squared));
+        row[HEIGHTS + axis] = area / (length > 1e-9 ? length : 1e-9);
+    }
+}
+
+void add_polynomial(
+    const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle, const double *told,
+    const double *misses, int64_t surest, double *out)
+{
+    const double size = unit[2];
     const int64_t end = TERMS_TO(degree);
     double factors[SURFACE_TERMS][2];
     for (int64_t k = end - 1; k >= 0; k--)
@@ -246,10 +299,11 @@ void polynomial_at(
             const double pivot = triangle[k * terms + k];
             factors[k][axis] = pivot > 0.0 ? left / pivot : 0.0;
         }
-    for (int64_t i = 0; i < count; i++) {
+    for (int64_t i = 0; i < count; i++, out += SURFACE_COLUMNS) {
+        const double x = (wanted[2 * i] - unit[0]) / size, y = (wanted[2 * i + 1] - unit[1]) / size;
         double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1], sum[5][2] = {{0.0}};
-        powers_of((wanted[2 * i] - middle_x) / size, px);
-        powers_of((wanted[2 * i + 1] - middle_y) / size, py);
+        powers_of(x, px);
+        powers_of(y, py);
         for (int64_t n = 0, k = 0; n <= degree; n++)
             for (int64_t j = 0; j <= n; j++, k++) {
                 const int64_t m = n - j;
@@ -263,38 +317,19 @@ void polynomial_at(
                     sum[s][1] += part[s] * factors[k][1];
                 }
             }
+        if (surest) {
+            double row[SURFACE_TERMS], best[3] = {0.0};
+            terms_at(x, y, terms, row);
+            surest_values(row, terms, triangle, told, misses, best);
+            sum[0][0] = best[0];
+            sum[0][1] = best[1];
+            out[GAIN] = best[2];
+        }
         for (int64_t s = 0; s < 5; s++) {
-            out[(s * count + i) * 2] = sum[s][0];
-            out[(s * count + i) * 2 + 1] = sum[s][1];
+            out[2 * s] += sum[s][0];
+            out[2 * s + 1] += sum[s][1];
         }
-    }
-}
-
-void surest_polynomial(
-    const double *wanted, int64_t count, double middle_x, double middle_y, double size, int64_t terms,
-    const double *triangle, const double *told, const double *misses, double *out)
-{
-    for (int64_t i = 0; i < count; i++) {
-        double part[SURFACE_TERMS], square = 0.0, u = 0.0, v = 0.0, least = INFINITY;
-        terms_at((wanted[2 * i] - middle_x) / size, (wanted[2 * i + 1] - middle_y) / size, terms, part);
-        for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE && isfinite(misses[degree]); degree++) {
-            for (; k < TERMS_TO(degree); k++) {
-                for (int64_t j = 0; j < k; j++)
-                    part[k] -= triangle[j * terms + k] * part[j];
-                const double pivot = triangle[k * terms + k];
-                part[k] = pivot > 0.0 ? part[k] / pivot : 0.0;
-                square += part[k] * part[k];
-                u += part[k] * told[2 * k];
-                v += part[k] * told[2 * k + 1];
-            }
-            const double gain = sqrt(square), off = misses[degree] * (gain > 1.0 ? gain : 1.0);
-            if (degree == 0 || off < least) {
-                least = off;
-                out[3 * i] = u;
-                out[3 * i + 1] = v;
-                out[3 * i + 2] = gain;
-            }
-        }
+        line_shapes(out);
     }
 }
 

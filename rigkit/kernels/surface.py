@@ -6,12 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, GreyImage
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import image_arguments
 from rigkit.kernels.declarations import header
 
-SURFACE_DEGREE = header().constants["SURFACE_DEGREE"]
+_CONSTANTS = header().constants
+SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS = (
+    _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS")
+)
+SURFACE_DEGREE = _CONSTANTS["SURFACE_DEGREE"]
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
 
 TERMS_OF_DEGREE = tuple((degree + 1) * (degree + 2) // 2 for degree in range(SURFACE_DEGREE + 1))
@@ -32,91 +36,129 @@ def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, flo
     return out, float(kernels().fit_perspective(*known, len(places), out))
 
 
-def projected(homography: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return where a homography (3, 3) takes `places` (M, 2), and the first and second derivatives along x and along y,
-    (M, 2, 2)."""
-    out = np.empty((5, len(places), 2))
+@dataclass(frozen=True, eq=False, slots=True)
+class Surface:
+    """A map from a board's plane to an image at M places.
+
+    Attributes
+    ----------
+    rows : (M, SURFACE_COLUMNS) all that is known of each.
+    """
+
+    rows: FloatArray
+
+    @classmethod
+    def made_of(cls, pixels: FloatArray, sides: FloatArray, bends: FloatArray) -> Surface:
+        """Return the map with these properties, without what `Polynomials.added_to` works out."""
+        rows = np.zeros((len(pixels), SURFACE_COLUMNS))
+        rows[:, :SIDES], rows[:, SIDES:SECOND] = pixels, sides.reshape(-1, 4)
+        rows[:, SECOND:GAIN] = bends.reshape(-1, 4)
+        return cls(rows)
+
+    @property
+    def pixels(self) -> FloatArray:
+        """(M, 2)"""
+        return self.rows[:, :SIDES]
+
+    @property
+    def sides(self) -> FloatArray:
+        """(M, 2, 2) first derivatives along x and along y, px per unit of the board."""
+        return self.rows[:, SIDES:SECOND].reshape(-1, 2, 2)
+
+    @property
+    def bends(self) -> FloatArray:
+        """(M, 2, 2) second derivatives likewise."""
+        return self.rows[:, SECOND:GAIN].reshape(-1, 2, 2)
+
+    @property
+    def gain(self) -> FloatArray:
+        """(M,) standard deviation of `pixels` for points of standard deviation 1, 0 where nobody asked for it."""
+        return self.rows[:, GAIN]
+
+    @property
+    def curvature(self) -> FloatArray:
+        """(M, 2) of the lines along x and along y, 1/px, positive towards +90 degrees."""
+        return self.rows[:, CURVATURE:HEIGHTS]
+
+    @property
+    def heights(self) -> FloatArray:
+        """(M, 2) how far a unit of the board lies from the line along x, and from that along y, px."""
+        return self.rows[:, HEIGHTS:]
+
+    def of(self, which: BoolArray) -> Surface:
+        """Return the places `which` (M,)."""
+        return Surface(self.rows[which])
+
+
+def projected(homography: FloatArray, places: FloatArray) -> Surface:
+    """Return what a homography (3, 3) does of `places` (M, 2), without curvatures and heights."""
+    out = np.empty((len(places), SURFACE_COLUMNS))
     places, homography = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(homography, np.float64)
     kernels().project_places(places, len(places), homography, out)
-    return _parted(out)
-
-
-def _parted(out: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return values (M, 2) and derivatives (M, 2, 2) of what kernels write, (5, M, 2)."""
-    return out[0], out[1:3].transpose(1, 0, 2), out[3:].transpose(1, 0, 2)
+    return Surface(out)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Polynomials:
-    """Polynomials of every degree through N points, in T terms x^i y^j of places in units of `size` from `middle`.
+    """Polynomials of every degree through N points, in T terms x^i y^j.
 
     Attributes
     ----------
+    unit : (3,) the middle of the points and half the longer side of their box: places are taken in these.
     triangle : (T, T) and told : (T, 2), the QR decomposition of the terms at the points, and the values in its basis;
         the diagonal of a term that the others are as good as at these points is 0.
     misses : (D,) how far off points usually lie where the others have them, by degree; infinite where that was not
         tried, for there are too few points, or from degree 6 on no better ones among the two degrees before.
-    best : degree with the smallest.
-    plain : the lowest degree that misses by hardly more: what further terms add is noise, which bends lines at the rim.
-    foretold : (N, 2) how far the points lie off where the others have them, by that degree.
-    leverage : (N,) of each point on its own value.
+    plain : the lowest degree that misses by hardly more than the best: what further terms add is noise, which bends
+        lines at the rim.
+    off : (N,) how far the points lie off where the others have them, by the best degree, and gain : (N,) of those.
+    scatter : the median of `off`, beside what those err by.
     """
 
-    middle: FloatArray
-    size: float
+    unit: FloatArray
     triangle: FloatArray
     told: FloatArray
     misses: FloatArray
-    best: int
     plain: int
-    foretold: FloatArray
-    leverage: FloatArray
+    off: FloatArray
+    gain: FloatArray
+    scatter: float
 
     @classmethod
-    def through(
-        cls, places: FloatArray, values: FloatArray, middle: FloatArray, size: float, most: int, most_leverage: float
-    ) -> Polynomials:
+    def through(cls, places: FloatArray, values: FloatArray, most: int, most_leverage: float) -> Polynomials:
         """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
         terms, count = max(end for end in TERMS_OF_DEGREE if end <= most), len(places)
         triangle, told, misses = np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1)
-        foretold, leverage = np.empty((count, 2)), np.empty(count)
+        unit, (off, gain), scatter = np.empty(3), np.empty((2, count)), np.empty(1)
         best = kernels().fit_polynomials(
             *(np.ascontiguousarray(part, np.float64) for part in (places, values)),
-            *(count, float(middle[0]), float(middle[1]), size, terms, most_leverage, np.empty((terms, count))),
-            *(triangle, told, np.empty((4, count)), misses, foretold, leverage),
+            *(count, terms, most_leverage, np.empty((terms + 5, count))),
+            *(unit, triangle, told, misses, off, gain, scatter),
         )
         return cls(
-            middle=middle,
-            size=size,
+            unit=unit,
             triangle=triangle,
             told=told,
             misses=misses,
-            best=int(best),
             plain=int(np.argmax(misses <= HARDLY_MORE * misses[best])),
-            foretold=foretold,
-            leverage=leverage,
+            off=off,
+            gain=gain,
+            scatter=float(scatter[0]),
         )
 
-    def at(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the values at `wanted` (M, 2) by the plain degree, and their first and second derivatives along x and
-        along y, (M, 2, 2)."""
-        out = np.empty((5, len(wanted), 2))
-        kernels().polynomial_at(*self._asked(wanted), self.plain, self.triangle, self.told, out)
-        return _parted(out)
+    def added_to(self, base: Surface | None, wanted: FloatArray, *, surest: bool) -> Surface:
+        """Return the map `base` at `wanted` (M, 2), without one nothing, with the values there and their derivatives, by
+        the plain degree.
 
-    def surest(self, wanted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the values at `wanted` (M, 2), each by the degree that is surest there, and their gain (M,): the
-        standard deviation for points of standard deviation 1.
-
-        Beyond the points high degrees run wild: what counts is the usual miss times the gain.
+        With `surest`, the values are by the degree that is surest at each place, and with their gains: beyond the points
+        high degrees run wild, and what counts is the usual miss times the gain.
         """
-        out = np.empty((len(wanted), 3))
-        kernels().surest_polynomial(*self._asked(wanted), self.triangle, self.told, self.misses, out)
-        return out[:, :2], out[:, 2]
-
-    def _asked(self, wanted: FloatArray) -> tuple[FloatArray, int, float, float, float, int]:
-        x, y = self.middle
-        return np.ascontiguousarray(wanted, np.float64), len(wanted), float(x), float(y), self.size, len(self.told)
+        out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
+        kernels().add_polynomial(
+            *(np.ascontiguousarray(wanted, np.float64), len(wanted), self.unit, len(self.told), self.plain),
+            *(self.triangle, self.told, self.misses, surest, out),
+        )
+        return Surface(out)
 
 
 def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:

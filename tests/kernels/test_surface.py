@@ -39,33 +39,51 @@ def test_perspective(rng: np.random.Generator) -> None:
 def test_derivatives_of_a_perspective(rng: np.random.Generator) -> None:
     places, pixels = seen(rng, bend=0.0)
     matrix, _ = perspective(places, pixels)
-    here, sides, bends = projected(matrix, places)
+    shown = projected(matrix, places)
+    here, sides, bends = shown.pixels, shown.sides, shown.bends
     image = np.column_stack([places, np.ones(len(places))]) @ matrix.T
     np.testing.assert_allclose(here, image[:, :2] / image[:, 2:], rtol=1e-12)
     for k, step in enumerate(1e-3 * np.eye(2)):
         after, before = projected(matrix, places + step), projected(matrix, places - step)
-        np.testing.assert_allclose(sides[:, k], (after[0] - before[0]) / 2e-3, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(bends[:, k], (after[1][:, k] - before[1][:, k]) / 2e-3, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(sides[:, k], (after.pixels - before.pixels) / 2e-3, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(bends[:, k], (after.sides[:, k] - before.sides[:, k]) / 2e-3, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.1, 0.6])
 def test_polynomials(bend: float, rng: np.random.Generator) -> None:
     places, pixels = seen(rng, bend=bend)
-    middle, size = np.array([5.5, 4.5]), 5.5
-    ours = Polynomials.through(places, pixels, middle, size, len(places) // 2, MAX_LEVERAGE)
+    ours = Polynomials.through(places, pixels, len(places) // 2, MAX_LEVERAGE)
+    np.testing.assert_allclose(ours.unit, [5.5, 4.5, 5.5])
     tried = int(np.isfinite(ours.misses).sum())
-    assert tried == min(len(TERMS_OF_DEGREE), max(6, ours.best + 3))
-    whole = reference.Polynomials(places, pixels, middle, size, tried - 1)
-    assert ours.best == int(whole.misses.argmin())
+    best = int(ours.misses.argmin())
+    assert tried == min(len(TERMS_OF_DEGREE), max(6, best + 3))
+    whole = reference.Polynomials(places, pixels, ours.unit[:2], ours.unit[2], tried - 1)
+    assert best == int(whole.misses.argmin())
     np.testing.assert_allclose(ours.misses[:tried], whole.misses, rtol=1e-6)
     assert ours.plain == int(np.argmax(whole.misses <= HARDLY_MORE * whole.misses.min()))
-    np.testing.assert_allclose(ours.foretold, whole.foretold[ours.best], atol=SAME)
-    np.testing.assert_allclose(ours.leverage, whole.leverage[:, TERMS_OF_DEGREE[ours.best] - 1], atol=1e-9)
+    off, leverage = np.hypot(*whole.foretold[best].T), whole.leverage[:, TERMS_OF_DEGREE[best] - 1]
+    np.testing.assert_allclose(ours.off, off, atol=SAME)
+    np.testing.assert_allclose(ours.gain, np.sqrt(leverage / (1.0 - leverage)), atol=1e-9)
+    assert ours.scatter == pytest.approx(np.median(ours.off / np.hypot(1.0, ours.gain)))
     wanted = rng.uniform([-2.0, -2.0], [13.0, 11.0], (50, 2))
-    for one, two in zip(ours.at(wanted), whole.at(wanted, ours.plain), strict=True):
+    plain, surest = (ours.added_to(None, wanted, surest=which) for which in (False, True))
+    for one, two in zip((plain.pixels, plain.sides, plain.bends), whole.at(wanted, ours.plain), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
-    for one, two in zip(ours.surest(wanted), whole.surest(wanted, tried), strict=True):
+    for one, two in zip((surest.pixels, surest.gain), whole.surest(wanted, tried), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
+    np.testing.assert_array_equal(plain.rows[:, 2:10], surest.rows[:, 2:10])
+
+
+def test_lines_of_a_surface(rng: np.random.Generator) -> None:
+    places, pixels = seen(rng, bend=0.6)
+    polynomials = Polynomials.through(places, pixels, len(places) // 2, MAX_LEVERAGE)
+    base = projected(np.array([[3.0, 0.1, 2.0], [-0.2, 2.0, 1.0], [0.01, 0.02, 1.0]]), places)
+    surface = polynomials.added_to(base, places, surest=False)
+    np.testing.assert_allclose(surface.pixels, base.pixels + polynomials.added_to(None, places, surest=False).pixels)
+    lengths = np.linalg.norm(surface.sides, axis=2)
+    bent = surface.sides[..., 0] * surface.bends[..., 1] - surface.sides[..., 1] * surface.bends[..., 0]
+    np.testing.assert_allclose(surface.curvature, bent / lengths**3)
+    np.testing.assert_allclose(surface.heights, np.abs(np.linalg.det(surface.sides))[:, None] / lengths)
 
 
 def test_points_on_two_lines_leave_what_they_do_not_say_out(rng: np.random.Generator) -> None:

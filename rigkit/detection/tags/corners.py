@@ -37,8 +37,9 @@ from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
 from rigkit.detection.tags.placing import TagBoard
-from rigkit.detection.tags.surface import SmoothMap, TagSurface, seen_surface
+from rigkit.detection.tags.surface import SmoothMap, seen_surface
 from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
+from rigkit.kernels.surface import Surface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
@@ -130,7 +131,7 @@ class _Fitter:
     def fit(
         self,
         cells: BoolArray,
-        surface: TagSurface,
+        surface: Surface,
         start: FloatArray,
         blur: FloatArray | float,
         stage: tuple[float, int, float],
@@ -138,8 +139,8 @@ class _Fitter:
         mirrored: bool = True,
     ) -> EdgeFit:
         """Fit the edge model at the `cells`; arguments else as of `fit_edges`."""
-        heights, steps = surface.heights(), self.steps[cells]
-        self.curvature[cells] = curvature = surface.curvature()
+        heights, steps = surface.heights, self.steps[cells]
+        self.curvature[cells] = curvature = surface.curvature
         gaps = steps * heights[:, :, None]
         pattern, side = self.tags.pattern, self.tags.codes.modules
         single = contrast = None
@@ -183,7 +184,7 @@ class _Fitter:
         more = self.added(state, self.map_of(rough))
         return state if more is None else self.completed(more)
 
-    def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
+    def _blur(self, cells: BoolArray, surface: Surface, pixels: FloatArray) -> float:
         """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
         few = np.zeros(len(pixels), np.bool_)
         few[:: max(len(few) // FEW_CORNERS, 1)] = True
@@ -233,7 +234,7 @@ class _Fitter:
         steps = np.minimum(0.5 * self.steps[cells].max(axis=2), WINDOW_REACH)
         half = np.minimum(steps * np.linalg.norm(surface.sides, axis=2), LAST_PASS[0])
         # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
-        off = np.abs(surface.curvature() - self.curvature[cells]).max(axis=1) * half.max(axis=1) ** 2 / 6.0
+        off = np.abs(surface.curvature - self.curvature[cells]).max(axis=1) * half.max(axis=1) ** 2 / 6.0
         bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
         if not bent.any():
             return state
@@ -264,7 +265,7 @@ class _Fitter:
         blur = known_median(state.blur)
         start = surface.pixels
         if (smooth.scatter() * surface.gain > blur).any():
-            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.heights().min(axis=1))
+            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.heights.min(axis=1))
             rough = self.fit(cells, surface, start, wide, LAST_PASS, mirrored=False)
             start = np.where(rough.valid[:, None], rough.pixels, start)
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
@@ -277,9 +278,9 @@ class _Fitter:
         self._waiting &= cv2.dilate((more.known & ~state.known).astype(np.uint8), AROUND_NEW) == 0
         return more
 
-    def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
+    def _there(self, state: BoardState, cells: BoolArray, surface: Surface, fit: EdgeFit, blur: float) -> BoolArray:
         """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
-        gap = self.tags.pattern.spacing * surface.heights().min(axis=1)
+        gap = self.tags.pattern.spacing * surface.heights.min(axis=1)
         moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
         contrast, residual = known_median(state.contrast), known_median(state.residual)
         seen = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
@@ -294,9 +295,9 @@ class _Fitter:
             coded &= self.read(pixels)[cells]
         return np.asarray(seen & (clean | coded))
 
-    def borders(self, surface: TagSurface) -> FloatArray:
+    def borders(self, surface: Surface) -> FloatArray:
         """Return how wide the borders of tags are at places of the map, (M,) px."""
-        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.heights().min(axis=1))
+        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.heights.min(axis=1))
 
     def read(self, pixels: FloatArray) -> BoolArray:
         """Return the corners (R, C) of tags whose codes are read in their places, by all corners (R, C, 2)."""
@@ -322,7 +323,7 @@ class _Fitter:
             allowed = TAG_OUTLIER * np.hypot(usual, sigma)
             if not ((gain < JUDGING_GAIN) & (off > allowed)).any():
                 return state
-            gap = self.tags.pattern.spacing * smooth.at(self.places[cells]).heights().min(axis=1)
+            gap = self.tags.pattern.spacing * smooth.at(self.places[cells]).heights.min(axis=1)
             excess = np.where(gain < JUDGING_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
             # Those that contradict the most go first: they may be all that speaks against their neighbours.
             worst = excess > max(1.0, 0.5 * float(excess.max()))

@@ -7,15 +7,14 @@ the points around leave over, or by the points around alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, known_median
+from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.surface import Polynomials, perspective, projected
+from rigkit.kernels.surface import Polynomials, Surface, perspective, projected
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MAX_LEVERAGE = 0.99
@@ -38,40 +37,6 @@ CHORD = 0.4
 """Derivatives of a camera's projection are chords of this many sides of a tag to either side."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class TagSurface:
-    """The map at M places of the board.
-
-    Attributes
-    ----------
-    pixels : (M, 2)
-    sides : (M, 2, 2) first derivatives along x and along y, px per unit of the board.
-    bends : (M, 2, 2) second derivatives likewise.
-    gain : (M,) standard deviation of `pixels` for points of standard deviation 1, 0 where nobody asked for it.
-    """
-
-    pixels: FloatArray
-    sides: FloatArray
-    bends: FloatArray
-    gain: FloatArray
-
-    def curvature(self) -> FloatArray:
-        """Return the curvature of the lines along x and along y, (M, 2) 1/px, positive towards +90 degrees."""
-        a, b, c, d = self.sides[..., 0], self.sides[..., 1], self.bends[..., 0], self.bends[..., 1]
-        squared = np.maximum(a * a + b * b, 1e-12)
-        return np.asarray((a * d - b * c) / (squared * np.sqrt(squared)))
-
-    def heights(self) -> FloatArray:
-        """Return how far a unit of the board lies from the line along x, and from that along y, (M, 2) px."""
-        x, y = self.sides[..., 0], self.sides[..., 1]
-        area = np.abs(x[:, 0] * y[:, 1] - y[:, 0] * x[:, 1])
-        return np.asarray(area[:, None] / np.maximum(np.hypot(x, y), 1e-9))
-
-    def of(self, which: BoolArray) -> TagSurface:
-        """Return the places `which` (M,)."""
-        return TagSurface(self.pixels[which], self.sides[which], self.bends[which], self.gain[which])
-
-
 class SmoothMap:
     """A smooth map through points at `places` (N, 2) of which the `pixels` (N, 2) are known.
 
@@ -80,53 +45,39 @@ class SmoothMap:
     """
 
     def __init__(
-        self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], TagSurface] | None = None
+        self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], Surface] | None = None
     ) -> None:
-        self._places, self._pixels = places, pixels
         self._base = base or _perspective(places, pixels)
         rest, fewest = pixels, min(3, len(places))
         if self._base is not None:
             rest, fewest = pixels - self._base(places).pixels, 1
             rest = np.where(np.isfinite(rest[:, :1]), rest, 0.0)
-        low, high = places.min(axis=0), places.max(axis=0)
-        size = max(0.5 * float((high - low).max()), 1e-9)
         terms = max(int(len(places) / POINTS_A_TERM), fewest)
-        self._polynomial = Polynomials.through(places, rest, 0.5 * (low + high), size, terms, MAX_LEVERAGE)
+        self._polynomial = Polynomials.through(places, rest, terms, MAX_LEVERAGE)
 
-    def at(self, wanted: FloatArray) -> TagSurface:
+    def at(self, wanted: FloatArray) -> Surface:
         """Return the map at `wanted` (M, 2), NaN where the base has none."""
-        return self._over_base(wanted, None, np.zeros(len(wanted)))
+        return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=False)
 
-    def beyond(self, wanted: FloatArray) -> TagSurface:
+    def beyond(self, wanted: FloatArray) -> Surface:
         """Return the map at `wanted` (M, 2), which may lie outside the points."""
-        return self._over_base(wanted, *self._polynomial.surest(wanted))
-
-    def _over_base(self, wanted: FloatArray, surest: FloatArray | None, gain: FloatArray) -> TagSurface:
-        """Return the map at `wanted` (M, 2); what the base leaves there is `surest` (M, 2), where that is known."""
-        values, sides, bends = self._polynomial.at(wanted)
-        left = values if surest is None else surest
-        if self._base is None:
-            return TagSurface(left, sides, bends, gain)
-        flat = self._base(wanted)
-        return TagSurface(flat.pixels + left, flat.sides + sides, flat.bends + bends, gain)
+        return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=True)
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Return how far (N,) the points lie off where the others have them, px, and the gain (N,) of those."""
-        leverage = self._polynomial.leverage
-        return np.hypot(*self._polynomial.foretold.T), np.sqrt(leverage / (1.0 - leverage))
+        return self._polynomial.off, self._polynomial.gain
 
     def scatter(self) -> float:
         """Return how far the points usually lie off where the others have them, px per axis, beside what those err by.
 
         Where the map has too few terms for the lens, that is more than what points are known to.
         """
-        off, gain = self.left_out()
-        return known_median(off / np.hypot(1.0, gain)) / MEDIAN_OF_RAYLEIGH
+        return self._polynomial.scatter / MEDIAN_OF_RAYLEIGH
 
 
 def wide_perspective(
     places: FloatArray, pixels: FloatArray, centre: FloatArray
-) -> Callable[[FloatArray], TagSurface] | None:
+) -> Callable[[FloatArray], Surface] | None:
     """Return the perspective that fits the points best through a lens that may be a fisheye; None where none does.
 
     Rays of a fisheye make angles with its axis, here through `centre` (2,), as pixels have distances from that, r = f
@@ -134,7 +85,7 @@ def wide_perspective(
     """
     away = pixels - centre
     radius = np.hypot(away[:, 0], away[:, 1])
-    best: tuple[float, Callable[[FloatArray], TagSurface]] | None = None
+    best: tuple[float, Callable[[FloatArray], Surface]] | None = None
     for part in BENDS:
         bend = part * 0.5 * np.pi / max(float(radius.max()), 1.0)
         angle = bend * radius
@@ -151,13 +102,13 @@ def wide_perspective(
 
 def _bent(homography: FloatArray, bend: float, centre: FloatArray, places: FloatArray) -> FloatArray:
     """Return where a lens of 1 / f `bend` shows what a homography does of places (M, 2)."""
-    straight = _projected(homography, places).pixels
+    straight = projected(homography, places).pixels
     length = bend * np.hypot(straight[:, 0], straight[:, 1])
     shrunk = np.where(length > SMALL_ANGLE, np.arctan(length) / np.maximum(length, SMALL_ANGLE), 1.0)
     return np.asarray(centre + shrunk[:, None] * straight)
 
 
-def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
+def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> Surface:
     """Return a map and its derivatives at places (M, 2) by differences."""
     h = DIFFERENCE
     here, right, left, below, above = (
@@ -165,21 +116,16 @@ def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray
     )
     sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
     bends = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
-    return TagSurface(here, sides, bends, np.zeros(len(places)))
+    return Surface.made_of(here, sides, bends)
 
 
-def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
+def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], Surface] | None:
     """Return the perspective that fits the points best; None where none with all of them in front does."""
     matrix, nearest = perspective(places, pixels)
-    return partial(_projected, matrix) if nearest > NEAREST_DEPTH else None
+    return partial(projected, matrix) if nearest > NEAREST_DEPTH else None
 
 
-def _projected(homography: FloatArray, places: FloatArray) -> TagSurface:
-    """Return the map of a homography at places (M, 2)."""
-    return TagSurface(*projected(homography, places), np.zeros(len(places)))
-
-
-def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:
+def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> Surface:
     """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
     h = CHORD
     offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
@@ -187,9 +133,7 @@ def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wa
     points = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=2)
     pixels, valid = camera.project(cam_from_board.apply(points))
     here, right, left, below, above = np.where(valid[..., None].all(axis=0), pixels, np.nan)
-    return TagSurface(
-        here,
-        np.stack([right - left, below - above], axis=1) / (2.0 * h),
-        np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2,
-        np.ones(len(wanted)),
+    sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
+    return Surface.made_of(
+        here, sides, np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
     )
