@@ -88,6 +88,8 @@ def _without_repeated(found: Sequence[BoardDetection]) -> list[BoardDetection]:
 
     A board that something lies across is found in parts; the largest, completed, has the corners of the others.
     """
+    if len(found) < 2:
+        return list(found)
     low, high = (np.array([f(item.pixels, axis=0) for item in found]).reshape(-1, 2) for f in (np.min, np.max))
     touching = np.asarray(((low[:, None] < high + SAME_CORNER_PX) & (low < high[:, None] + SAME_CORNER_PX)).all(axis=2))
     kept: list[int] = []

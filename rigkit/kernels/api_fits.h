@@ -79,7 +79,7 @@ EXPORT double fit_perspective(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(
     ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
-    double most_leverage, ARRAY(double, scratch, terms + 5, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
+    double most_leverage, ARRAY(double, basis, terms, count), ARRAY(double, scratch, 5, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
     ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, off, count),
     ARRAY(double, gain, count), ARRAY(double, scatter, 1));
 EXPORT void add_polynomial(

@@ -147,7 +147,7 @@ INLINE void terms_at(double x, double y, int64_t terms, double *row)
 
 /* Make column `k` of the `basis` orthogonal to those before it and of length 1, or 0 where they say the same (Gram and
  * Schmidt, modified: monomials up to degree 8 stay orthogonal to 1e-10), and take its share of the values, `left`. */
-INLINE void add_column(
+FOR_EACH_PROCESSOR static void add_column(
     double *basis, int64_t count, int64_t terms, int64_t k, double *triangle, double *told, double *left, double *gain)
 {
     double *own = basis + k * count, before = 0.0, after = 0.0, u = 0.0, v = 0.0;
@@ -189,11 +189,10 @@ INLINE void add_column(
 }
 
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
-    const double *places, const double *values, int64_t count, int64_t terms, double most_leverage, double *scratch, double *unit,
+    const double *places, const double *values, int64_t count, int64_t terms, double most_leverage, double *basis, double *scratch, double *unit,
     double *triangle, double *told, double *misses, double *off, double *gain, double *scatter)
 {
     double *left = scratch, *leverage = scratch + 2 * count, *missed = scratch + 3 * count, *ranked_off = scratch + 4 * count;
-    double *basis = scratch + 5 * count;
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
     for (int64_t i = 0; i < count; i++) {
         left[i] = values[2 * i];
@@ -205,10 +204,11 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             high[axis] = place > high[axis] ? place : high[axis];
         }
     }
-    for (int64_t axis = 0; axis < 2; axis++)
-        unit[axis] = 0.5 * (low[axis] + high[axis]);
-    const double across = high[0] - low[0], down = high[1] - low[1], size = 0.5 * (across > down ? across : down);
-    unit[2] = size > 1e-9 ? size : 1e-9;
+    const double across = high[0] - low[0], down = high[1] - low[1], wide = 0.5 * (across > down ? across : down);
+    const double middle_x = 0.5 * (low[0] + high[0]), middle_y = 0.5 * (low[1] + high[1]), size = wide > 1e-9 ? wide : 1e-9;
+    unit[0] = middle_x;
+    unit[1] = middle_y;
+    unit[2] = size;
     int64_t best = 0;
     for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE; degree++) {
         misses[degree] = INFINITY;
@@ -217,8 +217,8 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             continue;
         for (int64_t i = 0; i < count; i++) {
             double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
-            powers_of((places[2 * i] - unit[0]) / unit[2], px);
-            powers_of((places[2 * i + 1] - unit[1]) / unit[2], py);
+            powers_of((places[2 * i] - middle_x) / size, px);
+            powers_of((places[2 * i + 1] - middle_y) / size, py);
             for (int64_t j = 0; j <= degree; j++)
                 basis[(k + j) * count + i] = px[degree - j] * py[j];
         }

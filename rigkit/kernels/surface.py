@@ -132,7 +132,7 @@ class Polynomials:
         unit, (off, gain), scatter = np.empty(3), np.empty((2, count)), np.empty(1)
         best = kernels().fit_polynomials(
             *(np.ascontiguousarray(part, np.float64) for part in (places, values)),
-            *(count, terms, most_leverage, np.empty((terms + 5, count))),
+            *(count, terms, most_leverage, np.empty((terms, count)), np.empty((5, count))),
             *(unit, triangle, told, misses, off, gain, scatter),
         )
         return cls(

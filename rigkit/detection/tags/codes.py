@@ -91,9 +91,10 @@ def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
     if not len(quads):
         return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     bright, spread = read_modules(image, homographies(quads), codes.modules)
-    likeness = bright @ codes.patterns.T
-    best = likeness.argmax(axis=1)
-    most = np.where(spread < MIN_CODE_CONTRAST, 0.0, likeness[np.arange(len(quads)), best])
+    best, most = np.zeros(len(quads), np.int64), np.zeros(len(quads))
+    marked = np.flatnonzero(spread >= MIN_CODE_CONTRAST)
+    likeness = bright[marked] @ codes.patterns.T
+    best[marked], most[marked] = likeness.argmax(axis=1), likeness.max(axis=1)
     return TagCode(codes.numbers[best], codes.turns[best], most)
 
 

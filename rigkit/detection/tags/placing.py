@@ -42,6 +42,7 @@ class TagBoard:
     Attributes
     ----------
     numbers : (R / 2, C / 2) of its tags, which look as `codes` say.
+    firsts : (highest number + 1, 2) the (column, row) of the first corner of each.
     places : (R, C, 2) of its corners, in sides of a tag.
     steps : (R, C, 2, 2) how far it is to the corners above and below, right and left, within the tag or across the gap.
     signs : (R, C) +1 where brightness grows with the angle across the line along the row, else -1.
@@ -50,6 +51,7 @@ class TagBoard:
     board: Board
     pattern: AprilGrid
     numbers: IntArray
+    firsts: IntArray
     codes: Codes
     places: FloatArray
     steps: FloatArray
@@ -60,19 +62,14 @@ class TagBoard:
         """Return that of a board; those of boards asked for before are kept."""
         return _tag_board(board)
 
-    def corner_of(self, number: IntArray) -> IntArray:
-        """Return (column, row) of the first corner of tags (N, 2)."""
-        first = np.zeros((int(self.numbers.max()) + 1, 2), np.int64)
-        row, column = np.mgrid[: self.numbers.shape[0], : self.numbers.shape[1]]
-        first[self.numbers] = 2 * np.stack([column, row], axis=-1)
-        return first[number]
-
 
 @lru_cache(maxsize=64)
 def _tag_board(board: Board) -> TagBoard:
     pattern = board.pattern
     assert isinstance(pattern, AprilGrid)
     numbers, grid = pattern.numbers(*board.size), board.grid()
+    firsts = np.zeros((int(numbers.max()) + 1, 2), np.int64)
+    firsts[numbers.ravel()] = grid[(grid % 2 == 0).all(axis=1)]
     odd = (grid % 2).reshape(board.rows, board.columns, 2)
     inwards = np.array([pattern.spacing, 1.0])
     right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
@@ -81,6 +78,7 @@ def _tag_board(board: Board) -> TagBoard:
         board=board,
         pattern=pattern,
         numbers=numbers,
+        firsts=firsts,
         codes=Codes.of(pattern, numbers.ravel()),
         places=pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2),
         steps=np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2),
@@ -124,7 +122,7 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     sure = np.flatnonzero(tags.read)
     if not len(sure):
         return _place_together(image, lattice.size, quads, cells, board)
-    votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.corner_of(tags.number[sure]))
+    votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.firsts[tags.number[sure]])
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
     columns, rows = lattice.size
     every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
@@ -200,12 +198,15 @@ def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntA
     columns, rows = lattice.size
     # A tag that stands upright in the lattice turned back stands on the board.
     back = -turns % 4
-    turned = np.array([grid_turned(cells, (columns - 1, rows - 1), k) for k in range(4)])[back, np.arange(len(cells))]
-    shift = places - turned
-    # Numbered, which np.unique sorts in a tenth of the time of rows.
+    shift = np.empty_like(places)
+    for turn in set(back.tolist()):
+        mine = back == turn
+        shift[mine] = places[mine] - grid_turned(cells[mine], (columns - 1, rows - 1), turn)
+    # Numbered, to be counted.
     low = shift.min(axis=0)
-    width, height = np.ptp(shift, axis=0) + 1
+    width, height = (shift.max(axis=0) - low + 1).tolist()
     seats = (back * width + shift[:, 0] - low[0]) * height + shift[:, 1] - low[1]
-    _, first, votes = np.unique(seats, return_index=True, return_counts=True)
+    votes = np.bincount(seats)
     most = int(votes.argmax())
-    return int(votes[most]), int(back[first[most]]), shift[first[most]]
+    first = int((seats == most).argmax())
+    return int(votes[most]), int(back[first]), shift[first]

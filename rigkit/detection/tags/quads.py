@@ -44,7 +44,7 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
         return pixels
     turned = (tags.turns[own, None] + np.arange(4)) % 4
     corners = quads[own[:, None], turned]
-    place = board.corner_of(tags.number[own])
+    place = board.firsts[tags.number[own]]
     kept = _agreeing(corners, place, 1.0 + board.pattern.spacing)
     if np.count_nonzero(kept) * (board.codes.modules - 2 * board.pattern.border) ** 2 < MIN_BITS:
         return pixels
