@@ -147,11 +147,11 @@ class Polynomials:
         )
 
     def added_to(self, base: Surface | None, wanted: FloatArray, *, surest: bool) -> Surface:
-        """Return the map `base` at `wanted` (M, 2), without one nothing, with the values there and their derivatives, by
-        the plain degree.
+        """Return the map `base` (without one, nothing) at `wanted` (M, 2) with the values there and their derivatives,
+        by the plain degree.
 
-        With `surest`, the values are by the degree that is surest at each place, and with their gains: beyond the points
-        high degrees run wild, and what counts is the usual miss times the gain.
+        With `surest`, the values are by the degree that is surest at each place, and have gains: beyond the points high
+        degrees run wild, and what counts is the usual miss times the gain.
         """
         out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
         kernels().add_polynomial(
