@@ -37,7 +37,7 @@ def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, flo
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Surface:
+class TagSurface:
     """A map from a board's plane to an image at M places.
 
     Attributes
@@ -48,7 +48,7 @@ class Surface:
     rows: FloatArray
 
     @classmethod
-    def made_of(cls, pixels: FloatArray, sides: FloatArray, bends: FloatArray) -> Surface:
+    def made_of(cls, pixels: FloatArray, sides: FloatArray, bends: FloatArray) -> TagSurface:
         """Return the map with these properties, without what `Polynomials.added_to` works out."""
         rows = np.zeros((len(pixels), SURFACE_COLUMNS))
         rows[:, :SIDES], rows[:, SIDES:SECOND] = pixels, sides.reshape(-1, 4)
@@ -85,17 +85,17 @@ class Surface:
         """(M, 2) how far a unit of the board lies from the line along x, and from that along y, px."""
         return self.rows[:, HEIGHTS:]
 
-    def of(self, which: BoolArray) -> Surface:
+    def of(self, which: BoolArray) -> TagSurface:
         """Return the places `which` (M,)."""
-        return Surface(self.rows[which])
+        return TagSurface(self.rows[which])
 
 
-def projected(homography: FloatArray, places: FloatArray) -> Surface:
+def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     """Return what a homography (3, 3) does of `places` (M, 2), without curvatures and heights."""
     out = np.empty((len(places), SURFACE_COLUMNS))
     places, homography = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(homography, np.float64)
     kernels().project_places(places, len(places), homography, out)
-    return Surface(out)
+    return TagSurface(out)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -146,7 +146,7 @@ class Polynomials:
             scatter=float(scatter[0]),
         )
 
-    def added_to(self, base: Surface | None, wanted: FloatArray, *, surest: bool) -> Surface:
+    def added_to(self, base: TagSurface | None, wanted: FloatArray, *, surest: bool) -> TagSurface:
         """Return the map `base` (without one, nothing) at `wanted` (M, 2) with the values there and their derivatives,
         by the plain degree.
 
@@ -158,7 +158,7 @@ class Polynomials:
             *(np.ascontiguousarray(wanted, np.float64), len(wanted), self.unit, len(self.told), self.plain),
             *(self.triangle, self.told, self.misses, surest, out),
         )
-        return Surface(out)
+        return TagSurface(out)
 
 
 def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:

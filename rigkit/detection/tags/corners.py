@@ -39,7 +39,7 @@ from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, seen_surface
 from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
-from rigkit.kernels.surface import Surface
+from rigkit.kernels.surface import TagSurface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
@@ -131,7 +131,7 @@ class _Fitter:
     def fit(
         self,
         cells: BoolArray,
-        surface: Surface,
+        surface: TagSurface,
         start: FloatArray,
         blur: FloatArray | float,
         stage: tuple[float, int, float],
@@ -185,7 +185,7 @@ class _Fitter:
         more = self.added(state, self.map_of(rough))
         return state if more is None else self.completed(more)
 
-    def _blur(self, cells: BoolArray, surface: Surface, pixels: FloatArray) -> float:
+    def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
         """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
         few = np.zeros(len(pixels), np.bool_)
         few[:: max(len(few) // FEW_CORNERS, 1)] = True
@@ -279,7 +279,7 @@ class _Fitter:
         self._waiting &= cv2.dilate((more.known & ~state.known).astype(np.uint8), AROUND_NEW) == 0
         return more
 
-    def _there(self, state: BoardState, cells: BoolArray, surface: Surface, fit: EdgeFit, blur: float) -> BoolArray:
+    def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
         """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
         gap = self.tags.pattern.spacing * surface.heights.min(axis=1)
         moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
@@ -296,7 +296,7 @@ class _Fitter:
             coded &= self.read(pixels)[cells]
         return np.asarray(seen & (clean | coded))
 
-    def borders(self, surface: Surface) -> FloatArray:
+    def borders(self, surface: TagSurface) -> FloatArray:
         """Return how wide the borders of tags are at places of the map, (M,) px."""
         return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.heights.min(axis=1))
 

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.surface import Polynomials, Surface, perspective, projected
+from rigkit.kernels.surface import Polynomials, TagSurface, perspective, projected
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MAX_LEVERAGE = 0.99
@@ -45,7 +45,7 @@ class SmoothMap:
     """
 
     def __init__(
-        self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], Surface] | None = None
+        self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], TagSurface] | None = None
     ) -> None:
         self._base = base or _perspective(places, pixels)
         rest, fewest = pixels, min(3, len(places))
@@ -55,11 +55,11 @@ class SmoothMap:
         terms = max(int(len(places) / POINTS_A_TERM), fewest)
         self._polynomial = Polynomials.through(places, rest, terms, MAX_LEVERAGE)
 
-    def at(self, wanted: FloatArray) -> Surface:
+    def at(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), NaN where the base has none."""
         return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=False)
 
-    def beyond(self, wanted: FloatArray) -> Surface:
+    def beyond(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), which may lie outside the points."""
         return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=True)
 
@@ -77,7 +77,7 @@ class SmoothMap:
 
 def wide_perspective(
     places: FloatArray, pixels: FloatArray, centre: FloatArray
-) -> Callable[[FloatArray], Surface] | None:
+) -> Callable[[FloatArray], TagSurface] | None:
     """Return the perspective that fits the points best through a lens that may be a fisheye; None where none does.
 
     Rays of a fisheye make angles with its axis, here through `centre` (2,), as pixels have distances from that, r = f
@@ -85,7 +85,7 @@ def wide_perspective(
     """
     away = pixels - centre
     radius = np.hypot(away[:, 0], away[:, 1])
-    best: tuple[float, Callable[[FloatArray], Surface]] | None = None
+    best: tuple[float, Callable[[FloatArray], TagSurface]] | None = None
     for part in BENDS:
         bend = part * 0.5 * np.pi / max(float(radius.max()), 1.0)
         angle = bend * radius
@@ -108,7 +108,7 @@ def _bent(homography: FloatArray, bend: float, centre: FloatArray, places: Float
     return np.asarray(centre + shrunk[:, None] * straight)
 
 
-def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> Surface:
+def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
     """Return a map and its derivatives at places (M, 2) by differences."""
     h = DIFFERENCE
     here, right, left, below, above = (
@@ -116,16 +116,16 @@ def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray
     )
     sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
     bends = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
-    return Surface.made_of(here, sides, bends)
+    return TagSurface.made_of(here, sides, bends)
 
 
-def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], Surface] | None:
+def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
     """Return the perspective that fits the points best; None where none with all of them in front does."""
     matrix, nearest = perspective(places, pixels)
     return partial(projected, matrix) if nearest > NEAREST_DEPTH else None
 
 
-def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> Surface:
+def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:
     """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
     h = CHORD
     offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
@@ -134,6 +134,6 @@ def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wa
     pixels, valid = camera.project(cam_from_board.apply(points))
     here, right, left, below, above = np.where(valid[..., None].all(axis=0), pixels, np.nan)
     sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
-    return Surface.made_of(
+    return TagSurface.made_of(
         here, sides, np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
     )
