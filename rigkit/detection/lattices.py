@@ -26,7 +26,7 @@ from rigkit.detection.checks.validate import (
     too_large,
     trustworthy,
 )
-from rigkit.detection.lattice.grow import grow_all
+from rigkit.detection.lattice.grow import MAX_FRUITLESS, grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
@@ -38,6 +38,8 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
+
+Promising = Callable[[GreyImage, Level, Lattice], bool]
 
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""
@@ -67,17 +69,24 @@ def find_lattices(
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    seen, promising = Seen.of(grey), _sampled if marked else _promising
-    found = fitted(grey, candidates(seen, min_corners, promising), min_corners, sizes)
+    seen, promising = Seen.of(grey), _Counting(_sampled if marked else _promising)
+
+    def looked(at: Seen, more_than: int = 0) -> list[RefinedLattice]:
+        boards = candidates(at, min_corners, promising)
+        if sum(item.count for item in boards) <= more_than:
+            return []
+        out = fitted(grey, boards, min_corners, sizes)
+        promising.in_vain += 0 if out else len(boards)
+        return out
+
+    found = looked(seen)
     if _worth_another_look(seen, found, sizes):
-        again = fitted(grey, candidates(seen.with_smeared(), min_corners, promising), min_corners, sizes)
-        found = max(again, found, key=_corners_of)
+        found = max(looked(seen.with_smeared()), found, key=_corners_of)
     for coarser in seen.coarser():
-        if _whole(found, sizes):
+        # The squares of clutter do meet.
+        if _whole(found, sizes) or promising.in_vain >= MAX_FRUITLESS:
             break
-        more = candidates(coarser, min_corners, promising)
-        if sum(item.count for item in more) > _corners_of(found):
-            found = max(found, fitted(grey, more, min_corners, sizes), key=_corners_of)
+        found = max(found, looked(coarser, _corners_of(found)), key=_corners_of)
     if min_corners < MIN_BOARD_CORNERS:
         return found
     return [item for item in found if _of_size(item.lattice, sizes) or compact(item.lattice, size_px)]
@@ -85,9 +94,10 @@ def find_lattices(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Seen:
-    """An image in grey levels, the levels of its pyramid, and what is seen in them."""
+    """An image in grey levels, the finest level of its pyramid, those that are looked at, and what is seen in them."""
 
     grey: GreyImage
+    finest: Level
     levels: list[Level]
     corners: Corners
     saddles: Saddles
@@ -95,14 +105,15 @@ class Seen:
     @classmethod
     def of(cls, grey: GreyImage) -> Seen:
         levels = pyramid(grey)
-        return cls(grey, levels, *find_corners(levels))
+        return cls(grey, levels[0], levels, *find_corners(levels))
 
     def coarser(self) -> Iterator[Seen]:
         """Return this as the coarser levels alone show it, without one level more each time.
 
         Where bright squares run over into dark ones (too much light, thin print), or dark ones into bright ones (ink
         that spreads), these do not meet: near a corner, the borders of the quadrants lie aside of the lines, by an
-        angle that falls with the radius of the ring.
+        angle that falls with the radius of the ring. On coarser levels, dots look like squares, too: what lattices are
+        is seen on the finest one.
         """
         for k in range(1, len(self.levels)):
             corners = each_once(self.saddles.by_level[k:])
@@ -113,6 +124,19 @@ class Seen:
     def with_smeared(self) -> Seen:
         """Return this with what is a corner only if something moved among the corners."""
         return replace(self, corners=joined([self.corners, self.saddles.smeared]))
+
+
+@dataclass(slots=True)
+class _Counting:
+    """Says which lattices are promising, and counts those that are not, or turn out to be no boards."""
+
+    promising: Promising
+    in_vain: int = 0
+
+    def __call__(self, grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
+        good = self.promising(grey, finest, lattice)
+        self.in_vain += not good
+        return good
 
 
 def _corners_of(found: Sequence[RefinedLattice]) -> int:
@@ -135,15 +159,15 @@ def _worth_another_look(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequ
     return (bool(sizes) or not found) and len(seen.saddles.smeared) >= SMEARED_CORNERS
 
 
-def candidates(seen: Seen, min_corners: int, promising: Callable[[GreyImage, Level, Lattice], bool]) -> list[Lattice]:
+def candidates(seen: Seen, min_corners: int, promising: Promising) -> list[Lattice]:
     """Return the lattices of an image that may be boards, before the sub-pixel fit.
 
     `promising` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
     """
     size_px = (seen.grey.shape[1], seen.grey.shape[0])
-    finest = seen.levels[0]
-    lattices = build_lattices(seen.corners, find_links(seen.corners, finest))
-    grown = grow_all(lattices, seen.saddles, finest, functools.partial(promising, seen.grey, finest))
+    level = seen.levels[0]
+    lattices = build_lattices(seen.corners, find_links(seen.corners, level))
+    grown = grow_all(lattices, seen.saddles, level, functools.partial(promising, seen.grey, seen.finest))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []

@@ -67,13 +67,11 @@ def test_squares_that_overlap_by_pixels_are_corners_at_a_coarser_level(grow: flo
     assert np.abs(found.pixels - truth).max() < 0.12
 
 
-@pytest.mark.parametrize("grow, scale", [(-0.1, 1), (0.1, 1), (-0.06, 2), (0.06, 2)])
-def test_squares_that_run_over_by_a_tenth_are_found_at_coarser_levels(
-    grow: float, scale: int, rng: np.random.Generator
-) -> None:
+@pytest.mark.parametrize("grow", [-0.06, 0.05])
+def test_squares_that_run_over_by_pixels_are_found_at_coarser_levels(grow: float, rng: np.random.Generator) -> None:
     """3.6 and 4.3 px: on the finest level, the corners are bars of one brightness. Their sigmas say that they are less
     sure."""
-    image, truth = print_of(grow, 1e-6, rng, scale)
+    image, truth = print_of(grow, 1e-6, rng, scale=2)
     (found,) = detect_boards(image, [Board("b", COLUMNS, ROWS, 30.0, 30.0)])
     assert found.complete and found.board_id == "b"
     errors = found.pixels - truth
