@@ -212,7 +212,10 @@ def _result(
     """Return the result of a camera with its verdicts."""
     how, fit = begun.how, found.chosen.fit
     others = _others(tried, fit.state.camera.model) if len(tried.models) > 1 else []
-    close = [*rival_fits(found.observations, fit, rivals, likely), *rival_shapes(found.chosen, found.shapes)]
+    close = rival_fits(found.observations, fit, rivals, likely)
+    if not begun.name:
+        # What shape boards have is a question to all cameras of a rig together, which holds lenses by what each knows.
+        close += rival_shapes(found.chosen, found.shapes)
     result = assemble(
         found.observations,
         fit,

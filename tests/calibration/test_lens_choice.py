@@ -229,6 +229,8 @@ def test_boards_in_doubt_widen_the_sigmas_by_what_they_make_of_the_lens(monkeypa
     rng = np.random.default_rng(0)
     views, *_ = random_views(lens("reg"), 5, rng, reach_deg=REACH_DEG["reg"], noise_px=0.4, points_mm=bowed)
     found = calibrate(views, SIZE, model="kannala_brandt")
+    (in_rig,) = calibrate_together([("left", views, How(SIZE, "kannala_brandt", None, "auto", 5, silent))])
+    assert not in_rig.rivals  # All cameras of a rig together ask what shape its boards have.
     monkeypatch.setattr(module, "rival_shapes", lambda *_: [])
     alone = calibrate(views, SIZE, model="kannala_brandt")
     assert any(rival.name.startswith("board") for rival in found.rivals)
