@@ -61,7 +61,7 @@ class Saddles:
     ----------
     pixels : (N, 2) full resolution.
     smeared : those that are corners only if something moved.
-    by_level : the corners of each level, also those that a finer one has found.
+    by_level : the corners of each level, also those that a finer one has found, and the smeared ones.
     """
 
     pixels: FloatArray
