@@ -12,6 +12,7 @@ from rigkit.calibration.clustered import Clustered, effective_freedom, with_bloc
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
+from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.clustered import clustered_by_frame
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
@@ -19,7 +20,6 @@ from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.solver import pose_jacobians
 from rigkit.calibration.rig.state import RigObservations
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
@@ -165,21 +165,14 @@ def _frame_covariance(
     (F, 6, 6), what is the poses' own."""
     state = joint.solution.state
     translation = state.of_camera(c, observations).translation_mm
-    f = observations.frame[c]
-    lever = motion_of_world(translation) / max(len(f), 1)
-    by = pose_jacobians(observations, state, c, translation)
-    through_target = lever @ by.target
-    # The targets' poses follow the globals, pose = -W globals + what is their own.
-    mean = np.zeros((6, layout.count)) - np.einsum("vij,vjg->ig", through_target, back[f])
-    if layout.mounts[c] is not None:
-        mean[:, layout.mounts[c]] += (lever @ by.mount).sum(axis=0)
-    if by.place is not None:
-        for b, run in enumerate(layout.boards):
-            views = observations.cameras[c].board == b
-            if run is not None and views.any():
-                mean[:, run] += (lever[views] @ by.place[views]).sum(axis=0)
-    each = np.zeros((len(observations.keys), 6, 6))
-    np.add.at(each, f, through_target)
+    lever = motion_of_world(translation) / max(len(translation), 1)
+    mean, each = np.zeros((6, layout.count)), np.zeros((len(observations.keys), 6, 6))
+    for part in carried(observations, state, c, translation):
+        through = lever[part.views] @ part.target
+        # The targets' poses follow the globals, pose = -W globals + what is their own.
+        mean -= np.einsum("vij,vjg->ig", through, back[part.poses])
+        mean[:, part.index] += (lever[part.views] @ part.globals).sum(axis=0)
+        each[part.poses] += through
     design = np.zeros((len(covariance[layout.cameras[c]]) + 6, layout.count))
     design[:-6, layout.cameras[c]] = np.eye(len(design) - 6)
     design[-6:] = mean

@@ -14,7 +14,8 @@ import numpy as np
 from rigkit.calibration.displaced import LensModes, telling_modes
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.rig.solver import RigSolution, pose_jacobians
+from rigkit.calibration.rig.carried import carried
+from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import FarProjection
@@ -43,19 +44,15 @@ def _of_camera(
     if not modes.size:
         return LensModes(modes, np.zeros((count, 0)))
     layout = state.layout(observations)
-    alone, own, f = state.of_camera(c, observations), observations.cameras[c], observations.frame[c]
+    alone, own = state.of_camera(c, observations), observations.cameras[c]
     n = layout.shape.start
     by_globals = np.zeros((n, modes.shape[1]))
     by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes)
-    by = pose_jacobians(observations, state, c, alone.translation_mm)
-    runs = [(layout.mounts[c], by.mount, np.arange(len(f)))]
-    if by.place is not None:
-        runs += [(run, by.place, np.flatnonzero(own.board == b)) for b, run in enumerate(layout.boards)]
-    for run, how, views in runs:
-        if run is not None:
-            by_globals[run] += (np.swapaxes(how[views], -1, -2) @ by_own[views]).sum(axis=0)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
-    np.add.at(by_pose, f, np.swapaxes(by.target, -1, -2) @ by_own)
+    for part in carried(observations, state, c, alone.translation_mm):
+        told = by_own[part.views]
+        by_globals[part.index] += (np.swapaxes(part.globals, -1, -2) @ told).sum(axis=0)
+        by_pose[part.poses] += np.swapaxes(part.target, -1, -2) @ told
     inverse, back, _ = normal.covariance
     moves = -inverse @ (by_globals - np.tensordot(back, by_pose, axes=((0, 1), (0, 1))))
     return LensModes(modes, moves[:count])
