@@ -7,18 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.calibration.between_models import RivalFit, between_models
-from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
+from rigkit.calibration.clustered import Clustered
+from rigkit.calibration.covariance import Carried, GlobalCovariance
 from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal_equations import NormalEquations, Residuals
+from rigkit.calibration.normal_equations import Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import skew
 
 UNKNOWN_SHARE = 0.05
 """A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
@@ -61,20 +61,17 @@ def assemble(
 def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clustered]:
     """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
     the independent units, and what the images said."""
-    normal = fit.normal
     p = fit.state.camera.parameters.size
     # A warp may hide in the lens: an aspect ratio of the board in that of the pixels.
     n = p + fit.state.shape.basis.shape[-1]
-    unit = frame_covariance(normal, fit.state, n)
+    unit = fit.normal.covariance[0][:n, :n]
     variance = np.diag(unit)
     if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
         raise not_identifiable(fit.state.camera.model)
-    information, score = reduced_by_cluster(fit.data.products[0], n, observations.clusters(), normal.covariance[2])
-    prior = (normal.gg - fit.data.gg)[:n, :n]
-    clustered = clustered_covariance(unit[:n, :n], information, score, prior, fit.sigma_px)
-    covariance = with_block(unit * fit.sigma_px**2, clustered.covariance, clustered.overdispersion**2)
-    chosen = np.concatenate([np.arange(p), np.arange(n, n + 6)])
-    return covariance[np.ix_(chosen, chosen)], clustered
+    prior = (fit.normal.gg - fit.data.gg)[:n, :n]
+    known = GlobalCovariance.of(fit.normal, fit.data.products[0], prior, observations.clusters(), fit.sigma_px)
+    views = Carried.alone(len(observations.views))
+    return known.of_camera(slice(0, p), [views], fit.state.translation_mm), known.clustered
 
 
 def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
@@ -87,40 +84,6 @@ def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
         length = float(np.linalg.norm(fit.residuals.px[i, j])) if fit.residuals.valid[i, j] else float("nan")
         out.append(Outlier(view.image, view.board.board_id, column, row, length))
     return tuple(out)
-
-
-def motion_of_world(translation_mm: Points) -> FloatArray:
-    """Return how the motions (dw, dt) of boards at `translation_mm` (V, 3) become motions (W, T) of the world,
-    (V, 6, 6).
-
-    A point x in the camera frame that sticks to the board moves by dw x (x - t) + dt = W x x + T, with W = dw and
-    T = dt + t x dw.
-    """
-    lever = np.zeros((len(translation_mm), 6, 6))
-    lever[:] = np.eye(6)
-    lever[:, 3:, :3] = skew(translation_mm)
-    return lever
-
-
-def frame_covariance(normal: NormalEquations, state: State, count: int) -> FloatArray:
-    """Return the covariance, for unit residuals, of the first `count` globals and of the mean motion of the boards
-    (w, t).
-
-    The boards on average move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
-    """
-    p = count
-    globals_, back, own = normal.covariance
-    used = normal.pp.trace(axis1=-2, axis2=-1) > 0.0
-    lever = motion_of_world(state.translation_mm[used]) / max(int(used.sum()), 1)
-    through = lever.transpose(1, 0, 2).reshape(6, -1) @ back[used].reshape(-1, len(globals_))
-    spread = (lever @ own[used] @ np.swapaxes(lever, -1, -2)).sum(axis=0)
-    chosen = globals_[:p]
-    out = np.empty((p + 6, p + 6))
-    out[:p, :p] = chosen[:, :p]
-    out[:p, p:] = -(chosen @ through.T)
-    out[p:, :p] = out[:p, p:].T
-    out[p:, p:] = through @ globals_ @ through.T + spread
-    return 0.5 * (out + out.T)
 
 
 def identifiable(fit: Fit) -> bool:

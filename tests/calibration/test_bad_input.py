@@ -12,6 +12,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration import assemble
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
 from rigkit.core.boards import Board
@@ -105,13 +106,15 @@ def test_parts_of_boards_cost_no_more_than_their_corners(rng: np.random.Generato
 def test_a_covariance_that_is_none_is_no_result(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Equations that were sound while models were compared may have no inverse once corners are left out."""
     views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0)
-    sound = assemble.frame_covariance
+    sound = assemble._covariance
 
-    def singular(*arguments: Any) -> np.ndarray:
-        covariance = sound(*arguments)
-        covariance[0, 0] = -1e10
-        return covariance
+    def singular(observations: Observations, fit: Fit) -> Any:
+        inverse, *rest = fit.normal.covariance
+        inverse = inverse.copy()
+        inverse[0, 0] = -1e10
+        fit.normal.__dict__["covariance"] = (inverse, *rest)
+        return sound(observations, fit)
 
-    monkeypatch.setattr(assemble, "frame_covariance", singular)
+    monkeypatch.setattr(assemble, "_covariance", singular)
     with pytest.raises(DegenerateError, match="brown camera is not identifiable"):
         calibrate(views, SIZE, model="brown", board="flat")

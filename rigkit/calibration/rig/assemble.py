@@ -7,20 +7,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import board_shapes, motion_of_world, view_results
-from rigkit.calibration.clustered import Clustered, effective_freedom, with_block
+from rigkit.calibration.assemble import board_shapes, view_results
+from rigkit.calibration.clustered import Clustered, effective_freedom
+from rigkit.calibration.covariance import GlobalCovariance
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.carried import carried
-from rigkit.calibration.rig.clustered import clustered_by_frame
+from rigkit.calibration.rig.carried import carried, pose_products
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.state import RigObservations
+from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -43,28 +43,19 @@ def assemble_rig(
     observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
-    unit, back, own = normal.covariance
-    clustered = clustered_by_frame(observations, state, normal, unit, joint.frames, sigma)
-    overdispersion = clustered.overdispersion
-    covariance = with_block(unit * sigma**2, clustered.covariance, overdispersion**2)
-    covariance += _error_of_held(joint, names, layout, single, unit)
+    known = _global_covariance(joint, sigma)
+    overdispersion = known.clustered.overdispersion
+    beside = _error_of_held(joint, names, layout, single, normal.covariance[0])
     off = shape_error(observations, state, sigma * overdispersion)
-    covariance[: len(off), : len(off)] += np.outer(off, off)
-    covariance += between_rig_models(joint, single, np.sqrt(np.diag(covariance)))
-    own = own * (sigma * overdispersion) ** 2
+    beside[: len(off), : len(off)] += np.outer(off, off)
+    covariance = known.covariance
+    beside += between_rig_models(joint, single, np.sqrt(np.diag(covariance + beside)))
+    covariance += beside
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
-    cameras, squared = [], []
-    for c, name in enumerate(names):
-        frame = _frame_covariance(observations, joint, layout, c, covariance, back, own)
-        of_camera, of_corners = _of_camera(joint, c, single[c], frame)
-        squared.append(of_corners)
-        of_camera = replace(
-            of_camera, heldout_rms_px=heldout[1][c], overdispersion=overdispersion, freedom=clustered.freedom
-        )
-        cameras.append(RigCamera(name, Rigid3(state.mount_rotation[c], state.mount_mm[c]), of_camera))
+    cameras, squared = _cameras(joint, names, single, heldout[1], known, beside)
     everything = np.concatenate(squared)
     last = layout.mounts[-1] or layout.cameras[-1]
     # One ruler has measured all boards: its error does not average out.
@@ -77,7 +68,7 @@ def assemble_rig(
         covariance=covariance[: last.stop, : last.stop],
         sigma_px=sigma,
         overdispersion=overdispersion,
-        freedom=clustered.freedom,
+        freedom=known.clustered.freedom,
         single=single,
         convergence=joint.solution.convergence,
         corner_count=everything.size,
@@ -85,32 +76,56 @@ def assemble_rig(
         left_out=joint.left_out,
         scale_sigma=scale,
         departures=lens_modes(observations, joint.solution, far, last.stop),
-        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale, clustered),
+        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale, known.clustered),
     )
     return rig, far
 
 
-def _of_camera(
-    joint: JointRig, c: int, single: Calibration, frame_covariance: FloatArray
-) -> tuple[Calibration, FloatArray]:
-    """Return the calibration of camera `c` as the rig has it, and the squared residuals of its corners, px^2."""
+def _global_covariance(joint: JointRig, sigma_px: float) -> GlobalCovariance:
+    """Return how sure the solution is, with the frames as what repeats."""
+    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
+    products = pose_products(observations, state, normal.products)
+    n = products.shape[-1] - 7
+    nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
+    prior = with_rig_priors(nothing, observations, state, sigma_px).gg[:n, :n]
+    return GlobalCovariance.of(normal, products, prior, joint.frames, sigma_px)
+
+
+def _cameras(
+    joint: JointRig,
+    names: Sequence[str],
+    single: Sequence[Calibration],
+    heldout: Sequence[float | None],
+    known: GlobalCovariance,
+    beside: FloatArray,
+) -> tuple[list[RigCamera], list[FloatArray]]:
+    """Return the cameras as the rig has them, and the squared residuals of the corners of each, px^2; `beside` (G, G)
+    is what is not sure of the globals beside what frames show."""
     observations, state = joint.observations, joint.solution.state
-    alone = state.of_camera(c, observations)
-    residuals = joint.solution.normal.residuals[c]
-    kept = observations.weights[c] > 0.0
-    squared = (residuals.px**2).sum(axis=-1)[kept]
-    p = alone.camera.parameters.size
-    found = replace(
-        single,
-        camera=alone.camera,
-        rms_px=float(np.sqrt(squared.mean())),
-        covariance=frame_covariance[:p, :p],
-        frame_covariance=frame_covariance,
-        views=view_results(observations.cameras[c], alone, residuals, kept),
-        convergence=joint.solution.convergence,
-        boards=board_shapes(observations.cameras[c], observations.shape, state.unknowns),
-    )
-    return found, squared
+    layout = state.layout(observations)
+    cameras, squared = [], []
+    for c, (name, own) in enumerate(zip(names, observations.cameras, strict=True)):
+        alone = state.of_camera(c, observations)
+        parts = carried(observations, state, c, alone.translation_mm)
+        frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, beside)
+        residuals, kept = joint.solution.normal.residuals[c], observations.weights[c] > 0.0
+        squared.append((residuals.px**2).sum(axis=-1)[kept])
+        p = alone.camera.parameters.size
+        found = replace(
+            single[c],
+            camera=alone.camera,
+            rms_px=float(np.sqrt(squared[c].mean())),
+            heldout_rms_px=heldout[c],
+            covariance=frame[:p, :p],
+            frame_covariance=frame,
+            overdispersion=known.clustered.overdispersion,
+            freedom=known.clustered.freedom,
+            views=view_results(own, alone, residuals, kept),
+            convergence=joint.solution.convergence,
+            boards=board_shapes(own, observations.shape, state.unknowns),
+        )
+        cameras.append(RigCamera(name, Rigid3(state.mount_rotation[c], state.mount_mm[c]), found))
+    return cameras, squared
 
 
 def _error_of_held(
@@ -149,36 +164,6 @@ def residual_sigma(joint: JointRig) -> float:
     if state.unknowns.size:
         total += joint.sigma_px**2 * float(((state.unknowns / observations.shape.sigma) ** 2).sum())
     return float(np.sqrt(total / freedom))
-
-
-def _frame_covariance(
-    observations: RigObservations,
-    joint: JointRig,
-    layout: Layout,
-    c: int,
-    covariance: FloatArray,
-    back: FloatArray,
-    own: FloatArray,
-) -> FloatArray:
-    """Return the covariance of the P parameters of camera `c` and of the mean motion of the boards before it,
-    (P + 6, P + 6), as `rigkit.calibration.assemble` has it for a camera alone; from that of all globals and `own`
-    (F, 6, 6), what is the poses' own."""
-    state = joint.solution.state
-    translation = state.of_camera(c, observations).translation_mm
-    lever = motion_of_world(translation) / max(len(translation), 1)
-    mean, each = np.zeros((6, layout.count)), np.zeros((len(observations.keys), 6, 6))
-    for part in carried(observations, state, c, translation):
-        through = lever[part.views] @ part.target
-        # The targets' poses follow the globals, pose = -W globals + what is their own.
-        mean -= np.einsum("vij,vjg->ig", through, back[part.poses])
-        mean[:, part.index] += (lever[part.views] @ part.globals).sum(axis=0)
-        each[part.poses] += through
-    design = np.zeros((len(covariance[layout.cameras[c]]) + 6, layout.count))
-    design[:-6, layout.cameras[c]] = np.eye(len(design) - 6)
-    design[-6:] = mean
-    out = design @ covariance @ design.T
-    out[-6:, -6:] += np.einsum("fij,fjk,flk->il", each, own, each)
-    return np.asarray(0.5 * (out + out.T))
 
 
 def _board_rigs(

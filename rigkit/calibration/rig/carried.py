@@ -13,37 +13,18 @@ alone (its mount the identity, every board a target) they are the identity, and 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.covariance import Carried
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.geometry.rotation import skew
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Carried:
-    """N views of one camera (and, where boards have places on a target, of one board), of different poses each.
-
-    Attributes
-    ----------
-    views : (N,) which of the camera's.
-    poses : (N,) the target's pose of each.
-    target : (N, 6, 6) or (6, 6), how a view's own pose (w_cam, dt_cam) follows from that.
-    index : (K,) the globals that it follows beside it: the camera's mount and the board's place, where they are free.
-    globals : (N, 6, K) how.
-    """
-
-    views: IntArray
-    poses: IntArray
-    target: FloatArray
-    index: IntArray
-    globals: FloatArray
-
-
 def carried(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> list[Carried]:
-    """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from the rig."""
+    """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from targets, its mount where that
+    is free, and (board by board, where boards have places on a target) from these."""
     layout, frame, board = state.layout(observations), observations.frame[c], observations.cameras[c].board
     turn = state.mount_rotation[c]
     target = np.kron(np.eye(2), turn)
