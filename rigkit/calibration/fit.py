@@ -12,7 +12,7 @@ from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
-from rigkit.calibration.poses import find_poses, refine_poses
+from rigkit.calibration.poses import find_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
@@ -28,10 +28,6 @@ FINE = 1e-5
 and the least squares that follow begin where they end."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
-FOLD = 1e-6
-"""A fold begins at the solution of all images: a step that promises less of the cost changes no digit shown."""
-MIN_IMAGES_OF_FIT = 3
-"""So many images can be left out one at a time: two others still show a camera."""
 SETTLE_ROUNDS = 8
 MAX_SCATTER_OF_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
@@ -212,40 +208,3 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
         )
     sigma = np.sqrt(total / freedom)
     return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
-
-
-def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
-    """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
-    shape from the other images, only the poses of its boards refitted. Images that repeat each other take part
-    together, or not: else those that are left out would be known. Of fewer images than folds each is one. None with
-    less than MIN_IMAGES_OF_FIT that differ.
-
-    Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
-    decides no more than it is worth.
-    """
-    if folds < 2:
-        return None
-    images = list(dict.fromkeys(observations.images))
-    if int(observations.clusters().max()) + 1 < MIN_IMAGES_OF_FIT:
-        return None
-    place = {name: i for i, name in enumerate(images)}
-    image = np.array([place[name] for name in observations.images])
-    fold = observations.folds(folds)
-    squared = np.zeros(len(images))
-    weight = fit.weight(observations)
-    for k in range(int(fold.max()) + 1):
-        train, test = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        solved = solve(
-            observations.subset(train),
-            fit.state.subset(train),
-            weight=weight[train],
-            prior_sigma_px=fit.sigma_px,
-            cost_tolerance=FOLD,
-        ).state
-        part = observations.subset(test)
-        start = fit.state.subset(test)
-        moved = replace(solved, rotation=start.rotation, translation_mm=start.translation_mm)
-        found, _ = refine_poses(part, moved, weight[test])
-        own = np.where(fit.kept[test], weight[test] ** 2 * (evaluate(found, part).px ** 2).sum(axis=-1), 0.0)
-        np.add.at(squared, image[test], own.sum(axis=-1))
-    return squared

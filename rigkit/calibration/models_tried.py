@@ -9,7 +9,8 @@ import numpy as np
 
 from rigkit.calibration.assemble import identifiable, not_identifiable
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import Fit, fit_kept, fit_model, heldout_squares, robust_sigma
+from rigkit.calibration.fit import Fit, fit_kept, fit_model, robust_sigma
+from rigkit.calibration.heldout import heldout_squares
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.shape import SHAPES

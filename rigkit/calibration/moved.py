@@ -14,8 +14,8 @@ import numpy as np
 
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
-from rigkit.calibration.solver import solve
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solver import FROM_OPTIMUM, solve
+from rigkit.calibration.state import State, weighted_squares
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding
 
@@ -26,7 +26,6 @@ lenses. Halves of one and the same are 1 apart, at most 2."""
 AGAINST_PLACE = 1.4
 """They are, if no other way to halve the images sets them apart by more than a part of this. Measured: at most 1.2 for
 one lens with flat, bent and wavy boards, 1.5 and more for 2 % of focal length."""
-HALVES_TOLERANCE = 1e-6
 DIGITS = re.compile(r"\d+")
 
 
@@ -108,14 +107,10 @@ def _apart(observations: Observations, fit: Fit, state: State, second: BoolArray
     for chosen in (np.flatnonzero(~second), np.flatnonzero(second)):
         part, start = observations.subset(chosen), state.subset(chosen)
         weight = np.where(fit.kept[chosen], part.weight, 0.0)
-        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=HALVES_TOLERANCE).state
-        whole += _cost(part, start, weight)
-        split += _cost(part, own, weight)
+        own = solve(part, start, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=FROM_OPTIMUM).state
+        whole += float(weighted_squares(start, part, weight).sum())
+        split += float(weighted_squares(own, part, weight).sum())
         count += 2 * int(fit.kept[chosen].sum()) - 6 * len(chosen)
     p = state.camera.parameters.size
     variance = split / max(count - 2 * p, 1)
     return float(np.sqrt(max(whole - split, 0.0) / (p * variance))) if variance > 0.0 else 0.0
-
-
-def _cost(observations: Observations, state: State, weight: FloatArray) -> float:
-    return float(((evaluate(state, observations).px ** 2).sum(axis=-1) * weight**2).sum())

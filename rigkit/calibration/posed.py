@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept, heldout_squares
+from rigkit.calibration.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept
+from rigkit.calibration.heldout import heldout_squares
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import with_board_shape

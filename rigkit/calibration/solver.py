@@ -11,8 +11,8 @@ c^2 log(1 + |r|^2 / c^2) of the 2-D residual, as iteratively reweighted least sq
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, SchurStep
@@ -21,7 +21,6 @@ from rigkit.calibration.result import Convergence
 from rigkit.calibration.state import State
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.rotation import exp_so3
 from rigkit.optim import levenberg_marquardt
 from rigkit.optim.damping import Damping, Stop, StopReason
 from rigkit.optim.levenberg_marquardt import LinearisedProblem
@@ -32,6 +31,9 @@ MAX_SOLVER_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
 """Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
 the optimum is then known to about 1e-10 in cost."""
+FROM_OPTIMUM = 1e-6
+"""A solve that begins at the optimum of nearly the same problem (all images but some, another lens) stops here: a step
+that promises less of the cost changes no digit shown."""
 MIN_GAIN_RATIO = 0.5
 """A step that gains little, and less than this share of what it promised, was too far: the next one may gain more."""
 SOLVER_DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0, ceiling=1e12, by_gain=True)
@@ -58,11 +60,13 @@ class Linearised(LinearisedProblem):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class CameraSolution:
-    """The state found, the normal equations of its corners (without priors), and how the solver ended."""
+class Solution(Generic[S]):
+    """The state found, the normal equations there, of the corners alone and with all priors, and how the solver
+    ended."""
 
-    state: State
+    state: S
     data: NormalEquations
+    normal: NormalEquations
     convergence: Convergence
 
 
@@ -84,7 +88,7 @@ def solve(
     max_iterations: int = MAX_SOLVER_ITERATIONS,
     cost_tolerance: float = COST_TOLERANCE,
     at_start: NormalEquations | None = None,
-) -> CameraSolution:
+) -> Solution[State]:
     """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
     lack of data: what is not determined stays where it started.
 
@@ -98,58 +102,40 @@ def solve(
     at_start : the normal equations at `start`, without priors, where they are known.
     """
     weight = observations.weight if weight is None else weight
-    solver = _Solver(observations, weight, loss_px, prior_sigma_px)
-    here = None if at_start is None else solver.with_priors(start, at_start)
-    state, last, convergence = minimise(start, solver.linearise, _moved, max_iterations, cost_tolerance, here)
-    return CameraSolution(state, last.data, convergence)
 
+    def around(state: State, data: NormalEquations) -> Linearised:
+        return Linearised(data, with_priors(data, state, prior_sigma_px))
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Solver:
-    observations: Observations
-    weight: FloatArray
-    loss_px: float | None
-    prior_sigma_px: float
+    def linearise(state: State) -> Linearised:
+        return around(state, normal_equations(observations, state, weight, loss_px))
 
-    def linearise(self, state: State) -> Linearised:
-        return self.with_priors(state, normal_equations(self.observations, state, self.weight, self.loss_px))
-
-    def with_priors(self, state: State, data: NormalEquations) -> Linearised:
-        return Linearised(data, with_priors(data, state, self.prior_sigma_px))
+    here = None if at_start is None else around(start, at_start)
+    return minimise(start, linearise, State.moved, max_iterations, cost_tolerance, here)
 
 
 def minimise(
     state: S,
     linearise: Callable[[S], Linearised],
-    moved: Callable[[S, SchurStep], S | None],
+    moved: Callable[[S, SchurStep], S],
     max_iterations: int = MAX_SOLVER_ITERATIONS,
     tolerance: float = COST_TOLERANCE,
     here: Linearised | None = None,
-) -> tuple[S, Linearised, Convergence]:
-    """Return the state of least cost near `state`, the problem around it, and how it ended: Levenberg-Marquardt.
+) -> Solution[S]:
+    """Return the state of least cost near `state`: Levenberg-Marquardt.
 
     `linearise` gives cost and normal equations together: nearly every step is taken, so hardly any are in vain.
-    `moved` returns the state after a step, None where there is no such state. `here` is the problem around the start,
-    where it is known.
+    `moved` returns the state after a step; where its parameters make no camera it raises, and the step is refused.
+    `here` is the problem around the start, where it is known.
     """
+
+    def attempt(state: S, step: SchurStep) -> S | None:
+        try:
+            return moved(state, step)
+        except (InputError, DegenerateError):
+            return None
+
     stop = Stop(steps=max_iterations, gain=tolerance, gain_ratio=MIN_GAIN_RATIO, promise=tolerance)
-    end = levenberg_marquardt.minimise(state, linearise, moved, SOLVER_DAMPING, stop, here=here)
+    end = levenberg_marquardt.minimise(state, linearise, attempt, SOLVER_DAMPING, stop, here=here)
     stopped = f"stopped after {max_iterations} iterations"
     reason = stopped if end.reason == StopReason.STEPS else str(end.reason)
-    return end.state, end.problem, Convergence(end.steps, end.converged, reason)
-
-
-def _moved(state: State, step: SchurStep) -> State | None:
-    """Return the state after a step, None where the parameters make no camera."""
-    p = state.camera.parameters.size
-    try:
-        camera = state.camera.with_parameters(state.camera.parameters + step.globals[:p])
-    except (InputError, DegenerateError):
-        return None
-    return replace(
-        state,
-        camera=camera,
-        rotation=exp_so3(step.poses[:, :3]) @ state.rotation,
-        translation_mm=state.translation_mm + step.poses[:, 3:],
-        unknowns=state.unknowns + step.globals[p:],
-    )
+    return Solution(end.state, end.problem.data, end.problem.normal, Convergence(end.steps, end.converged, reason))

@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import Residuals
+from rigkit.calibration.normal_equations import Residuals, SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import ShapeModel, shape_model
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
+from rigkit.geometry.rotation import exp_so3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -32,6 +33,17 @@ class State:
     def subset(self, chosen: IntArray) -> State:
         """Return the state of the views `chosen`."""
         return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
+
+    def moved(self, step: SchurStep) -> State:
+        """Return the state after a step; raises InputError or DegenerateError where the parameters make no camera."""
+        p = self.camera.parameters.size
+        return replace(
+            self,
+            camera=self.camera.with_parameters(self.camera.parameters + step.globals[:p]),
+            rotation=exp_so3(step.poses[:, :3]) @ self.rotation,
+            translation_mm=self.translation_mm + step.poses[:, 3:],
+            unknowns=self.unknowns + step.globals[p:],
+        )
 
     def with_boards_held(self) -> State:
         """Return the state with nothing of the boards' shape left to solve for."""
@@ -60,6 +72,11 @@ def evaluate(state: State, observations: Observations) -> Residuals:
     pixels, valid = state.camera.project(points)
     residuals = observations.pixels - pixels
     return Residuals(residuals if valid.all() else np.where(valid[..., None], residuals, lost_px(state.camera)), valid)
+
+
+def weighted_squares(state: State, observations: Observations, weight: FloatArray) -> FloatArray:
+    """Return the sum of the squared residuals of each view (V,), px^2, times the squares of the weights (V, C)."""
+    return np.asarray((weight**2 * (evaluate(state, observations).px ** 2).sum(axis=-1)).sum(axis=-1))
 
 
 def lost_px(camera: Camera) -> float:

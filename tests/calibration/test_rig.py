@@ -101,7 +101,6 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
 
     def residuals(x: np.ndarray) -> np.ndarray:
         moved = state.moved(SchurStep(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
-        assert moved is not None
         return np.concatenate(
             [
                 (evaluate(moved.of_camera(c, observations), own).px * w[..., None]).ravel()

@@ -16,13 +16,11 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
+from rigkit.calibration.solver import FROM_OPTIMUM
 from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rotation import log_so3
-
-RIVAL_TOLERANCE = 1e-6
-"""A rival's solution begins at that of the lens chosen: a step that promises less of the cost changes no digit."""
 
 
 def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: FloatArray) -> FloatArray:
@@ -46,7 +44,7 @@ def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: F
         )
         try:
             turns = _turns(here, start, rays, sigmas, joint)[1]
-            there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, RIVAL_TOLERANCE).state
+            there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, FROM_OPTIMUM).state
             way = _way(here, there, rays, sigmas, joint)
         except (InputError, DegenerateError):
             continue

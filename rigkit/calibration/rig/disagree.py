@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.rig.observations import FrameObservations
-from rigkit.calibration.rig.solver import RigSolution
-from rigkit.calibration.rig.state import Key, RigObservations
+from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.solver import Solution
 
 FAR_APART = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
@@ -38,7 +38,7 @@ def shared_keys(seen: Sequence[FrameObservations]) -> dict[Key, int]:
 
 
 def cost_of_sharing(
-    observations: RigObservations, solution: RigSolution, seen: Sequence[FrameObservations]
+    observations: RigObservations, solution: Solution[RigState], seen: Sequence[FrameObservations]
 ) -> dict[Key, float]:
     """Return what it costs every shared target that its views have one pose, px^2 for each of the six numbers that
     every view but one gives up. A view that is bad in itself is no reason to distrust the moment."""

@@ -15,8 +15,8 @@ from rigkit.calibration.displaced import LensModes, telling_modes
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.carried import carried
-from rigkit.calibration.rig.solver import RigSolution
 from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.solver import Solution
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
@@ -25,7 +25,7 @@ from rigkit.kernels.departures import displacements
 
 
 def lens_modes(
-    observations: RigObservations, solution: RigSolution, far: Sequence[FarProjection], count: int
+    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], count: int
 ) -> tuple[LensModes, ...]:
     """Return what each lens may do beyond its model, and how the first `count` globals, intrinsics and mounts, are off;
     `far` are the cameras' projections as the rig has them."""

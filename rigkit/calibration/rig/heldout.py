@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.fit import MIN_IMAGES_OF_FIT
+from rigkit.calibration.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
-from rigkit.calibration.state import evaluate
-
-FOLD_TOLERANCE = 1e-6
-"""A fold begins at the solution of all frames: a step that promises less of the cost changes no digit shown."""
+from rigkit.calibration.solver import FROM_OPTIMUM
+from rigkit.calibration.state import weighted_squares
 
 
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
@@ -34,14 +32,12 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
         train = observations.subset(~test)
         if not _hang_together(train):
             return nothing
-        solved = solve_rig(train, state, joint.sigma_px, FOLD_TOLERANCE).state
+        solved = solve_rig(train, state, joint.sigma_px, FROM_OPTIMUM).state
         part = observations.subset(test)
         found = refine_frames(part, solved.with_frames(state))
         for c, (own, weight) in enumerate(zip(part.cameras, part.weights, strict=True)):
-            used = weight > 0.0
-            px = evaluate(found.of_camera(c, part), own).px
-            squared[c] += float((weight**2 * (px**2).sum(axis=-1))[used].sum())
-            count[c] += float(used.sum())
+            squared[c] += float(weighted_squares(found.of_camera(c, part), own, weight).sum())
+            count[c] += float((weight > 0.0).sum())
     each = tuple(float(np.sqrt(s / n)) if n else None for s, n in zip(squared, count, strict=True))
     return float(np.sqrt(squared.sum() / count.sum())), each
 

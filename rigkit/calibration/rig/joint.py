@@ -30,8 +30,9 @@ from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned
 from rigkit.calibration.rig.known import KnownCameras
 from rigkit.calibration.rig.observations import FrameObservations, Places
 from rigkit.calibration.rig.shape import common_shape
-from rigkit.calibration.rig.solver import RigSolution, solve_rig
+from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.solver import Solution
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
@@ -72,7 +73,7 @@ class JointRig:
     """
 
     observations: RigObservations
-    solution: RigSolution
+    solution: Solution[RigState]
     seen: tuple[FrameObservations, ...]
     sigma_px: float
     cost_sigmas: float
@@ -177,7 +178,7 @@ def _solved(
     places: Places,
     sigma: float,
     known: KnownCameras | None,
-) -> tuple[RigObservations, RigSolution]:
+) -> tuple[RigObservations, Solution[RigState]]:
     observations, unknowns = _observations(seen, single, places, sigma)
     frame_rotation, frame_mm = first_frames(observations.keys, seen, mounts, places)
     board_rotation, board_mm = _board_poses(observations.cameras[0], places)

@@ -3,36 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations
 from rigkit.calibration.poses import refine_each
-from rigkit.calibration.result import Convergence
 from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.solver import COST_TOLERANCE, Linearised, minimise
+from rigkit.calibration.solver import COST_TOLERANCE, Linearised, Solution, minimise
 from rigkit.core.arrays import Mat3, Points
 from rigkit.geometry.rotation import log_so3
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class RigSolution:
-    """The state found, the normal equations there with all priors, and how the solver ended."""
-
-    state: RigState
-    normal: NormalEquations
-    convergence: Convergence
-
-
 def rig_normal(observations: RigObservations, state: RigState, sigma_px: float = 0.0) -> NormalEquations:
-    """Return the normal equations over the globals (`RigState.layout`) and the targets' poses.
+    """Return the normal equations with all priors; `sigma_px`, the standard deviation of a corner, sets residuals
+    against the priors of cameras and shape; zero for none of these."""
+    return with_rig_priors(rig_data(observations, state), observations, state, sigma_px)
 
-    `sigma_px`, the standard deviation of a corner, sets residuals against the priors of cameras and shape; zero for no
-    priors.
-    """
+
+def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
+    """Return the normal equations of the corners over the globals (`RigState.layout`) and the targets' poses."""
     layout = state.layout(observations)
     count, poses = layout.count, len(observations.keys)
     gg, g = np.zeros((count, count)), np.zeros(count)
@@ -70,8 +62,7 @@ def rig_normal(observations: RigObservations, state: RigState, sigma_px: float =
     released = None
     if observations.shape.kind == "released":
         released = layout.shape.start + observations.shape.basis.shape[-1]
-    whole = replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
-    return with_rig_priors(whole, observations, state, sigma_px)
+    return replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
 
 
 def _joined(each: Sequence[NormalEquations]) -> NormalEquations:
@@ -100,7 +91,7 @@ def with_rig_priors(
 
 def solve_rig(
     observations: RigObservations, start: RigState, sigma_px: float, tolerance: float = COST_TOLERANCE
-) -> RigSolution:
+) -> Solution[RigState]:
     """Return the state of least weighted squares from `start`, and how the solver ended.
 
     `sigma_px` as for `rig_normal`; `tolerance` is the part of the cost that a step must promise to be taken.
@@ -108,13 +99,10 @@ def solve_rig(
     layout = start.layout(observations)
 
     def linearise(state: RigState) -> Linearised:
-        normal = rig_normal(observations, state, sigma_px)
-        return Linearised(normal, normal)
+        data = rig_data(observations, state)
+        return Linearised(data, with_rig_priors(data, observations, state, sigma_px))
 
-    state, last, convergence = minimise(
-        start, linearise, lambda state, step: state.moved(step, layout), tolerance=tolerance
-    )
-    return RigSolution(state, last.normal, convergence)
+    return minimise(start, linearise, lambda state, step: state.moved(step, layout), tolerance=tolerance)
 
 
 def refine_frames(observations: RigObservations, state: RigState) -> RigState:

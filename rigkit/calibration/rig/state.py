@@ -20,7 +20,6 @@ from rigkit.calibration.shape import ShapeModel
 from rigkit.calibration.state import State
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
-from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
@@ -107,17 +106,12 @@ class RigState:
         translation = place @ self.mount_rotation[c].T + self.mount_mm[c]
         return State(self.cameras[c], rotation, translation, observations.shape, self.unknowns)
 
-    def moved(self, step: SchurStep, layout: Layout) -> RigState | None:
-        """Return the state after a step, None where the parameters make no camera."""
-        cameras = []
-        for camera, own in zip(self.cameras, layout.cameras, strict=True):
-            try:
-                cameras.append(camera.with_parameters(camera.parameters + step.globals[own]))
-            except (InputError, DegenerateError):
-                return None
+    def moved(self, step: SchurStep, layout: Layout) -> RigState:
+        """Return the state after a step; raises InputError or DegenerateError where the parameters make no camera."""
+        lenses = zip(self.cameras, layout.cameras, strict=True)
         mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
         return RigState(
-            cameras=tuple(cameras),
+            cameras=tuple(c.with_parameters(c.parameters + step.globals[own]) for c, own in lenses),
             mount_rotation=exp_so3(mounts[:, :3]) @ self.mount_rotation,
             mount_mm=self.mount_mm + mounts[:, 3:],
             frame_rotation=exp_so3(step.poses[:, :3]) @ self.frame_rotation,
