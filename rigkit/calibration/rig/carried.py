@@ -18,54 +18,72 @@ import numpy as np
 
 from rigkit.calibration.covariance import Carried
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.core.arrays import FloatArray, IntArray, Points
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
 
 def carried(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> list[Carried]:
     """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from targets, its mount where that
     is free, and (board by board, where boards have places on a target) from these."""
-    layout, frame, board = state.layout(observations), observations.frame[c], observations.cameras[c].board
+    layout, frame, lever = state.layout(observations), observations.frame[c], translation_mm - state.mount_mm[c]
     turn = state.mount_rotation[c]
-    target = np.kron(np.eye(2), turn)
     if not observations.tied:
-        free = [(layout.mounts[c], _swung(translation_mm - state.mount_mm[c]))]
-        return [Carried(np.arange(len(frame)), frame, target, *_free(free, len(frame)))]
-    out = []
+        return [carried_by_mount(turn, layout.mounts[c], frame, lever)]
+    out, board = [], observations.cameras[c].board
     for b in np.unique(board).tolist():
         views = np.flatnonzero(board == b)
         onto = turn @ state.frame_rotation[frame[views]]
         place = np.zeros((len(views), 6, 6))
         place[:, :3, :3] = place[:, 3:, 3:] = onto
-        free = [
-            (layout.mounts[c], _swung(translation_mm[views] - state.mount_mm[c])),
-            (layout.boards[b], place),
-        ]
-        by_target = _swung(onto @ state.board_mm[b]) @ target
-        out.append(Carried(views, frame[views], by_target, *_free(free, len(views))))
+        target = _swung(onto @ state.board_mm[b]) @ _turned(turn)
+        free = _free([(layout.mounts[c], _swung(lever[views])), (layout.boards[b], place)], len(views))
+        out.append(Carried(views, frame[views], target, *free))
     return out
+
+
+def carried_by_mount(rotation: Mat3, mount: slice | None, poses: IntArray, lever: Points) -> Carried:
+    """Return how V boards, targets all, follow their `poses` (V,) in the rig and the `mount` of a camera, None where
+    that is not free: it has this `rotation`, and the boards lie at `lever` (V, 3) from where it has the rig."""
+    return Carried(np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _swung(lever))], len(poses)))
 
 
 def pose_products(observations: RigObservations, state: RigState, products: Sequence[FloatArray]) -> FloatArray:
     """Return of every pose the sums of the products of its rows, (F, n + 7, n + 7), from those of every view of each
     camera (`view_products`): derivatives by the n globals but for released corners, by the pose, and the residual."""
-    layout, warps = state.layout(observations), observations.shape.basis.shape[-1]
-    n = layout.shape.start + warps
-    out = np.zeros((len(observations.keys), n + 7, n + 7))
-    for c, own in enumerate(products):
-        lens = layout.cameras[c]
-        direct = np.r_[lens.start : lens.stop, layout.shape.start : n]
+    layout = state.layout(observations)
+    n = layout.shape.start + observations.shape.basis.shape[-1]
+    each = [
+        (
+            own,
+            np.r_[lens.start : lens.stop, layout.shape.start : n],
+            carried(observations, state, c, state.of_camera(c, observations).translation_mm),
+        )
+        for c, (own, lens) in enumerate(zip(products, layout.cameras, strict=True))
+    ]
+    return summed_products(each, len(observations.keys), n)
+
+
+def summed_products(
+    each: Sequence[tuple[FloatArray, IntArray, Sequence[Carried]]], poses: int, count: int
+) -> FloatArray:
+    """Return the products of so many poses and globals, (F, G + 7, G + 7): of each camera given are those of its views
+    (V, P + 7, P + 7), where its own P unknowns stand among the globals, and how the views follow."""
+    out = np.zeros((poses, count + 7, count + 7))
+    for own, direct, parts in each:
         p = len(direct)
-        for part in carried(observations, state, c, state.of_camera(c, observations).translation_mm):
-            index = np.concatenate([direct, part.index, np.arange(n, n + 7)])
-            follow = np.zeros((len(part.views), p + 7, len(index)))
-            follow[:, :p, :p] = np.eye(p)
-            follow[:, p : p + 6, p:-7] = part.globals
-            follow[:, p : p + 6, -7:-1] = part.target
+        for part in parts:
+            follow = np.zeros((len(part.views), p + 7, count + 7))
+            follow[:, np.arange(p), direct] = 1.0
+            follow[:, p : p + 6, part.index] = part.globals
+            follow[:, p : p + 6, count : count + 6] = part.target
             follow[:, -1, -1] = 1.0
-            both = np.swapaxes(follow, -1, -2) @ own[part.views] @ follow
-            out[part.poses[:, None, None], index[:, None], index] += both
+            np.add.at(out, part.poses, np.swapaxes(follow, -1, -2) @ own[part.views] @ follow)
     return out
+
+
+def _turned(rotation: Mat3) -> FloatArray:
+    """Return how a pose (w, dt) is turned, (6, 6)."""
+    return np.kron(np.eye(2), rotation)
 
 
 def _swung(lever: Points) -> FloatArray:

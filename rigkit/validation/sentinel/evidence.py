@@ -17,6 +17,7 @@ from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.outliers import inliers, sigma_of
 from rigkit.calibration.poses import refine_poses
+from rigkit.calibration.rig.carried import carried_by_mount, summed_products
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import Camera
@@ -26,7 +27,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.information import MIN_SIGMA_PX, observations_of
 
 SAME_BOARD = 0.02
@@ -233,26 +234,16 @@ class _PosedBoards:
     def products(self, watched: Watched) -> FloatArray:
         """Return for each board in a frame the sums of the products of its rows, (G, T + 7, T + 7): derivatives by
         theta and by its pose in the rig, and the residual."""
-        layout = watched.layout
-        n = layout.count
-        out = np.zeros((len(self.frame), n + 7, n + 7))
-        for c, seen in enumerate(self.observations):
-            if seen is None:
-                continue
-            own = view_products(seen, self.state(watched, c, seen), self.weight[c])
-            p, turn = watched.cameras[c].parameters.size, watched.cam_from_rig[c].rotation
-            follow = np.zeros((len(own), p + 7, n + 7))
-            follow[:, :p, layout.cameras[c]] = np.eye(p)
-            follow[:, p : p + 3, n : n + 3] = follow[:, p + 3 : p + 6, n + 3 : n + 6] = turn
-            follow[:, -1, -1] = 1.0
-            if c > 0:
-                # A mount that turns by w swings the board's origin, R t away, with it.
-                lever = self.translation_mm[self.group[c]] @ turn.T
-                run = layout.mount(c).start
-                follow[:, p : p + 6, run : run + 6] = np.eye(6)
-                follow[:, p + 3 : p + 6, run : run + 3] = -skew(lever)
-            np.add.at(out, self.group[c], np.swapaxes(follow, -1, -2) @ own @ follow)
-        return out
+        layout, each = watched.layout, []
+        for c, (seen, pose, lens) in enumerate(
+            zip(self.observations, watched.cam_from_rig, layout.cameras, strict=True)
+        ):
+            if seen is not None:
+                own = view_products(seen, self.state(watched, c, seen), self.weight[c])
+                lever = self.translation_mm[self.group[c]] @ pose.rotation.T
+                follow = carried_by_mount(pose.rotation, layout.mounts[c], self.group[c], lever)
+                each.append((own, np.arange(lens.start, lens.stop), (follow,)))
+        return summed_products(each, len(self.frame), layout.count)
 
     def moved(self, step: FloatArray) -> _PosedBoards:
         """Return the boards after steps (G, 6) of their poses."""
