@@ -23,15 +23,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choice import HeldOut, Option
+from rigkit.calibration.covariance import motion_of_world
 from rigkit.calibration.fit import Fit, fit_other_lens
 from rigkit.calibration.observations import Observations
+from rigkit.calibration.poses import steps_between
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.state import State
 from rigkit.calibration.uncertainty import followed
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.rotation import log_so3, skew
 
 MIN_LIKELY = 0.05
 """A model that is less likely the better one adds next to nothing, however far it is off."""
@@ -118,16 +119,10 @@ def between_models(
     for one in rivals:
         step, turn = followed(here.camera, one.rival.camera, rays, sigmas)
         # As the axes of the chosen lens have it.
-        moved = np.concatenate(
-            [
-                log_so3(turn.T @ one.state.rotation @ np.swapaxes(here.rotation, -1, -2)),
-                one.state.translation_mm @ turn - here.translation_mm,
-            ],
-            axis=1,
-        )
-        shift = moved[:, 3:] + np.einsum("vij,vj->vi", skew(here.translation_mm), moved[:, :3])
-        used = chosen.kept.any(axis=1)
-        way = np.concatenate([step, moved[used, :3].mean(axis=0), shift[used].mean(axis=0)])
+        there = (turn.T @ one.state.rotation, one.state.translation_mm @ turn)
+        moved = steps_between((here.rotation, here.translation_mm), there)
+        motions = motion_of_world(here.translation_mm) @ moved[..., None]
+        way = np.concatenate([step, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
         out += one.rival.likely * np.outer(way, way)
     return out
 

@@ -30,7 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.normal_equations import pose_inverses
-from rigkit.core.arrays import FloatArray, IntArray, symmetric_pinv
+from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.kernels.linearise import chebyshev_series
 
 MIN_CLUSTERS = 2
@@ -174,9 +174,7 @@ def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> Floa
     them as before, and what is their own is multiplied by `factor`."""
     n = len(block)
     before = covariance[:n, :n]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(before), np.finfo(float).tiny))
-    inverse = symmetric_pinv(before * scale[:, None] * scale, RANK) * scale[:, None] * scale
-    follow = covariance[n:, :n] @ inverse
+    follow = covariance[n:, :n] @ scaled_pinv(before, RANK)
     out = np.empty_like(covariance)
     out[:n, :n] = block
     out[n:, :n] = follow @ block

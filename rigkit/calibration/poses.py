@@ -13,7 +13,7 @@ from rigkit.calibration.observations import Observations
 from rigkit.calibration.radial_alignment import align
 from rigkit.calibration.state import State
 from rigkit.core.arrays import FloatArray, Mat3, Points
-from rigkit.geometry.rotation import exp_so3, nearest_rotation
+from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
@@ -65,6 +65,12 @@ def refine_each(
     stop = Stop(steps=MAX_POSE_ITERATIONS, promise=tolerance)
     found, cost = minimise_each((rotation, translation_mm), around, moved, VIEW_DAMPING, stop)
     return found[0], found[1], cost
+
+
+def steps_between(before: tuple[Mat3, Points], after: tuple[Mat3, Points]) -> FloatArray:
+    """Return the steps (N, 6) that take poses `before` to those `after`, (N, 3, 3) and (N, 3) each, as solvers step:
+    R <- exp(w) R, t <- t + dt."""
+    return np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
 
 
 def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:

@@ -29,7 +29,7 @@ from rigkit.calibration.departures import Departures, information_of_lens
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, symmetric_pinv
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv
 from rigkit.geometry.rotation import exp_so3, skew
 
 CORNERS = 400
@@ -276,13 +276,10 @@ class _Alone:
     def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays) -> _Alone:
         """Return it for a `camera` whose rays are those of the calibrated one, of which these are `rays` (N, 3) to
         corners, after a `turn`."""
-        information = information_of_lens(calibration, camera, turn)
-        told = np.diag(information)
         # A lens gone astray may know nothing of a parameter, or by rounding less.
-        scale = np.where(told > 0.0, 1.0 / np.sqrt(np.where(told > 0.0, told, 1.0)), 0.0)
-        covariance = symmetric_pinv(information * scale[:, None] * scale) * scale[:, None] * scale
+        covariance = scaled_pinv(information_of_lens(calibration, camera, turn))
         sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
-        design, p = projection_design(camera, rays @ turn.T), len(scale)
+        design, p = projection_design(camera, rays @ turn.T), len(covariance)
         turned = design[:, p:]
         square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
         hides = symmetric_pinv(square) @ (turned @ np.swapaxes(design[:, :p], 1, 2)).sum(axis=0)

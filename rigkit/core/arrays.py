@@ -208,6 +208,14 @@ def symmetric_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
     return np.asarray((vectors[:, known] / values[known]) @ vectors[:, known].T)
 
 
+def scaled_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
+    """Return the same of a covariance or information (n, n) of unknowns with units of their own: its eigenvalues are
+    compared once its diagonal is one. What has none stays zero."""
+    diagonal = np.diag(matrix)
+    scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
+    return np.asarray(symmetric_pinv(matrix * scale[:, None] * scale, rcond) * scale[:, None] * scale)
+
+
 def median_of(values: FloatArray) -> float:
     """Return the median of N > 0 numbers, which are reordered. np.median takes four times as long, to look for NaN."""
     low, high = (values.size - 1) // 2, values.size // 2

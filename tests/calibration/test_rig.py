@@ -10,20 +10,25 @@ from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
 
 from rigkit.calibration.camera_prior import camera_prior
+from rigkit.calibration.clustered import Clustered
+from rigkit.calibration.covariance import GlobalCovariance
 from rigkit.calibration.normal_equations import SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
 from rigkit.calibration.shape import shape_model
-from rigkit.calibration.state import evaluate
+from rigkit.calibration.state import State, evaluate
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 
+SHAPE_WEIGHT = 0.3
+"""px of a corner, against which the priors of boards' shapes are weighed."""
 SIGMAS = 4.0
 """A mount further than this from the truth, in its own standard deviations, is wrong: 1 in 16000 by chance."""
 
@@ -54,10 +59,8 @@ def test_joint_solve_is_no_worse_than_single_ones(rng: np.random.Generator) -> N
         assert camera.rms_px < 1.1 * alone.rms_px
 
 
-@pytest.mark.parametrize("kind", ["flat", "warp", "released"])
-@pytest.mark.parametrize("tied", [False, True])
-def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.Generator) -> None:
-    """Central differences of the cost and of the residuals, by every kind of unknown."""
+def _small_rig(kind: str, tied: bool, rng: np.random.Generator) -> tuple[RigObservations, RigState]:
+    """Two cameras before two boards of a shape, three frames: on one target (tied), or each with poses of its own."""
     boards = [Board("a", 4, 3, 40.0, 40.0), Board("b", 3, 3, 50.0, 50.0)]
     names = ["reg", "wide"]
     views = [
@@ -92,6 +95,15 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
         board_mm=np.array([np.zeros(3), 80.0 * rng.normal(size=3) if tied else np.zeros(3)]),
         unknowns=0.3 * rng.normal(size=shape.count),
     )
+    return observations, state
+
+
+@pytest.mark.parametrize("kind", ["flat", "warp", "released"])
+@pytest.mark.parametrize("tied", [False, True])
+def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.Generator) -> None:
+    """Central differences of the cost and of the residuals, by every kind of unknown."""
+    observations, state = _small_rig(kind, tied, rng)
+    shape, poses = observations.shape, len(observations.keys)
     layout = state.layout(observations)
     assert layout.count == 17 + 6 + (6 if tied else 0) + shape.count
     normal = rig_normal(observations, state)
@@ -127,6 +139,49 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
     assert with_priors.cost - normal.cost == pytest.approx(0.09 * expected, rel=1e-6)
     gradient = (jacobian @ residuals(np.zeros(h.size))) * scale
     assert np.abs(gradient - np.concatenate([normal.g, normal.p.ravel()]) * scale).max() < 1e-5 * np.abs(gradient).max()
+
+
+@pytest.mark.parametrize("kind", ["flat", "warp", "released"])
+@pytest.mark.parametrize("tied", [False, True])
+def test_covariance_of_lenses_and_of_the_boards_mean_motion(kind: str, tied: bool, rng: np.random.Generator) -> None:
+    """Against the inverse of all equations at once, carried to a camera's boards by central differences."""
+    observations, state = _small_rig(kind, tied, rng)
+    layout, normal = state.layout(observations), rig_normal(observations, state, SHAPE_WEIGHT)
+    count, poses = layout.count, len(observations.keys)
+    whole = np.zeros((count + 6 * poses, count + 6 * poses))
+    whole[:count, :count] = normal.gg
+    whole[:count, count:] = np.moveaxis(normal.gp, 0, 1).reshape(count, -1)
+    whole[count:, :count] = whole[:count, count:].T
+    for f in range(poses):
+        own = slice(count + 6 * f, count + 6 * f + 6)
+        whole[own, own] = normal.pp[f]
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    inverse = np.linalg.inv(whole * scale[:, None] * scale) * scale[:, None] * scale
+    n = layout.shape.start + observations.shape.basis.shape[-1]
+    known = GlobalCovariance(normal, 0.5, Clustered(0.25 * normal.covariance[0][:n, :n], 1.0, float("inf")))
+    root = rng.normal(size=(count, 3)) * scale[:count, None]
+    for c, lens_of in enumerate(layout.cameras):
+        before = state.of_camera(c, observations)
+
+        def shown(x: np.ndarray, c: int = c, before: State = before) -> np.ndarray:
+            moved = state.moved(SchurStep(x[:count], x[count:].reshape(-1, 6), 0.0), layout)
+            now = moved.of_camera(c, observations)
+            turn = log_so3(now.rotation @ np.swapaxes(before.rotation, 1, 2))
+            shift = now.translation_mm - before.translation_mm + np.cross(before.translation_mm, turn)
+            return np.concatenate([moved.cameras[c].parameters, turn.mean(axis=0), shift.mean(axis=0)])
+
+        h = 1e-4 * scale
+        design = np.array([(shown(s * e) - shown(-s * e)) / (2 * s) for s, e in zip(h, np.eye(h.size), strict=True)]).T
+        # Poses follow what is not sure of the globals beside.
+        through = design[:, :count] - design[:, count:] @ normal.covariance[1].reshape(-1, count)
+        parts = carried(observations, state, c, before.translation_mm)
+        for more, expected in (
+            (None, 0.25 * design @ inverse @ design.T),
+            (root @ root.T, 0.25 * design @ inverse @ design.T + through @ root @ root.T @ through.T),
+        ):
+            found = known.of_camera(lens_of, parts, before.translation_mm, more)
+            size = np.sqrt(np.diag(expected))
+            assert (np.abs(found - expected) < 1e-5 * size[:, None] * size).all()
 
 
 def test_baseline_sigma_is_that_of_moved_mounts(rng: np.random.Generator) -> None:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.between_models import same_model, spread_rays
+from rigkit.calibration.poses import steps_between
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
@@ -20,7 +21,6 @@ from rigkit.calibration.solver import FROM_OPTIMUM
 from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.rotation import log_so3
 
 
 def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: FloatArray) -> FloatArray:
@@ -90,7 +90,7 @@ def _way(here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArr
         (layout.mounts, (here.mount_rotation, here.mount_mm), (back.mount_rotation, back.mount_mm)),
         (layout.boards, (here.board_rotation, here.board_mm), (back.board_rotation, back.board_mm)),
     ):
-        moved = np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
+        moved = steps_between(before, after)
         for k, run in enumerate(runs):
             if run is not None:
                 way[run] = moved[k]

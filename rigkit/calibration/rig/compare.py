@@ -24,7 +24,7 @@ from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, scaled_pinv
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
@@ -186,8 +186,6 @@ def _chance(off: FloatArray, covariance: FloatArray, errors: FloatArray) -> floa
     """Return the probability that errors like those drawn, (n, N), are as large as `off` (n,), by the covariance."""
     if not len(off):
         return 1.0
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    inverse = np.linalg.pinv(covariance * scale[:, None] * scale, hermitian=True)
-    size, drawn = off * scale, errors * scale[:, None]
-    null = np.einsum("in,in->n", drawn, inverse @ drawn)
-    return float((1 + np.count_nonzero(null >= size @ inverse @ size)) / (len(null) + 1))
+    inverse = scaled_pinv(covariance)
+    null = np.einsum("in,in->n", errors, inverse @ errors)
+    return float((1 + np.count_nonzero(null >= off @ inverse @ off)) / (len(null) + 1))

@@ -33,7 +33,7 @@ from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
 from rigkit.calibration.solver import Solution
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.progress import Progress
@@ -236,9 +236,7 @@ def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[t
     for alone in single:
         # Of independent corners, in px^2 of the joint solution.
         unit = alone.covariance / (sigma * alone.overdispersion) ** 2
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(unit), np.finfo(float).tiny))
-        inverse = np.linalg.pinv(unit * scale[:, None] * scale, hermitian=True)
-        out.append((alone.camera.parameters, weight * inverse * scale[:, None] * scale))
+        out.append((alone.camera.parameters, weight * scaled_pinv(unit)))
     return tuple(out)
 
 
