@@ -4,11 +4,16 @@
 - a start without any guess: `radial_alignment`, `initialise`, `poses`
 - one model by least squares: `state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`,
   `solver`, `outliers`, `fit`
-- which model and board shape: `folds`, `models_tried`, `choice`, `lens_choice`, `one_model`
-- how sure that is: `repeats`, `clustered`, `uncertainty`, `between_models`, `departures`
+- which model and board shape: `folds`, `heldout`, `models_tried`, `choice`, `lens_choice`, `one_model`
+- how sure that is: `repeats`, `clustered`, `covariance`, `uncertainty`, `between_models`, `departures`, `displaced`
 - what to think of it: `captured`, `coverage`, `neighbours`, `moved`, `changing`, `mixed`, `verdicts`
 - what comes out: `assemble`, `result`
 
-`compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known. `rig` does
-the same for several cameras, under the same names of files, on top of what is here.
+`compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.
+
+`rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is:
+steps and priors in `normal_equations` and `solver`, what repeats in `clustered`, covariances and the boards' mean
+motion in `covariance`, steps between poses in `poses`, the squares of what was left out in `state`, how a lens follows
+another and what it may do beyond its model in `uncertainty` and `displaced`. A file of `rig` that is called as one here
+has only what a rig does there besides, or instead.
 """

@@ -92,7 +92,7 @@ class GlobalCovariance:
         joint[:n, n:] = joint[n:, :n].T
         joint[n:, n:] = with_globals @ mean.T + spread
         chosen = np.r_[lens.start : lens.stop, n : n + 6]
-        out = self._of(0.5 * (joint + joint.T))[np.ix_(chosen, chosen)]
+        out = np.asarray(self._of(0.5 * (joint + joint.T))[np.ix_(chosen, chosen)])
         if more is None:
             return out
         design = np.concatenate([np.eye(len(unit))[lens], mean])

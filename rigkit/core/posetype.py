@@ -24,3 +24,8 @@ class PoseType(StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> None:
         raise InputError(f"pose type '{value}' is unknown; known: {', '.join(cls)}")
+
+
+def axis_of(kind: str) -> int | None:
+    """Return along which camera axis a pose type without rotation moves, 0 for x and 2 for z; None for any other."""
+    return {"standard": 0, "forward": 2}.get(kind)

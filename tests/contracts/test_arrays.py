@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rigkit.core.arrays import known_median, median_of, quantiles_of, symmetric_pinv
+from rigkit.core.arrays import known_median, median_of, quantiles_of, scaled_pinv, symmetric_pinv
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 100])
@@ -28,3 +28,14 @@ def test_pseudo_inverse_of_a_symmetric_matrix(rank: int, rng: np.random.Generato
     root = rng.normal(size=(5, rank))
     matrix = root @ root.T
     assert symmetric_pinv(matrix, 1e-12) == pytest.approx(np.linalg.pinv(matrix, 1e-12, hermitian=True), rel=1e-9)
+
+
+def test_pseudo_inverse_of_unknowns_with_units_of_their_own(rng: np.random.Generator) -> None:
+    """Units change nothing but units, and what is not known at all stays so."""
+    root, unit = rng.normal(size=(5, 7)), np.array([1e-9, 1.0, 1e6, 1e-3, 0.0])
+    matrix = root @ root.T * unit[:, None] * unit
+    expected = np.zeros((5, 5))
+    expected[:4, :4] = np.linalg.inv((root @ root.T)[:4, :4]) / unit[:4, None] / unit[:4]
+    found = scaled_pinv(matrix)
+    assert found[:4, :4] == pytest.approx(expected[:4, :4], rel=1e-9)
+    assert (found[4] == 0.0).all() and (found[:, 4] == 0.0).all()

@@ -1,1 +1,13 @@
-"""Several cameras, or boards, on one mount: calibrated together."""
+"""Several cameras, or boards, on one mount: calibrated together. `calibrate.py` runs it all, in this order.
+
+- each camera alone: `rigkit.calibration`
+- views in: `observations`; boards on one mount: `board_places`, `board_ties`, `board_sizes`
+- a start: `frames`
+- one least squares: `layout`, `state`, `carried` (how views follow from targets, mounts and places), `shape`, `known`,
+  `solver`; what does not fit in it left out: `disagree`, `joint`
+- how sure that is: `heldout`, `flatness`, `between_models`, `displaced`, `uncertainty`
+- what to think of it: `verdicts`
+- what comes out: `assemble`, `result`, `board_rig`
+
+`compare` tells two rigs apart.
+"""

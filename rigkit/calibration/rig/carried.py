@@ -83,7 +83,9 @@ def summed_products(
 
 def _turned(rotation: Mat3) -> FloatArray:
     """Return how a pose (w, dt) is turned, (6, 6)."""
-    return np.kron(np.eye(2), rotation)
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = rotation
+    return out
 
 
 def _swung(lever: Points) -> FloatArray:

@@ -16,6 +16,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
+from rigkit.detection.stencil import STENCIL, by_differences
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.geometry.board_pose import board_poses, ray_residuals
 from rigkit.geometry.rigid3 import Rigid3
@@ -156,21 +157,12 @@ class Guide:
 
     def _projected(self, camera: Camera, cam_from_board: Rigid3, cells: BoolArray) -> tuple[LocalFit, BoolArray]:
         row, column = np.nonzero(cells)
-        h = HALF_STEP
-        offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
-        grid = np.stack([column, row], axis=-1) + offsets[:, None]
+        grid = np.stack([column, row], axis=-1) + HALF_STEP * STENCIL[:, None]
         side = np.array([self.board.square_x_mm, self.board.square_y_mm])
         points = np.concatenate([grid * side, np.zeros((*grid.shape[:2], 1))], axis=2)
         pixels, valid = camera.project(cam_from_board.apply(points))
-        here, right, left, below, above = pixels
         ones = np.ones(len(row))
-        return LocalFit(
-            here,
-            np.stack([right - left, below - above], axis=1) / (2.0 * h),
-            np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2,
-            ones,
-            ones,
-        ), np.asarray(valid.all(axis=0))
+        return LocalFit(*by_differences(pixels, HALF_STEP), ones, ones), np.asarray(valid.all(axis=0))
 
 
 def _pose(board: Board, camera: Camera, state: BoardState, start: Rigid3 | None) -> Rigid3 | None:

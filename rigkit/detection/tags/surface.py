@@ -13,6 +13,7 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
+from rigkit.detection.stencil import STENCIL, by_differences
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.surface import Polynomials, TagSurface, perspective, projected
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
@@ -96,7 +97,7 @@ def wide_perspective(
         seen = partial(_bent, matrix, bend, centre)
         off = float(np.mean((seen(places) - pixels) ** 2))
         if best is None or off < best[0]:
-            best = off, partial(_by_differences, seen)
+            best = off, partial(_surface_of, seen)
     return None if best is None else best[1]
 
 
@@ -108,15 +109,10 @@ def _bent(homography: FloatArray, bend: float, centre: FloatArray, places: Float
     return np.asarray(centre + shrunk[:, None] * straight)
 
 
-def _by_differences(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
+def _surface_of(seen: Callable[[FloatArray], FloatArray], places: FloatArray) -> TagSurface:
     """Return a map and its derivatives at places (M, 2) by differences."""
-    h = DIFFERENCE
-    here, right, left, below, above = (
-        seen(places + h * np.array(at)) for at in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
-    )
-    sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
-    bends = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
-    return TagSurface.made_of(here, sides, bends)
+    pixels = np.array([seen(places + DIFFERENCE * at) for at in STENCIL])
+    return TagSurface.made_of(*by_differences(pixels, DIFFERENCE))
 
 
 def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
@@ -127,13 +123,7 @@ def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray
 
 def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:
     """Return the map at `wanted` (M, 2), in units of `unit_mm` (2,), as a camera sees it; NaN where it does not."""
-    h = CHORD
-    offsets = np.array([[0.0, 0.0], [h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
-    places = (wanted + offsets[:, None]) * unit_mm
+    places = (wanted + CHORD * STENCIL[:, None]) * unit_mm
     points = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=2)
     pixels, valid = camera.project(cam_from_board.apply(points))
-    here, right, left, below, above = np.where(valid[..., None].all(axis=0), pixels, np.nan)
-    sides = np.stack([right - left, below - above], axis=1) / (2.0 * h)
-    return TagSurface.made_of(
-        here, sides, np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / h**2
-    )
+    return TagSurface.made_of(*by_differences(np.where(valid[..., None].all(axis=0), pixels, np.nan), CHORD))

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
-from rigkit.core.posetype import PoseType
+from rigkit.core.posetype import PoseType, axis_of
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
@@ -190,9 +190,8 @@ def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray
     if kind == PoseType.PLANAR:
         angle = np.arctan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2])
         R, t = exp_so3(np.array([0.0, angle, 0.0])), np.array([t[0], 0.0, t[2]])
-    elif kind in (PoseType.STANDARD, PoseType.FORWARD):
-        keep = 0 if kind == PoseType.STANDARD else 2
-        R, t = np.eye(3), np.where(np.arange(3) == keep, t, 0.0)
+    elif (along := axis_of(kind)) is not None:
+        R, t = np.eye(3), np.where(np.arange(3) == along, t, 0.0)
     if not np.linalg.norm(t) > 1e-6:
         raise DegenerateError(f"the start of the refinement has no translation that pose type '{kind}' allows")
     return R, unit(t)

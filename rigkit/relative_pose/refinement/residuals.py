@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.matches import Matches
-from rigkit.core.posetype import PoseType
+from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rotation import cross, log_so3, skew
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.geometry.triangulation import correct_rays_px
@@ -125,8 +125,8 @@ def level_terms(
         by_rotation = np.concatenate([-skew(vertical)[[0, 2]], np.zeros((1, 3))])
         by_direction = np.concatenate([np.zeros((2, 2)), basis[:, 1][None]])
         return values, np.concatenate([by_rotation, by_direction], axis=1)
-    if kind in (PoseType.STANDARD, PoseType.FORWARD):
-        across = [1, 2] if kind == PoseType.STANDARD else [0, 1]
+    if (along := axis_of(kind)) is not None:
+        across = np.delete(np.arange(3), along)
         jacobian = np.zeros((5, 5))
         # The rotation is small where this prior has a say: d log(exp(w) R) = dw.
         jacobian[:3, :3] = np.eye(3)

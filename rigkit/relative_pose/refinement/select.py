@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.matches import Matches
-from rigkit.core.posetype import PoseType
+from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import rotation_angle, unit
 from rigkit.relative_pose.refinement.noise_level import POSE_FREEDOM, variance_factor
@@ -203,7 +203,6 @@ def type_deviation_rad(pose: Rigid3, kind: PoseType) -> float:
     if kind == PoseType.PLANAR:
         tilt = np.arctan2(np.hypot(R[0, 1], R[2, 1]), R[1, 1])
         return float(max(tilt, np.arctan2(abs(t[1]), np.hypot(t[0], t[2]))))
-    if kind in (PoseType.STANDARD, PoseType.FORWARD):
-        along, across = (0, [1, 2]) if kind == PoseType.STANDARD else (2, [0, 1])
-        return float(max(rotation_angle(R), np.arctan2(np.linalg.norm(t[across]), abs(t[along]))))
+    if (along := axis_of(kind)) is not None:
+        return float(max(rotation_angle(R), np.arctan2(np.linalg.norm(np.delete(t, along)), abs(t[along]))))
     return 0.0

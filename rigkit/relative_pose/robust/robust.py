@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
-from rigkit.core.posetype import PoseType
+from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.kernels.minimal import five_rows, six_rows
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
@@ -142,7 +142,7 @@ def _finalists(
 
     Raises DegenerateError where there are none.
     """
-    if kind in (PoseType.STANDARD, PoseType.FORWARD):
+    if axis_of(kind) is not None:
         return fundamental_for(kind).solve(matches, "points").E21[None], 0
     size = _sample_size(matches, kind, sample)
     finalists, trials = _ConsensusSearch(matches, rows, kind, sample, size, max_noise).run(rng)
