@@ -184,6 +184,20 @@ def test_covariance_of_lenses_and_of_the_boards_mean_motion(kind: str, tied: boo
             assert (np.abs(found - expected) < 1e-5 * size[:, None] * size).all()
 
 
+def test_views_of_which_no_corner_counts_have_no_part_in_the_mean_motion(rng: np.random.Generator) -> None:
+    observations, state = _small_rig("flat", False, rng)
+    known = np.arange(len(observations.keys)) > 0
+    weights = [w * known[f][:, None] for w, f in zip(observations.weights, observations.frame, strict=True)]
+    found = []
+    for seen in (replace(observations, weights=tuple(weights)), observations.subset(known)):
+        normal, lens_of = rig_normal(seen, state, SHAPE_WEIGHT), state.layout(seen).cameras[1]
+        translation = state.of_camera(1, seen).translation_mm
+        sure = GlobalCovariance(normal, 0.5, Clustered(0.25 * normal.covariance[0], 1.0, float("inf")))
+        found.append(sure.of_camera(lens_of, carried(seen, state, 1, translation), translation))
+    scale = np.sqrt(np.diag(found[1]))
+    assert (np.abs(found[0] - found[1]) < 1e-9 * scale[:, None] * scale).all()
+
+
 def test_baseline_sigma_is_that_of_moved_mounts(rng: np.random.Generator) -> None:
     """The variance of a baseline against mounts drawn from the covariance."""
     rig = calibrate_rig(rig_views(rng, 20), sizes(), model=MODELS)

@@ -11,12 +11,14 @@ from scipy.optimize import least_squares
 
 from rigkit.calibration.initialise import initialise
 from rigkit.calibration.linearise import normal_equations
+from rigkit.calibration.normal_equations import SchurStep
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.shape import shape_model
-from rigkit.calibration.solver import solve, with_priors
+from rigkit.calibration.solver import Linearised, minimise, solve, with_priors
 from rigkit.calibration.state import State, evaluate
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.scaramuzza import Scaramuzza
+from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3
 
 GRADIENT_REL = 1e-5
@@ -188,3 +190,22 @@ def test_polynomials_of_high_degree_are_no_harder(degree: int, rng: np.random.Ge
     design /= np.linalg.norm(design, axis=0)
     left = residual - design @ np.linalg.lstsq(design, residual, rcond=1e-15)[0]
     assert residual @ residual - left @ left < COST_REL * (residual @ residual)
+
+
+def test_a_step_that_makes_no_camera_is_refused(rng: np.random.Generator) -> None:
+    observations, state = scene("reg", rng, 6)
+    start, refused = disturbed(state, rng, 1e-3), list[SchurStep]()
+
+    def linearise(state: State) -> Linearised:
+        normal = normal_equations(observations, state)
+        return Linearised(normal, normal)
+
+    def moved(state: State, step: SchurStep) -> State:
+        if not refused:
+            refused.append(step)
+            raise InputError("no camera")
+        return state.moved(step)
+
+    found = minimise(start, linearise, moved)
+    assert found.convergence.converged and len(refused) == 1
+    assert found.normal.cost == pytest.approx(minimise(start, linearise, State.moved).normal.cost, rel=1e-9)
