@@ -99,5 +99,6 @@ def _swung(lever: Points) -> FloatArray:
 def _free(runs: Sequence[tuple[slice | None, FloatArray]], views: int) -> tuple[IntArray, FloatArray]:
     """Return the globals that are free, (K,), and how so many views follow them, (N, 6, K)."""
     found = [(np.arange(run.start, run.stop), how) for run, how in runs if run is not None]
-    index = np.concatenate([np.zeros(0, dtype=np.int64), *(run for run, _ in found)])
-    return index, np.concatenate([np.zeros((views, 6, 0)), *(how for _, how in found)], axis=-1)
+    if not found:
+        return np.zeros(0, dtype=np.int64), np.zeros((views, 6, 0))
+    return np.concatenate([run for run, _ in found]), np.concatenate([how for _, how in found], axis=-1)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
+from itertools import accumulate, pairwise, starmap
 
 from rigkit.cameras.base import Camera
 
@@ -23,8 +22,8 @@ class Layout:
     @classmethod
     def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int) -> Layout:
         """Lay out cameras of so many parameters each, boards that have a place to find or not, and the shape."""
-        ends = np.cumsum([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape]).tolist()
-        runs = iter([slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)])
+        ends = accumulate([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape], initial=0)
+        runs = starmap(slice, pairwise(ends))
         cameras = tuple(next(runs) for _ in sizes)
         mounts = (None, *(next(runs) for _ in sizes[1:]))
         boards = tuple(next(runs) if place else None for place in places)

@@ -37,7 +37,9 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
         each.append(n)
         size = alone.camera.parameters.size
         # Where the camera's own unknowns stand in the rig, and by themselves.
-        parts = [(layout.cameras[c], slice(0, size)), (layout.shape, slice(size, None))]
+        parts = [(layout.cameras[c], slice(0, size))]
+        if observations.shape.count:
+            parts.append((layout.shape, slice(size, None)))
         for there, here in parts:
             g[there] += n.g[here]
             for also, too in parts:
@@ -49,14 +51,16 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
             pp[f] += by_target @ own_pp @ part.target
             p[f] += (by_target @ own_p)[..., 0]
             costs[f] += n.costs[views]
+            for there, here in parts:
+                gp[f, there] += n.gp[views, here] @ part.target
+            if not index.size:
+                continue
             moved = by_globals @ own_pp
             gp[f[:, None], index] += moved @ part.target
             gg[index[:, None], index] += (moved @ part.globals).sum(axis=0)
             g[index] += (by_globals @ own_p).sum(axis=0)[:, 0]
             for there, here in parts:
-                own_gp = n.gp[views, here]
-                gp[f, there] += own_gp @ part.target
-                both = (own_gp @ part.globals).sum(axis=0)
+                both = (n.gp[views, here] @ part.globals).sum(axis=0)
                 gg[there, index] += both
                 gg[index, there] += both.T
     released = None
