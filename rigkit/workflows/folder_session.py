@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +22,11 @@ from rigkit.workflows.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""
-NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<number>\d+)", re.IGNORECASE)
-NAMED_LAST = re.compile(r"\d+(?P<gap>[_-]?)(?P<side>left|right)", re.IGNORECASE)
+NAMED_FIRST = re.compile(rf"(?P<side>{SIDE})(?P<gap>[_-]?)(?P<rest>\d+|(?<=[_-]).*\d)", re.IGNORECASE)
+NAMED_LAST = re.compile(r"(?P<rest>.*\d)(?P<gap>[_-]?)(?P<side>left|right)", re.IGNORECASE)
+MIN_IN_COMMON = 0.5
+"""Of the names of several cameras' images, part that another camera has but for the side: "left_tilted_1" and
+"right_far_1" say where a board was held before one camera."""
 SIDE_FOLDER = re.compile(rf"(.*[ _-])?({SIDE})", re.IGNORECASE)
 
 
@@ -193,7 +197,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     """Return the images of every camera as (folder, pattern), by its name; of one camera by "".
 
     Several folders are as many cameras. One folder holds several where all its images are called left01, right01 (or
-    cam0_01, 01_left), or where it has no images but folders left and right (or cam0, cam1).
+    cam0_01, 01_left, left_pose_1), or where it has no images but folders left and right (or cam0, cam1).
 
     Raises InputError for a folder without images, or folders of one name.
     """
@@ -234,16 +238,17 @@ def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
 def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
     """Return the cameras that the images' names tell: more than one only where every image has a side."""
     sides: dict[str, dict[str, None]] = {}
-    for image in images:
-        first, last = NAMED_FIRST.fullmatch(image.stem), NAMED_LAST.fullmatch(image.stem)
-        if first is not None:
-            side, pattern = first["side"], f"{first['side']}{first['gap']}[0-9]*{image.suffix}"
-        elif last is not None:
-            side, pattern = last["side"], f"*[0-9]{last['gap']}{last['side']}{image.suffix}"
-        else:
-            sides = {}
-            break
-        sides.setdefault(side.lower(), {})[pattern] = None
+    found = [NAMED_FIRST.fullmatch(image.stem) or NAMED_LAST.fullmatch(image.stem) for image in images]
+    named = [name for name in found if name is not None]
+    rests = Counter(name["rest"] for name in named)
+    numbered = all(rest.isdigit() for rest in rests)
+    shared = sum(count for count in rests.values() if count > 1)
+    if len(named) == len(images) and (numbered or shared >= MIN_IN_COMMON * len(images)):
+        for image, name in zip(images, named, strict=True):
+            side, gap = name["side"], name["gap"]
+            before = f"{side}{gap}{'[0-9]*' if numbered else '*[0-9]'}"
+            pattern = before if image.stem.startswith(side) else f"*[0-9]{gap}{side}"
+            sides.setdefault(side.lower(), {})[pattern + image.suffix] = None
     if len(sides) < 2:
         return {"": [(folder, f"*{suffix}") for suffix in _suffixes(images)]}
     return {side: [(folder, pattern) for pattern in sides[side]] for side in sorted(sides, key=_natural)}

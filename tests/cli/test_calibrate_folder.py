@@ -149,6 +149,13 @@ def test_pictures_of_two_cameras_are_a_rig(pictures: Path, tmp_path: Path, layou
         (["left01.jpg", "right01.jpg"], {"left": ["left[0-9]*.jpg"], "right": ["right[0-9]*.jpg"]}),
         (["01_left.png", "01_right.png"], {"left": ["*[0-9]_left.png"], "right": ["*[0-9]_right.png"]}),
         (["cam2_1.png", "cam10_1.png"], {"cam2": ["cam2_[0-9]*.png"], "cam10": ["cam10_[0-9]*.png"]}),
+        (
+            ["left_p0_1.png", "right_p0_1.png", "left_p0_2.png"],
+            {"left": ["left_*[0-9].png"], "right": ["right_*[0-9].png"]},
+        ),
+        (["a_1_left.png", "a_1_right.png"], {"left": ["*[0-9]_left.png"], "right": ["*[0-9]_right.png"]}),
+        # Where a board was held before one camera.
+        (["left_far_1.png", "left_near_2.png", "right_tilted_3.png"], {"": ["*.png"]}),
         # One that belongs to neither side, or one side alone: one camera.
         (["left01.jpg", "right01.jpg", "upright.jpg"], {"": ["*.jpg"]}),
         (["left01.jpg", "left02.JPG"], {"": ["*.JPG", "*.jpg"]}),
