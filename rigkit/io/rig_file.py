@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.displaced import LensModes, with_modes
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -68,8 +70,27 @@ class SavedRig:
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:
         """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
         these, camera by camera, and of the mounts; None where the file does not say it."""
+        return self._with_departures(self.covariance)
+
+    @property
+    def quoted(self) -> UncertainRig | None:
+        """The rig as sure as it is quoted to be: two standard deviations hold 95 % of errors; None where the file does
+        not say it."""
+        if self.covariance is None:
+            return None
+        wider = widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
+        cameras, covariance = self._with_departures(wider**2 * self.covariance)
+        assert covariance is not None
+        return UncertainRig(
+            cameras=cameras,
+            cam_from_rig=tuple(pose for _, pose in self.cameras.values()),
+            covariance=covariance,
+            scale_sigma=self.scale_sigma,
+        )
+
+    def _with_departures(self, covariance: FloatArray | None) -> tuple[tuple[Camera, ...], FloatArray | None]:
         cameras = tuple(camera for camera, _ in self.cameras.values())
-        return (cameras, None) if self.covariance is None else with_modes(cameras, self.covariance, self.departures)
+        return (cameras, None) if covariance is None else with_modes(cameras, covariance, self.departures)
 
 
 def rig_text(rig: RigCalibration, made: Made | None = None) -> str:

@@ -17,15 +17,14 @@ import numpy as np
 from rigkit.affine.affinities import EpipolarNormals
 from rigkit.affine.normal import normals_from_affines
 from rigkit.affine.registry import affines_from_directions, needs_epipolar
-from rigkit.cameras.base import Camera
-from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import BoolArray, FloatArray, Normals, RayJacobians, Rays
 from rigkit.core.errors import InputError
 from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
+from rigkit.reconstruction.moved_cameras import moved_pairs, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -67,7 +66,7 @@ class CalibrationShifts:
 
 def calibration_shifts(
     reconstruction: Reconstruction,
-    known1: UncertainCamera,
+    known1: UncertainCamera | UncertainPair,
     known2: UncertainCamera | None = None,
     *,
     pose_is_known: bool = False,
@@ -77,26 +76,29 @@ def calibration_shifts(
     Parameters
     ----------
     reconstruction : of one pair, with boards or of any scene.
-    known1 : camera 1 as it is known.
+    known1 : camera 1 as it is known, or both of a rig with their pose.
     known2 : camera 2, or None where both images are of one camera: then both move together.
-    pose_is_known : the pose was measured and stays as it is.
+    pose_is_known : it is not estimated again: a rig's moves with its cameras, one that was measured stays as it is.
     """
     r = reconstruction
-    cameras = [(r.camera1, r.camera2), *moved_cameras(r.camera1, r.camera2, known1, known2, one=known2 is None)]
+    there = PosedPair(r.camera1, r.camera2, r.cam2_from_cam1)
+    calibrations = known1 if isinstance(known1, UncertainPair) else (known1, known2)
+    moves = [there, *moved_pairs(there, calibrations)]
     # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
-    seen = seen_by_all(cameras, r.pixels1, r.pixels2)
-    again = [_again(r, *both, seen, pose_is_known) for both in cameras]
+    seen = seen_by_all([(move.camera1, move.camera2) for move in moves], r.pixels1, r.pixels2)
+    again = [_again(r, move, seen, pose_is_known) for move in moves]
     base, *moved = (estimated for estimated, _ in again)
     return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
 
 
 def _again(
-    r: Reconstruction, camera1: Camera, camera2: Camera, seen: BoolArray, pose_is_known: bool
+    r: Reconstruction, there: PosedPair, seen: BoolArray, pose_is_known: bool
 ) -> tuple[Reconstruction, BoolArray]:
     """Estimate pose, scale and points again from the corners `seen`, and say which points (N,) could be.
 
     The other points, and all normals, stay. Without boards the baseline keeps its length.
     """
+    camera1, camera2, given = there
     known = r.matches.select(seen)
     matches = Matches.from_cameras(
         camera1,
@@ -108,12 +110,12 @@ def _again(
         board_index=known.board_index,
         grid=known.grid,
     )
-    pose = Rigid3(r.cam2_from_cam1.rotation, r.cam2_from_cam1.translation_mm / r.baseline_mm)
+    scale = float(np.linalg.norm(given.translation_mm))
+    pose = Rigid3(given.rotation, given.translation_mm / scale)
     if not pose_is_known:
         frames = None if r.geometry is None else r.geometry.decision.level_frames
         pose = refine_pose(matches, pose, r.pose_type, r.level_sigma_rad, level_frames=frames).cam2_from_cam1
     points, covariance, valid = triangulate_matches(matches, pose)
-    scale = r.baseline_mm
     if r.boards:
         scale, _ = metric_scale(points, matches.board_index, matches.grid, r.boards, covariance)
     found = np.zeros(len(seen), dtype=bool)

@@ -6,12 +6,16 @@ The axes are independent: the squares of what they change in a quantity add up t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import BoolArray, Pixels
+
+Calibrations: TypeAlias = tuple[UncertainCamera, UncertainCamera | None] | UncertainPair
+"""Both cameras as they are known; None: the second is the first. Of a rig the pose between them, too."""
 
 
 def moved_cameras(
@@ -25,6 +29,15 @@ def moved_cameras(
         return []
     first = [(moved, moved if one else camera2) for moved in known1.moved()]
     return first if one or known2 is None else first + [(camera1, moved) for moved in known2.moved()]
+
+
+def moved_pairs(pair: PosedPair, calibrations: Calibrations) -> list[PosedPair]:
+    """Return both cameras and the pose between them for each axis of what their calibrations leave open: that of a rig
+    moves with its cameras, one that was measured by other means stays."""
+    if isinstance(calibrations, UncertainPair):
+        return calibrations.moved()
+    moved = moved_cameras(pair.camera1, pair.camera2, *calibrations, one=calibrations[1] is None)
+    return [PosedPair(*cameras, pair.cam2_from_cam1) for cameras in moved]
 
 
 def seen_by_all(cameras: Sequence[tuple[Camera, Camera]], pixels1: Pixels, pixels2: Pixels) -> BoolArray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rigkit.cameras.uncertain import PosedPair
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.matches import Matches
@@ -15,6 +16,7 @@ from rigkit.geometry.rotation import rotation_angle
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL, MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.geometry import decide_pose_type
+from rigkit.reconstruction.moved_cameras import seen_by_all
 from rigkit.relative_pose.refinement.marginal import QUANTILE, marginal_quality
 from rigkit.relative_pose.refinement.pose_problem import cauchy_weights
 from rigkit.relative_pose.refinement.refine import RefinedPose, refine_pose
@@ -54,16 +56,35 @@ class ScenePose:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KnownPose:
-    """A measured pose, mm, and its covariance (6, 6) of (left rotation perturbation rad, translation mm): exact where
-    none is given."""
+    """A measured pose, mm.
+
+    Attributes
+    ----------
+    cam2_from_cam1 : it is used as it is.
+    covariance : (6, 6) of (left rotation perturbation rad, translation mm), exact where none is given.
+    moved : the cameras and the pose moved by one standard deviation along each axis of what is not known of them:
+        matches may be as far from their epipolar lines.
+    """
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    moved: tuple[PosedPair, ...] = ()
 
     @property
     def baseline_mm(self) -> float:
         """Length of the translation."""
         return float(np.linalg.norm(self.cam2_from_cam1.translation_mm))
+
+    def open_px(self, matches: Matches) -> FloatArray:
+        """Return how far from their epipolar lines (N,) what is not known puts exact matches, px: one standard
+        deviation."""
+        here = sampson_of_matches(essential_from_pose(self.cam2_from_cam1), matches)
+        squares = np.zeros(len(matches))
+        for camera1, camera2, pose in self.moved:
+            seen = seen_by_all([(camera1, camera2)], matches.pixels1, matches.pixels2)
+            there = matches.select(seen).through(camera1, camera2)
+            squares[seen] += (sampson_of_matches(essential_from_pose(pose), there) - here[seen]) ** 2
+        return np.sqrt(squares)
 
 
 def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
@@ -73,7 +94,8 @@ def known_scene_pose(matches: Matches, known: KnownPose) -> ScenePose:
     """
     length = known.baseline_mm
     pose = Rigid3(known.cam2_from_cam1.rotation, known.cam2_from_cam1.translation_mm / length)
-    near = np.abs(_in_sigmas(matches, pose)) < QUANTILE * MAX_NOISE
+    slack = GATE * known.open_px(matches) / matches.sigma1_px
+    near = np.abs(_in_sigmas(matches, pose)) < np.hypot(QUANTILE * MAX_NOISE, slack)
     _require(near)
     _refuse_contradiction(matches, pose, near)
     inliers = near
@@ -108,8 +130,8 @@ def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> No
         turn = np.degrees(rotation_angle(other.rotation @ pose.rotation.T))
         raise DegenerateError(
             f"{int(near.sum())} of {len(matches)} correspondences agree with the measured pose and {int(better.sum())} "
-            f"with another, turned by {turn:.2f} deg from it; check which camera took which image, and that the pose "
-            "is cam2_from_cam1"
+            f"with another, turned by {turn:.2f} deg from it; check which camera took which image, that the pose is "
+            "cam2_from_cam1, and that the cameras have not moved since"
         )
 
 

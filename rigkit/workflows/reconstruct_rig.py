@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.features import match_affine_features
 from rigkit.cameras.base import Camera
+from rigkit.cameras.uncertain import UncertainPair
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
@@ -25,7 +26,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure
-from rigkit.workflows.camera_files import import_rig
+from rigkit.workflows.camera_files import saved_rig
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 from rigkit.workflows.results import require_folder, write_results
@@ -83,6 +84,8 @@ class RigScene:
 @dataclass(frozen=True, eq=False, slots=True)
 class _View:
     name: str
+    number: int
+    """Of the camera in the rig."""
     camera: Camera
     cam_from_world: Rigid3
     image: NDArray[np.generic]
@@ -96,7 +99,8 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
     """
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    views = _views(options)
+    rig = saved_rig(options.rig)
+    views, known = _views(options, rig.cameras), rig.quoted
     pairs = near_pairs([v.cam_from_world for v in views])
     grown: dict[tuple[str, str], PosedCloud] = {}
     notes: list[str] = []
@@ -105,13 +109,14 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
         progress("growing correspondences of pairs", k, len(pairs))
         one, other = views[i], views[j]
         try:
-            dense = _dense(one, other)
+            dense = _dense(one, other, None if known is None else known.pair(one.number, other.number))
         except DegenerateError as error:
             notes.append(str(error))
             continue
         # The picture shows the pair of the first camera, whose frame is the world's.
         first = dense if first is None and i == 0 else first
-        grown[one.name, other.name] = PosedCloud.of(dense, one.cam_from_world.inverse())
+        covariance = None if known is None else known.pair(one.number, views[0].number).covariance[-6:, -6:]
+        grown[one.name, other.name] = PosedCloud.of(dense, one.cam_from_world.inverse(), covariance)
     progress("growing correspondences of pairs", len(pairs), len(pairs))
     if not grown:
         raise DegenerateError(
@@ -146,9 +151,8 @@ def near_pairs(cam_from_world: Sequence[Rigid3]) -> list[tuple[int, int]]:
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(chosen | chosen.T))]
 
 
-def _views(options: RigSceneOptions) -> list[_View]:
+def _views(options: RigSceneOptions, cameras: Mapping[str, tuple[Camera, Rigid3]]) -> list[_View]:
     """Return the views, the world being the frame of the first; raises InputError where rig and images do not fit."""
-    cameras = import_rig(options.rig)
     names = options.names or tuple(cameras)[: len(options.images)]
     missing = [name for name in names if name not in cameras]
     if missing or len(names) != len(options.images) or len(set(names)) < len(names):
@@ -162,6 +166,7 @@ def _views(options: RigSceneOptions) -> list[_View]:
     views = [
         _View(
             name,
+            list(cameras).index(name),
             cameras[name][0],
             cameras[name][1] @ rig_from_first,
             read_image_of(path, cameras[name][0].size_px, options.rig),
@@ -180,14 +185,16 @@ def _views(options: RigSceneOptions) -> list[_View]:
     return views
 
 
-def _dense(one: _View, other: _View) -> DenseScene:
-    """Return the cloud of two views; raises DegenerateError where they do not see the same surfaces."""
-    pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse())
+def _dense(one: _View, other: _View, known: UncertainPair | None) -> DenseScene:
+    """Return the cloud of two views, with what the rig leaves open in its sigmas where that is known; raises
+    DegenerateError where they do not see the same surfaces."""
+    moved = () if known is None else tuple(known.moved())
+    pose = KnownPose(other.cam_from_world @ one.cam_from_world.inverse(), moved=moved)
     try:
         seeds = match_affine_features(one.image, other.image)
         name = f"{one.name}-{other.name}"
         sparse = reconstruct_scene(seeds, one.camera, other.camera, pair_id=name, known_pose=pose, image1=one.image)
-        return grow_scene(sparse, seeds, one.image, other.image, pose_is_known=True)
+        return grow_scene(sparse, seeds, one.image, other.image, pose_is_known=True, calibrations=known)
     except (DegenerateError, InputError) as error:
         raise DegenerateError(f"pair {one.name}, {other.name}: {error}") from error
 

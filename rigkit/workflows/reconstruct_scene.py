@@ -16,7 +16,7 @@ from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.affine.from_points import are_rough, with_affinities
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
-from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import without_nan
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
@@ -28,13 +28,14 @@ from rigkit.io.images import read_image_of
 from rigkit.io.ply import ply_bytes
 from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
-from rigkit.reconstruction.growing.dense import Calibrations, grow_scene
+from rigkit.reconstruction.growing.dense import grow_scene
+from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure, epipolar_figure
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera, import_pair, own_calibration
+from rigkit.workflows.camera_files import import_camera, import_pair, own_calibration, saved_rig
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
@@ -151,6 +152,10 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     if options.output is not None:
         require_folder(options.output, force=options.force)
     camera1, camera2, known_pose, notes = _cameras(options)
+    of = _calibrations(options, camera1, camera2)
+    if known_pose is not None and of is not None:
+        moved = moved_pairs(PosedPair(camera1, camera2, known_pose.cam2_from_cam1), of)
+        known_pose = replace(known_pose, moved=tuple(moved))
     images = None
     if options.images:
         a, b = options.images
@@ -165,11 +170,12 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     with about(*(path for path in told if path is not None)):
         scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
-    known, of = known_pose is not None, _calibrations(options, camera1, camera2)
+    known = known_pose is not None
     if images and options.grow:
         scene, found, maps = _grown(scene, found, images, progress, pose_is_known=known, of=of)
     if of is not None and not maps:
-        shifts = calibration_shifts(scene.reconstruction, *of, pose_is_known=known)
+        both = (of,) if isinstance(of, UncertainPair) else of
+        shifts = calibration_shifts(scene.reconstruction, *both, pose_is_known=known)
         scene = replace(scene, reconstruction=with_calibrations(scene.reconstruction, shifts))
     r = scene.reconstruction
     scene = replace(scene, reconstruction=replace(r, notes=(*notes, *r.notes)))
@@ -203,6 +209,12 @@ def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, l
 
 def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Calibrations | None:
     """Return the cameras as their files know them, exact where one does not say; None where none does."""
+    if options.rig is not None:
+        rig = saved_rig(options.rig)
+        names = list(rig.cameras)
+        chosen = options.rig_names or names[:2]
+        known_rig = rig.quoted
+        return None if known_rig is None else known_rig.pair(*(names.index(name) for name in chosen))
     found = [
         None if path is None or (known := own_calibration(path)) is None else uncertain_camera(known)
         for path in (options.camera, options.camera2)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from helpers.textured_scene import Corner
+from numpy.typing import NDArray
 
 from rigkit.affine.features import match_affine_features
 from rigkit.cameras.pinhole import Pinhole
-from rigkit.core.errors import InputError
+from rigkit.cameras.uncertain import UncertainRig
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.reconstruction.growing.dense import grow_scene
@@ -31,15 +35,22 @@ def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
     rng = np.random.default_rng(5)
     corner = Corner.of_a_room()
     images = [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
+    rig = UncertainRig(cameras=[CAMERA] * 3, cam_from_rig=CAM_FROM_WORLD, covariance=np.zeros((24, 24)))
+    return corner, clouds_of(images, rig)
+
+
+def clouds_of(images: Sequence[NDArray[np.generic]], rig: UncertainRig) -> list[PosedCloud]:
     clouds = []
     for i, j in ((0, 1), (0, 2), (2, 1)):
-        pose = CAM_FROM_WORLD[j] @ CAM_FROM_WORLD[i].inverse()
+        known = rig.pair(i, j)
         seeds = match_affine_features(images[i], images[j])
-        known = KnownPose(pose)
-        sparse = reconstruct_scene(seeds, CAMERA, CAMERA, known_pose=known, image1=images[i])
-        dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True)
-        clouds.append(PosedCloud.of(dense, CAM_FROM_WORLD[i].inverse()))
-    return corner, clouds
+        pose = KnownPose(known.posed.cam2_from_cam1, moved=tuple(known.moved()))
+        sparse = reconstruct_scene(seeds, *known.posed[:2], known_pose=pose, image1=images[i])
+        of_rig = known if rig.covariance.any() else None
+        dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True, calibrations=of_rig)
+        place = rig.pair(i, 0)
+        clouds.append(PosedCloud.of(dense, place.posed.cam2_from_cam1, place.covariance[-6:, -6:]))
+    return clouds
 
 
 def distances(corner: Corner, points: np.ndarray) -> np.ndarray:
@@ -82,19 +93,37 @@ def test_the_order_of_the_clouds_and_the_frame_do_not_matter() -> None:
     np.testing.assert_allclose(turned.cloud.points_mm, fused.cloud.points_mm, atol=1e-9)
 
 
+def test_what_the_rig_leaves_open_is_in_the_sigmas_and_is_not_averaged_away() -> None:
+    """A rig with lenses and mounts as wrong as its covariance says, and the same one that is said to be exact."""
+    rng = np.random.default_rng(7)
+    corner = Corner.of_a_room()
+    images = [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
+    sigmas = np.array([0.1] * 12 + [2e-4, 2e-4, 2e-4, 0.3, 0.3, 0.3] * 2)
+    wrong = rng.permuted(np.tile([1.0, -1.0], 12)) * sigmas
+    cameras = [CAMERA.with_parameters(CAMERA.parameters + own) for own in np.split(wrong[:12], 3)]
+    poses = [CAM_FROM_WORLD[0]] + [
+        Rigid3(exp_so3(own[:3]) @ pose.rotation, pose.translation_mm + own[3:])
+        for pose, own in zip(CAM_FROM_WORLD[1:], np.split(wrong[12:], 2), strict=True)
+    ]
+    with pytest.raises(DegenerateError, match="the cameras have not moved since"):
+        clouds_of(images, UncertainRig(cameras=cameras, cam_from_rig=poses, covariance=np.zeros((24, 24))))
+    clouds = clouds_of(images, UncertainRig(cameras=cameras, cam_from_rig=poses, covariance=np.diag(sigmas**2)))
+    fused = fuse_clouds(clouds)
+    assert fused.cloud.calibration_in_sigmas
+    # All 24 numbers are off by one sigma each, and distances from planes are less than those along rays.
+    assert 0.1 < np.median(distances(corner, fused.cloud.points_mm) / fused.cloud.sigma_mm) < 1.5
+    merged = fused.pairs_of > 1
+    assert merged.mean() > 0.2
+    assert np.median(fused.cloud.sigma_mm[merged]) > 0.9 * min(np.median(c.of_calibrations[0]) for c in clouds)
+
+
 def test_one_cloud_stays_and_surfaces_apart_are_not_merged() -> None:
     _, clouds = corner_clouds()
     alone = fuse_clouds(clouds[:1])
     np.testing.assert_allclose(alone.cloud.points_mm, clouds[0].world_from_cam.apply(clouds[0].cloud.points_mm))
     np.testing.assert_allclose(alone.cloud.sigma_mm, clouds[0].cloud.sigma_mm)
-    far = PosedCloud(
-        cloud=clouds[0].cloud,
-        pixels=clouds[0].pixels,
-        step_px=clouds[0].step_px,
-        camera=CAMERA,
-        # By far more than any sigma.
-        world_from_cam=clouds[0].world_from_cam @ Rigid3(np.eye(3), [0.0, 0.0, 200.0]),
-    )
+    # By far more than any sigma.
+    far = replace(clouds[0], world_from_cam=clouds[0].world_from_cam @ Rigid3(np.eye(3), [0.0, 0.0, 200.0]))
     apart = fuse_clouds([clouds[0], far])
     assert (apart.pairs_of == 1).mean() > 0.95
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import grey_of
 from rigkit.cameras.base import Camera
-from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.cameras.uncertain import PosedPair
 from rigkit.core.arrays import FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, rotation_angle, unit
+from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
@@ -26,7 +26,7 @@ from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKn
 from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
-from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
+from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction, colours_at
 from rigkit.reconstruction.scene import MAX_RANGE_SIGMA, NO_DISTANCE, SceneReconstruction, in_unit
 from rigkit.reconstruction.scene_pose import GATE, KnownPose, fit_scene_pose, known_scene_pose
@@ -53,9 +53,6 @@ SHARED_ERROR = 0.5
 WINDOW_OVERLAP = 3.5
 """Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
 
-Calibrations: TypeAlias = tuple[UncertainCamera, UncertainCamera | None]
-"""Both cameras as they are known; None: the second is the first."""
-
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DenseScene:
@@ -67,12 +64,15 @@ class DenseScene:
     grown : the pairs.
     surface : the planes at their nodes, in the unit of the scene; row k of the cloud is node `nodes[k]` (row-major).
     nodes : (K,) indices.
+    of_calibrations : of the K points' sigmas (mm, rad) what the calibrations have in them: an error of all points
+        together.
     """
 
     scene: SceneReconstruction
     grown: GrownPatches
     surface: GrownSurface
     nodes: NDArray[np.int64]
+    of_calibrations: tuple[FloatArray, FloatArray]
 
     @property
     def correspondences(self) -> Correspondences:
@@ -110,8 +110,9 @@ def grow_scene(
 ) -> DenseScene:
     """Return the dense cloud of two images whose `seeds` gave the reconstruction `sparse`.
 
-    With `pose_is_known` its pose is not estimated again. With `calibrations`, the cameras as they are known,
-    what these leave open is in the covariance of the pose and in the cloud's sigmas.
+    With `pose_is_known` its pose is not estimated again. With `calibrations`, the cameras as they are known (two of a
+    rig: with their pose, which is known then), what these leave open is in the covariance of the pose and in the
+    cloud's sigmas.
 
     Raises DegenerateError: nothing grows from the seeds.
     """
@@ -119,7 +120,10 @@ def grow_scene(
     view1 = GrowingView.of(grey_of(image1, "image 1"), r.camera1)
     view2 = GrowingView.of(grey_of(image2, "image 2"), r.camera2)
     agreeing = seeds.select(sparse.inliers)
-    even = _pose_from_grown(view1, view2, agreeing, sparse, fixed=pose_is_known)
+    there = PosedPair(r.camera1, r.camera2, r.cam2_from_cam1)
+    moved = [] if calibrations is None else moved_pairs(there, calibrations)
+    fixed = KnownPose(r.cam2_from_cam1, moved=tuple(moved)) if pose_is_known else None
+    even = _pose_from_grown(view1, view2, agreeing, sparse, fixed)
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
     known = _knowledge(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
@@ -140,14 +144,13 @@ def grow_scene(
         keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.at_end[at])
         surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(rays, pose, covariance)
-    if calibrations is not None:
-        moves = _moved_poses(even, r, calibrations)
-        by_pose, of_pose = _with_calibrations(rays, pose, moves, by_pose, of_pose)
-        covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
-    cloud, nodes = _cloud(grown, surface, by_pose, of_pose, image1)
+    moves = _moves(even, r, moved, pose_is_known=pose_is_known)
+    covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
+    uncertain = _UncertainPlanes(surface, by_pose, of_pose, _planes_of_moves(rays, pose, moves))
+    cloud, nodes, of_calibrations = _cloud(grown, uncertain, image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
     scene = _scene(sparse, grown, cloud, nodes, known, pose, covariance)
-    return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes)
+    return DenseScene(scene=scene, grown=grown, surface=surface, nodes=nodes, of_calibrations=of_calibrations)
 
 
 def _scene(
@@ -190,9 +193,13 @@ class _EvenPose(NamedTuple):
 
 
 def _pose_from_grown(
-    view1: GrowingView, view2: GrowingView, seeds: Correspondences, sparse: SceneReconstruction, *, fixed: bool
+    view1: GrowingView,
+    view2: GrowingView,
+    seeds: Correspondences,
+    sparse: SceneReconstruction,
+    fixed: KnownPose | None,
 ) -> _EvenPose:
-    """Return the pose of evenly spread pairs, grown until it does not move any more; where it is `fixed`, as it was."""
+    """Return the pose of evenly spread pairs, grown until it does not move any more; where it is `fixed`, that."""
     r = sparse.reconstruction
     pose = Rigid3(r.cam2_from_cam1.rotation, unit(r.cam2_from_cam1.translation_mm))
     cameras = view1.camera, view2.camera
@@ -206,9 +213,8 @@ def _pose_from_grown(
             raise DegenerateError(
                 f"only {len(matches)} pairs grow from {len(seeds)} correspondences; the surfaces lack texture"
             )
-        if fixed:
-            assert r.pose_covariance is not None
-            kept = known_scene_pose(matches, KnownPose(r.cam2_from_cam1, r.pose_covariance))
+        if fixed is not None:
+            kept = known_scene_pose(matches, fixed)
             even = kept.matches.select(kept.inliers)
             # What pairs err by together across their epipolar lines they err by along them too.
             there = kept.refined.cam2_from_cam1
@@ -274,58 +280,79 @@ class _Moved(NamedTuple):
     change: FloatArray
 
 
-def _moved_poses(even: _EvenPose, r: Reconstruction, calibrations: Calibrations) -> list[_Moved]:
-    """Return the moved cameras with their poses, as the same pairs move these."""
+def _moves(even: _EvenPose, r: Reconstruction, moved: list[PosedPair], *, pose_is_known: bool) -> list[_Moved]:
+    """Return the moved cameras, and how the pose moves with them: as it is told, or as the same pairs move it."""
+    here, out = r.cam2_from_cam1, []
+    for camera1, camera2, there in moved:
+        if pose_is_known:
+            turn = log_so3(there.rotation @ here.rotation.T)
+            change = np.concatenate([turn, there.translation_mm - here.translation_mm])
+        else:
+            change = _change_of_pose(even, r, (camera1, camera2))
+        out.append(_Moved((camera1, camera2), change))
+    return out
+
+
+def _change_of_pose(even: _EvenPose, r: Reconstruction, cameras: tuple[Camera, Camera]) -> FloatArray:
+    """Return by how much (6,) the pose of the same pairs differs with other cameras."""
     pose, m = even.pose.cam2_from_cam1, even.matches
-    t, to_length = pose.translation_mm, np.repeat([1.0, r.baseline_mm], 3)
-    moves = []
-    for cameras in moved_cameras(r.camera1, r.camera2, *calibrations, one=calibrations[1] is None):
-        seen = np.flatnonzero(seen_by_all([cameras], m.pixels1, m.pixels2))
-        here = m.select(seen)
-        there = here.through(*cameras)
-        before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
-        change = to_length * (even.pose.by_distance[:, seen] @ (after - before))
-        moves.append(_Moved(cameras, change))
-    return moves
+    t = pose.translation_mm
+    seen = np.flatnonzero(seen_by_all([cameras], m.pixels1, m.pixels2))
+    here = m.select(seen)
+    there = here.through(*cameras)
+    before, after = (point_terms(each, pose.rotation, t, translation_basis(t))[0] for each in (here, there))
+    return np.asarray(np.repeat([1.0, r.baseline_mm], 3) * (even.pose.by_distance[:, seen] @ (after - before)))
 
 
-def _with_calibrations(
-    rays: PairRays, pose: Rigid3, moves: list[_Moved], by_pose: FloatArray, of_pose: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return what `_moved_planes` returns with a column more for each move, of variance one."""
+def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> FloatArray:
+    """Return how the nodes' own planes change with each move (R, C, 3, M)."""
     here = rays.planes(pose)
-    planes = []
-    for cameras, change in moves:
+    planes = np.zeros((*here.shape, len(moves)))
+    for k, (cameras, change) in enumerate(moves):
         there = Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
-        planes.append(PairRays.of(rays.grown, *cameras).planes(there) - here)
-    ends = np.eye(of_pose.shape[0] + len(moves))
-    ends[: of_pose.shape[0], : of_pose.shape[0]] = of_pose
-    return np.stack([*np.moveaxis(by_pose, -1, 0), *planes], axis=-1), ends
+        planes[..., k] = PairRays.of(rays.grown, *cameras).planes(there) - here
+    return planes
+
+
+class _UncertainPlanes(NamedTuple):
+    """Planes at nodes, their derivatives (R, C, 3, 5) by the pose, its covariance (5, 5), and how they change with each
+    move of the calibrations (R, C, 3, M)."""
+
+    surface: GrownSurface
+    by_pose: FloatArray
+    of_pose: FloatArray
+    by_calibrations: FloatArray
 
 
 def _cloud(
-    grown: GrownPatches,
-    surface: GrownSurface,
-    by_pose: FloatArray,
-    pose_covariance: FloatArray,
-    image1: NDArray[np.generic],
-) -> tuple[OrientedCloud, NDArray[np.int64]]:
-    """Return the cloud of the planes whose range is known, and their nodes; the covariance goes with `by_pose`."""
+    grown: GrownPatches, planes: _UncertainPlanes, image1: NDArray[np.generic]
+) -> tuple[OrientedCloud, NDArray[np.int64], tuple[FloatArray, FloatArray]]:
+    """Return the cloud of the planes whose range is known, their nodes, and what of its sigmas (mm, rad) is of the
+    calibrations."""
+    surface = planes.surface
     at = np.flatnonzero(surface.valid.ravel())
 
     def flat(values: FloatArray) -> FloatArray:
-        return values.reshape(-1, *values.shape[2:])[at]
+        return values.reshape(grown.valid.size, *values.shape[2:])[at]
 
     points, normals, plane, covariance = (
         flat(v) for v in (surface.points, surface.normals, surface.plane, surface.covariance)
     )
-    spread = flat(by_pose)
-    covariance = covariance + spread @ pose_covariance @ np.swapaxes(spread, 1, 2)
+    by_pose, moves = flat(planes.by_pose), flat(planes.by_calibrations)
+    of_calibrations = moves @ np.swapaxes(moves, 1, 2)
+    covariance = covariance + by_pose @ planes.of_pose @ np.swapaxes(by_pose, 1, 2) + of_calibrations
     size = np.linalg.norm(points, axis=1)
     ray = points / size[:, None]
-    sigma_mm = size**2 * np.sqrt(np.einsum("ni,nij,nj->n", ray, covariance, ray))
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]
-    of_normal = across @ covariance @ across / np.sum(plane**2, axis=1)[:, None, None]
+
+    def sigmas(of_plane: FloatArray) -> tuple[FloatArray, FloatArray]:
+        of_normal = across @ of_plane @ across / np.sum(plane**2, axis=1)[:, None, None]
+        return (
+            size**2 * np.sqrt(np.einsum("ni,nij,nj->n", ray, of_plane, ray)),
+            np.sqrt(np.trace(of_normal, axis1=1, axis2=2)),
+        )
+
+    sigma_mm, normal_sigma = sigmas(covariance)
     sure = np.isfinite(sigma_mm) & (sigma_mm < MAX_RANGE_SIGMA * size)
     if not sure.any():
         raise DegenerateError(NO_DISTANCE)
@@ -337,8 +364,9 @@ def _cloud(
         board_index=np.full(count, -1),
         grid=np.zeros((count, 2), dtype=np.int64),
         sigma_mm=sigma_mm[sure],
-        normal_sigma_rad=np.sqrt(np.trace(of_normal[sure], axis1=1, axis2=2)),
+        normal_sigma_rad=normal_sigma[sure],
         board_ids=(),
         from_origin=True,
     )
-    return cloud, at[sure]
+    share_mm, share_rad = sigmas(of_calibrations)
+    return cloud, at[sure], (share_mm[sure], share_rad[sure])

@@ -3,7 +3,8 @@
 What one pair says of a place, another pair may have said before: then the two are one point. A point of a later cloud
 is looked for where the camera of an earlier one saw it; where its distance from the surface there is no more than the
 errors of both along the surface's normal, the two are merged by these errors, and their colours with them. Distances
-across the surface do not matter: both clouds are samples of it.
+across the surface do not matter: both clouds are samples of it. What calibrations err by parts clouds as noise does,
+but merging does not average it away: all points of a pair have it together, and pairs with a camera in common, too.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import unit
+from rigkit.geometry.rotation import skew, unit
 from rigkit.reconstruction.growing.dense import DenseScene
 from rigkit.reconstruction.scene_pose import GATE
 
@@ -36,25 +37,31 @@ class PosedCloud:
     Attributes
     ----------
     cloud : N points. pixels : (N, 2) of its first image, where each was seen; nodes were `step_px` apart.
+    of_calibrations : what of its sigmas (N,) (mm, rad) is of the calibrations.
     camera, world_from_cam : the first camera, and where it stands.
+    pose_covariance : (6, 6) of that place: left rotation perturbation, rad, and translation, mm.
     """
 
     cloud: OrientedCloud
+    of_calibrations: tuple[FloatArray, FloatArray]
     pixels: Pixels
     step_px: float
     camera: Camera
     world_from_cam: Rigid3
+    pose_covariance: FloatArray
 
     @classmethod
-    def of(cls, dense: DenseScene, world_from_cam1: Rigid3) -> PosedCloud:
-        """Return the cloud of a dense scene whose first camera stands there."""
+    def of(cls, dense: DenseScene, world_from_cam1: Rigid3, pose_covariance: FloatArray | None = None) -> PosedCloud:
+        """Return the cloud of a dense scene whose first camera stands there, exactly so without a covariance."""
         r = dense.scene.reconstruction
         return cls(
             cloud=r.cloud,
+            of_calibrations=dense.of_calibrations,
             pixels=r.pixels1,
             step_px=float(dense.grown.step),
             camera=r.camera1,
             world_from_cam=world_from_cam1,
+            pose_covariance=np.zeros((6, 6)) if pose_covariance is None else pose_covariance,
         )
 
 
@@ -76,13 +83,24 @@ class FusedCloud:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _MergedSurface:
-    """A cloud in the world, and what later clouds add to it."""
+    """A cloud in the world, and what later clouds add to it.
+
+    Attributes
+    ----------
+    sigma, errors, variance : (N,), (N, 3), (N,) of noise: of points, along rays, and squared along normals.
+    common : (N, 3, 3) mm^2 of the calibrations. common_sums : (N,) of its largest axes, weighted as points are.
+    common_rad : (N,), of normals.
+    """
 
     posed: PosedCloud
     points: FloatArray
     normals: FloatArray
+    sigma: FloatArray
     errors: FloatArray
     variance: FloatArray
+    common: FloatArray
+    common_sums: FloatArray
+    common_rad: FloatArray
     keep: BoolArray
     weights: FloatArray
     offsets: FloatArray
@@ -112,17 +130,27 @@ def fuse_clouds(clouds: Sequence[PosedCloud]) -> FusedCloud:
 
 
 def _surface(posed: PosedCloud) -> _MergedSurface:
-    cloud, turn = posed.cloud, posed.world_from_cam.rotation
-    rays = unit(cloud.points_mm)
-    normals, errors = cloud.normals @ turn.T, (cloud.sigma_mm[:, None] * rays) @ turn.T
+    cloud, turn, (common_mm, common_rad) = posed.cloud, posed.world_from_cam.rotation, posed.of_calibrations
+    points, normals, rays = (values @ turn.T for values in (cloud.points_mm, cloud.normals, unit(cloud.points_mm)))
+    sigma = np.sqrt(np.maximum(cloud.sigma_mm**2 - common_mm**2, 0.0))
+    errors = sigma[:, None] * rays
     variance = _variance(errors, normals)
-    sure = _information(cloud.normal_sigma_rad)
+    by_pose = np.concatenate([-skew(points), np.broadcast_to(np.eye(3), (len(points), 3, 3))], axis=2)
+    common = by_pose @ posed.pose_covariance @ np.swapaxes(by_pose, 1, 2)
+    common += (common_mm**2)[:, None, None] * rays[:, :, None] * rays[:, None, :]
+    of_turn = posed.pose_covariance[:3, :3]
+    of_normal = np.trace(of_turn) - np.einsum("ni,ij,nj->n", normals, of_turn, normals)
+    sure = _information(np.sqrt(np.maximum(cloud.normal_sigma_rad**2 - common_rad**2, 0.0)))
     return _MergedSurface(
         posed=posed,
         points=posed.world_from_cam.apply(cloud.points_mm),
         normals=normals,
+        sigma=sigma,
         errors=errors,
         variance=variance,
+        common=common,
+        common_sums=np.sqrt(np.maximum(np.linalg.eigvalsh(common)[:, -1], 0.0)) / variance,
+        common_rad=np.sqrt(common_rad**2 + np.maximum(of_normal, 0.0)),
         keep=np.ones(len(cloud), dtype=bool),
         weights=1.0 / variance,
         offsets=np.zeros(len(cloud)),
@@ -163,12 +191,15 @@ def _merge(earlier: _MergedSurface, later: _MergedSurface) -> None:
     normal = earlier.normals[into]
     off = np.sum(normal * (later.points[left] - earlier.points[into]), axis=1)
     variance = _variance(later.errors[left], normal)
-    both = np.sqrt(earlier.variance[into] + variance)
+    common = np.einsum("ni,nij,nj->n", normal, earlier.common[into] + later.common[left], normal)
+    both = np.sqrt(earlier.variance[into] + variance + common)
     turned = np.sum(normal * later.normals[left], axis=1) < np.cos(np.radians(MAX_TURN_DEG))
     same = (np.abs(off) < GATE * both) & ~turned
     left, into, off, variance = left[same], into[same], off[same], variance[same]
     np.add.at(earlier.offsets, into, off / variance)
     np.add.at(earlier.weights, into, 1.0 / variance)
+    largest = later.common_sums[left] * later.variance[left]
+    np.add.at(earlier.common_sums, into, largest / variance)
     np.add.at(earlier.normal_weights, into, later.normal_weights[left])
     np.add.at(earlier.normal_sums, into, later.normal_sums[left])
     np.add.at(earlier.colour_sums, into, later.colour_sums[left])
@@ -184,7 +215,9 @@ def _fused(surfaces: Sequence[_MergedSurface], order: Sequence[int]) -> FusedClo
     with np.errstate(divide="ignore", invalid="ignore"):
         move = np.where(weights > 0.0, joined([s.offsets for s in surfaces]) / weights, 0.0)
         shrink = np.sqrt(1.0 / weights / joined([s.variance for s in surfaces]))
+        common = np.nan_to_num(joined([s.common_sums for s in surfaces]) / weights)
     normals = joined([s.normals for s in surfaces])
+    sigma = joined([s.sigma for s in surfaces]) * np.nan_to_num(shrink, nan=1.0)
     count = len(counts)
     cloud = OrientedCloud(
         points_mm=joined([s.points for s in surfaces]) + move[:, None] * normals,
@@ -192,9 +225,12 @@ def _fused(surfaces: Sequence[_MergedSurface], order: Sequence[int]) -> FusedClo
         colours=np.rint(joined([s.colour_sums for s in surfaces]) / counts[:, None]).astype(np.uint8),
         board_index=np.full(count, -1),
         grid=np.zeros((count, 2), dtype=np.int64),
-        sigma_mm=joined([s.posed.cloud.sigma_mm for s in surfaces]) * np.nan_to_num(shrink, nan=1.0),
-        normal_sigma_rad=1.0 / np.sqrt(joined([s.normal_weights for s in surfaces])),
+        sigma_mm=np.hypot(sigma, common),
+        normal_sigma_rad=np.sqrt(
+            1.0 / joined([s.normal_weights for s in surfaces]) + joined([s.common_rad for s in surfaces]) ** 2
+        ),
         board_ids=(),
+        calibration_in_sigmas=all(s.posed.cloud.calibration_in_sigmas for s in surfaces),
     )
     sizes = [int(s.keep.sum()) for s in surfaces]
     return FusedCloud(cloud, counts, np.repeat(np.array(order, dtype=np.int64), sizes))

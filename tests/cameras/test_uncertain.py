@@ -1,0 +1,59 @@
+"""Two cameras of a rig are as sure as the rig: what each of its numbers moves, exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.cameras.uncertain import UncertainRig
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3, log_so3
+
+CAMERAS = [Pinhole((300, 225), np.array([262.5 + k, 262.5, 149.5, 112.0])) for k in range(3)]
+POSES = [
+    Rigid3.identity(),
+    Rigid3(exp_so3(np.array([0.1, -0.4, 0.2])), np.array([-300.0, 40.0, 60.0])),
+    Rigid3(exp_so3(np.array([-0.3, 0.2, 0.7])), np.array([150.0, -90.0, 500.0])),
+]
+SIZES = [4, 4, 4, 6, 6]
+MOVE = 1e-6
+
+
+@pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 0), (1, 2), (2, 1), (2, 0)])
+@pytest.mark.parametrize("number", range(sum(SIZES)))
+def test_a_pair_moves_as_the_rig_does(first: int, second: int, number: int) -> None:
+    """The rig is sure but for one number: its pair is moved along one axis, to where the moved rig has it."""
+    step = np.zeros(sum(SIZES))
+    step[number] = MOVE
+    rig = UncertainRig(cameras=CAMERAS, cam_from_rig=POSES, covariance=np.outer(step, step))
+    own = np.split(step, np.cumsum(SIZES)[:-1])
+    cameras = [camera.with_parameters(camera.parameters + by) for camera, by in zip(CAMERAS, own[:3], strict=True)]
+    poses = [POSES[0]] + [
+        Rigid3(exp_so3(by[:3]) @ pose.rotation, pose.translation_mm + by[3:])
+        for pose, by in zip(POSES[1:], own[3:], strict=True)
+    ]
+    here, there = POSES[second] @ POSES[first].inverse(), poses[second] @ poses[first].inverse()
+    change = np.concatenate(
+        [
+            cameras[first].parameters - CAMERAS[first].parameters,
+            cameras[second].parameters - CAMERAS[second].parameters,
+            log_so3(there.rotation @ here.rotation.T),
+            there.translation_mm - here.translation_mm,
+        ]
+    )
+    pair = rig.pair(first, second)
+    # Second order: a rotation of 1e-6 at 600 mm.
+    np.testing.assert_allclose(pair.covariance, np.outer(change, change), atol=1e-6 * MOVE**2 * 600.0**2)
+    for moved in pair.moved():
+        by = log_so3(moved.cam2_from_cam1.rotation @ here.rotation.T)
+        assert np.abs(np.abs(by) - np.abs(change[8:11])).max() < 1e-4 * MOVE
+
+
+def test_a_scale_that_is_not_sure_makes_baselines_longer() -> None:
+    rig = UncertainRig(cameras=CAMERAS, cam_from_rig=POSES, covariance=np.zeros((24, 24)), scale_sigma=1e-3)
+    (moved,) = rig.pair(1, 2).moved()
+    here = POSES[2] @ POSES[1].inverse()
+    np.testing.assert_allclose(moved.cam2_from_cam1.rotation, here.rotation, atol=1e-12)
+    longer = np.linalg.norm(moved.cam2_from_cam1.translation_mm) / np.linalg.norm(here.translation_mm)
+    assert abs(longer - 1.0) == pytest.approx(1e-3)
