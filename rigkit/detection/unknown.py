@@ -20,7 +20,7 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.in_squares import likeness_at
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
-from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, TagSightings, guessed_grids
+from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagSightings, guessed_grids
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
     MIN_SURE_CORNERS,
@@ -48,7 +48,7 @@ MAX_LEVELS_APART = 0.35
 where it is blurred."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BoardGuess:
     """A board that images show.
 
@@ -59,6 +59,8 @@ class BoardGuess:
     beside : other boards that images show.
     sizes : empty where the images tell how large the board is. Otherwise it has so many columns and rows, or more; or
         one of several sizes, between which images do not decide.
+    rough : light or ink has moved the edges of tags in all images: the spacing is known to some hundredths.
+    either : it may as well be this board: edges of tags have moved so far that either border may be meant.
     either_pattern : nothing tells whether a ChArUco board is of the pattern of today or the one before OpenCV 4.6: the
         images do not show the column in which the two differ.
     marked : no image shows that the squares of this chessboard are empty: there may be marks that were not read.
@@ -68,12 +70,14 @@ class BoardGuess:
     images: tuple[int, ...]
     beside: tuple[Board, ...] = ()
     sizes: tuple[Size, ...] = ()
+    rough: bool = False
+    either: Board | None = None
     either_pattern: bool = False
     marked: bool = False
 
     @property
     def told(self) -> bool:
-        return not self.sizes
+        return not self.sizes and not self.rough and self.either is None
 
 
 def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> BoardGuess | None:
@@ -116,11 +120,11 @@ def _guess_of(
 ) -> BoardGuess | None:
     grids = guessed_grids(tags)
     if grids:
-        return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:]))
+        return _of_grids(grids)
     charuco = guessed_charuco(markers)
     if charuco:
         board, sure = _of_pattern(charuco, [images[k] for k in markers.images])
-        return BoardGuess(board, tuple(markers.images), either_pattern=not sure)
+        return BoardGuess(board=board, images=tuple(markers.images), either_pattern=not sure)
     guess = _plain_guess(images, plain)
     if guess is not None and guess.told:
         return guess
@@ -129,7 +133,18 @@ def _guess_of(
     for k, image in enumerate(images):
         aruco.look_alone(k, image)
     grids = guessed_grids(aruco)
-    return BoardGuess(*grids[0], tuple(board for board, _ in grids[1:])) if grids else guess
+    return _of_grids(grids) if grids else guess
+
+
+def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
+    first, *others = grids
+    return BoardGuess(
+        board=first.board,
+        images=first.images,
+        beside=tuple(grid.board for grid in others),
+        rough=first.rough,
+        either=first.either,
+    )
 
 
 def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
@@ -196,16 +211,16 @@ def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]
     best = told_size(plain)
     grid = guessed_circles(circles)
     if grid is not None and (best is None or len(grid[1]) > len(best[1])):
-        return BoardGuess(*grid)
+        return BoardGuess(board=grid[0], images=grid[1])
     if best is not None:
         sizes, shown = best
         board = Board("board", *sizes[0], 1.0, 1.0)
-        return BoardGuess(board, shown, sizes=sizes if len(sizes) > 1 else ())
+        return BoardGuess(board=board, images=shown, sizes=sizes if len(sizes) > 1 else ())
     shown = tuple(k for k, found in enumerate(plain) if found)
     if len(shown) < 0.5 * len(plain) or not shown:
         return None
     least: Size = tuple(np.array([grid.size for found in plain for grid in found]).max(axis=0).tolist())
-    return BoardGuess(Board("board", *least, 1.0, 1.0), shown, sizes=(least,))
+    return BoardGuess(board=Board("board", *least, 1.0, 1.0), images=shown, sizes=(least,))
 
 
 def difference(guess: Board, declared: Board) -> str | None:

@@ -16,7 +16,6 @@ from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
-from rigkit.detection.whole_grids import Size
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
 from rigkit.io.video import Video, is_video
@@ -89,7 +88,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
         seen = _doubtful(list(images.items())) or "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {seen}")
     if not guess.told:
-        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess.sizes)}")
+        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess)}")
     pictures = list(images.values())
     twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
@@ -236,14 +235,22 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
     if guess is None:
         return Suggestion(doubt=_doubtful(pictures))
     if not guess.told:
-        return Suggestion(part=_untold(guess.sizes))
+        return Suggestion(part=_untold(guess))
     return Suggestion(" --board ".join(words_of_board(board) for board in (guess.board, *guess.beside)))
 
 
-def _untold(sizes: Sequence[Size]) -> str:
-    """Say what images show of a chessboard that has one of several sizes, or the only one at least."""
-    words = " or ".join(f"{columns} x {rows}" for columns, rows in sizes)
-    if len(sizes) > 1:
+def _untold(guess: BoardGuess) -> str:
+    """Say what images show of a board, where that is not all: a chessboard that has one of several sizes, or the only
+    one at least, or an AprilGrid whose edges are aside of where they were printed."""
+    if not guess.sizes:
+        either = [guess.board, *filter(None, [guess.either])]
+        return (
+            "an AprilGrid whose tags look smaller or larger than they are, as too much light or ink runs over: "
+            f"{' or '.join(words_of_board(board) for board in either)}, with a spacing that may be off by some "
+            "hundredths; take images with less light, or measure a tag and the gap beside it"
+        )
+    words = " or ".join(f"{columns} x {rows}" for columns, rows in guess.sizes)
+    if len(guess.sizes) > 1:
         return f"a chessboard of {words} inner corners and do not tell which; count them on the board"
     return (
         f"only parts of a chessboard, of at least {words} inner corners: none shows all of its sides; count them on "

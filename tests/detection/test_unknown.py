@@ -325,3 +325,61 @@ def test_what_is_wrong_with_a_board_is_said() -> None:
     grids = [board(12, 10, AprilGrid(spacing)) for spacing in (0.3, 0.2)]
     assert difference(*grids) == "spacing is 0.2 in the board file, 0.3 in the images"
     assert difference(grids[0], new) == 'an aprilgrid board of 6 x 5 tags is seen; set type = "aprilgrid"'
+
+
+SPREAD_PLACES = 0.06
+"""How well spacing is read where edges have moved by up to a third of the gap."""
+
+
+@pytest.mark.parametrize(
+    ("pattern", "moved_px", "rough"),
+    [
+        (AprilGrid(0.3), 1, False),
+        (AprilGrid(0.3, border=1, numbering="opencv", corner_squares=False), 1, True),
+        (AprilGrid(0.4, corner_squares=False), 1, True),
+    ],
+    ids=["squares", "one", "two"],
+)
+def test_tags_whose_edges_have_moved(pattern: AprilGrid, moved_px: int, rough: bool) -> None:
+    """Bright parts run over into dark ones, or dark ones into bright ones: the print is told, not what it looks like,
+    or that it is not known; between squares corners stay where they were."""
+    board = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
+    images = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        seen = one_board(rng, board=board, max_tilt_deg=35.0).render(optics=Optics(0.5), noise_levels=2.0, rng=rng)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(moved_px) + 1,) * 2)
+        run = (cv2.dilate if moved_px > 0 else cv2.erode)(np.asarray(seen, np.uint8), disc)
+        images.append(grey_image(cv2.GaussianBlur(run, (0, 0), 0.6)))
+    guess = guess_board(images)
+    assert guess is not None and isinstance(guess.board.pattern, AprilGrid)
+    found = guess.board.pattern
+    assert (found.border, found.corner_squares) == (pattern.border, pattern.corner_squares)
+    assert abs(found.spacing - pattern.spacing) <= (SPREAD_PLACES if rough else PLACES[0])
+    assert (guess.rough, guess.told) == (rough, not rough)
+
+
+@pytest.mark.parametrize("sure", [False, True])
+def test_edges_that_have_moved_too_far_for_the_border(sure: bool) -> None:
+    """Both borders are named, with modules as large and tags as far apart; one image that is sure is enough."""
+    seen = TagSightings()
+    row, column = np.divmod(np.arange(12), 4)
+    for image, either in enumerate((True, not sure)):
+        own = unknown_tags._SeenTags(
+            image=image,
+            kind=("tag36h11", 2, True),
+            numbers=np.arange(12),
+            places=np.stack([column, row], axis=-1),
+            steps=np.full(17, 1.45),
+            rough=either,
+            either=either,
+        )
+        seen.kinds[own.kind] += 1
+        seen.seen.append(own)
+    (grid,) = unknown_tags.guessed_grids(seen)
+    assert grid.board.size == (8, 6) and grid.rough is not sure
+    if sure:
+        assert grid.either is None
+    else:
+        assert grid.either is not None and isinstance(grid.either.pattern, AprilGrid)
+        assert (grid.either.pattern.border, grid.either.pattern.spacing) == (1, 0.81)

@@ -93,10 +93,29 @@ def test_images_that_do_not_decide_between_two_sizes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))
-    seen = BoardGuess(Board("b", 9, 6, 1.0, 1.0), (0,), sizes=((9, 6), (10, 6)))
+    seen = BoardGuess(board=Board("b", 9, 6, 1.0, 1.0), images=(0,), sizes=((9, 6), (10, 6)))
     monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
     assert main(["board", "identify", str(tmp_path)]) == 1
     words = "a chessboard of 9 x 6 or 10 x 6 inner corners and do not tell which; count them on the board"
     assert f"1 image of 1 show {words}" in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
     assert f"the images show {words}, and give it as --board" in capsys.readouterr().err
+
+
+def test_tags_whose_edges_have_moved(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is known is said, and what helps."""
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))
+    board, either = (
+        Board("b", 8, 6, 1.0, 1.0, pattern=AprilGrid(spacing, border=border))
+        for spacing, border in ((0.3, 2), (0.625, 1))
+    )
+    seen = BoardGuess(board=board, images=(0,), rough=True, either=either)
+    monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
+    assert main(["board", "identify", str(tmp_path)]) == 1
+    err = capsys.readouterr().err
+    assert "aprilgrid:4x3xMM,spacing=0.3 or aprilgrid:4x3xMM,spacing=0.625,border=1" in err
+    assert "take images with less light" in err
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert "measure a tag and the gap beside it, and give it as --board" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -17,12 +17,13 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import MAX_BORDER, TAG_FAMILIES, AprilGrid
-from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
+from rigkit.core.patterns.aruco import dictionary_modules, marker_count, smallest_dictionary
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
-from rigkit.detection.saddles.response import GreyImage, pyramid
-from rigkit.detection.saddles.saddle import find_corners
+from rigkit.detection.lattices import Seen
+from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.module_size import module_size
 from rigkit.detection.tags.placing import squares_of
 from rigkit.detection.tags.quads import quadrilaterals
 from rigkit.detection.tags.unknown_charuco import DICTIONARIES, laid_out
@@ -39,6 +40,12 @@ MIN_SHARE_COUNTED = 0.5
 MAX_LONE_STEP = 3.0
 """From one lone tag to the next, in sides of a tag: `AprilGrid.spacing` is at most 2."""
 
+OFF_EDGE, OFF_BORDER = 0.25, 0.6
+"""Of a tag's side, modules: outlines further off the edges that were printed tell no spacing (on REAL images as they
+are, at most .19, where light or ink runs over by 1 to 3 px .4 to 2); and from where edges were printed to those of a
+border of whole modules. Borders are two modules a side apart: further than this from one, the next may be meant (those
+images have .0 to .7 with light, up to 1.6 with much ink)."""
+
 OFF_TAG_PLACE = 0.2
 """A tag beside another lies within so many steps of its place, as the other has it."""
 
@@ -53,7 +60,7 @@ Kind: TypeAlias = tuple[str, int, bool]
 """Family, modules of the border, whether tags stand alone."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _SeenTags:
     """Tags of one lattice, or lone ones beside each other.
 
@@ -63,6 +70,8 @@ class _SeenTags:
     numbers : (N,)
     places : (N, 2) in tags from any of them, with the tags upright as OpenCV has them.
     steps : (K,) from a tag to the one beside it, in sides of a tag, as often as that is seen.
+    rough : light or ink has moved the edges of tags, so that `steps` are known to some hundredths.
+    either : it may as well be another border.
     """
 
     image: int
@@ -70,6 +79,8 @@ class _SeenTags:
     numbers: IntArray
     places: IntArray
     steps: FloatArray
+    rough: bool = False
+    either: bool = False
 
     def counted(self) -> tuple[int, int, IntArray] | None:
         """Return by how much numbers grow along a row and down a column, and which tags (N,) follow that; None where
@@ -105,11 +116,14 @@ class TagSightings:
 
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; say whether there are some."""
-        levels = pyramid(image)
-        corners, _ = find_corners(levels)
-        lattices = build_lattices(corners, find_links(corners, levels[0], LENGTH_RATIO * WIDEST_RATIO))
-        found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
-        return any(found) or self.look_alone(index, image)
+        seen = Seen.of(image)
+        # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
+        for at in (seen, *seen.coarser()):
+            lattices = build_lattices(at.corners, find_links(at.corners, at.levels[0], LENGTH_RATIO * WIDEST_RATIO))
+            found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
+            if any(found):
+                return True
+        return self.look_alone(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         quads, squares = squares_of(lattice, dark=True)
@@ -130,7 +144,13 @@ class TagSightings:
         columns, rows = size
         cells = grid_turned(squares[own], (columns - 1, rows - 1), -turn)
         upright, places = np.roll(quads[own], -turn, axis=1), cells // 2
-        seen = _SeenTags(index, (*family, False), codes.number[own], places, _steps(upright, places))
+        seen = _SeenTags(
+            image=index,
+            kind=(*family, False),
+            numbers=codes.number[own],
+            places=places,
+            steps=_steps(upright, places),
+        )
         counted = seen.counted()
         # Small families read something in most squares, but do not count with it.
         if counted is None or len(counted[2]) < max(MIN_TAGS_READ, MIN_SHARE_COUNTED * len(seen.numbers)):
@@ -142,9 +162,9 @@ class TagSightings:
         """Read the tags of an image that stand alone, without squares between their corners; say whether there are
         some."""
         quads = quadrilaterals(image)
-        return any(self._count_alone(index, quads, *read) for read in _read_kinds(image, quads, self.families))
+        return any(self._count_alone(index, image, quads, *read) for read in _read_kinds(image, quads, self.families))
 
-    def _count_alone(self, index: int, quads: FloatArray, family: Family, codes: TagCode) -> bool:
+    def _count_alone(self, index: int, image: GreyImage, quads: FloatArray, family: Family, codes: TagCode) -> bool:
         """Keep the lone tags of one family, and say so, if numbers of some beside each other are those of a board."""
         # The same tag is seen several times: at the outer and at the inner border.
         order = np.flatnonzero(codes.read)[np.argsort(-codes.likeness[codes.read], kind="stable")]
@@ -152,14 +172,37 @@ class TagSightings:
         upright = quads[own[:, None], (codes.turns[own, None] + np.arange(4)) % 4]
         shown = False
         for members, places in _beside_each_other(upright):
-            steps = _steps(upright[members], places)
-            seen = _SeenTags(index, (*family, True), codes.number[own[members]], places, steps)
+            seen = _SeenTags(
+                image=index,
+                kind=(*family, True),
+                numbers=codes.number[own[members]],
+                places=places,
+                steps=_steps(upright[members], places),
+            )
             counted = seen.counted()
             # Chance reads codes, but does not count with them.
             if counted is not None and len(counted[2]) >= MIN_TAGS_READ:
-                self._keep(seen, codes)
+                self._keep(self._as_printed(image, seen, upright[members]), codes)
                 shown = True
         return shown
+
+    def _as_printed(self, image: GreyImage, seen: _SeenTags, upright: FloatArray) -> _SeenTags:
+        """Return lone tags, whose corners are `upright` (N, 4, 2), with the border and the steps of their print."""
+        family = seen.kind[0]
+        bits = dictionary_modules(TAG_FAMILIES.get(family, family))[seen.numbers]
+        size = module_size(image, upright, bits, float(np.median(seen.steps))) if len(seen.steps) else None
+        if size is None:
+            return seen
+        sides = {border: bits.shape[1] + 2.0 * border for name, border in self.families if name == family}
+        border = min(sides, key=lambda one: abs(sides[one] - size.side))
+        rough = abs(size.outline - sides[border]) > OFF_EDGE
+        return replace(
+            seen,
+            kind=(family, border, not size.squares),
+            steps=seen.steps * size.outline / sides[border] if rough else seen.steps,
+            rough=rough,
+            either=len(sides) > 1 and abs(size.side - sides[border]) > OFF_BORDER,
+        )
 
     def _keep(self, seen: _SeenTags, codes: TagCode) -> None:
         self.kinds[seen.kind] += float(codes.likeness[codes.read].sum())  # type: ignore[assignment]
@@ -220,9 +263,26 @@ def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]
     yield from laid_out(near, place)
 
 
-def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
-    """Return the AprilGrids of the kind that most tags are of, with tags of 1 mm, and the images that show each; those
-    that most tags are of come first."""
+@dataclass(frozen=True, eq=False, slots=True)
+class GuessedGrid:
+    """An AprilGrid that images show.
+
+    Attributes
+    ----------
+    board : with tags of 1 mm.
+    images : indices of those that show it.
+    rough : light or ink has moved the edges of its tags in all of them: its spacing is known to some hundredths.
+    either : it may as well be this board of another border.
+    """
+
+    board: Board
+    images: tuple[int, ...]
+    rough: bool = False
+    either: Board | None = None
+
+
+def guessed_grids(seen: TagSightings) -> list[GuessedGrid]:
+    """Return the AprilGrids of the kind that most tags are of, those first that most tags are of."""
     if not seen.seen:
         return []
     kind = seen.kinds.most_common(1)[0][0]
@@ -233,11 +293,29 @@ def guessed_grids(seen: TagSightings) -> list[tuple[Board, tuple[int, ...]]]:
             groups.append((item, *counted))
     out = []
     for cluster in _of_one_board(groups):
-        board = _board_of(cluster, kind)
+        # Corners between squares lie where they were printed, whatever light and ink do.
+        sure = [group for group in cluster if not group[0].rough]
+        board = _board_of(cluster, kind, _steps_of(sure or cluster))
         if board is not None:
             tags = sum(len(own) for *_, own in cluster)
-            out.append((tags, board, tuple(sorted({item.image for item, *_ in cluster}))))
-    return [(board, images) for _, board, images in sorted(out, key=lambda found: -found[0])]
+            images = tuple(sorted({item.image for item, *_ in cluster}))
+            either = None if any(not item.either for item, *_ in cluster) else _of_other_border(board)
+            out.append((tags, GuessedGrid(board, images, not sure, either)))
+    return [grid for _, grid in sorted(out, key=lambda found: -found[0])]
+
+
+def _steps_of(groups: Sequence[Counted]) -> FloatArray:
+    return np.concatenate([item.steps for item, *_ in groups])
+
+
+def _of_other_border(board: Board) -> Board:
+    """Return the board of tags with the other border, whose modules are as large and as far from those of the next."""
+    pattern = board.pattern
+    assert isinstance(pattern, AprilGrid)
+    border = MAX_BORDER + 1 - pattern.border
+    bits = dictionary_modules(pattern.dictionary).shape[1]
+    spacing = (1.0 + pattern.spacing) * (bits + 2 * pattern.border) / (bits + 2 * border) - 1.0
+    return replace(board, pattern=replace(pattern, border=border, spacing=round(spacing, 2)))
 
 
 def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
@@ -253,8 +331,9 @@ def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
     return [members for _, members in clusters]
 
 
-def _board_of(cluster: Sequence[Counted], kind: Kind) -> Board | None:
-    """Return the board, with tags of 1 mm, that groups of its tags show; None where they do not tell its spacing."""
+def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray) -> Board | None:
+    """Return the board, with tags of 1 mm, that groups of its tags show, with `steps` (K,) from tag to tag; None where
+    they do not tell its spacing."""
     family, border, alone = kind
     (step, line), _ = Counter((step, line) for _, step, line, _ in cluster).most_common(1)[0]
     columns = line
@@ -265,7 +344,6 @@ def _board_of(cluster: Sequence[Counted], kind: Kind) -> Board | None:
     remainder = firsts.most_common(1)[0][0] if firsts else 0
     least, most = (int(f([f(n) for n, _ in own])) for f in (np.min, np.max))
     first = max(least - (least - remainder) % columns, 0)
-    steps = np.concatenate([item.steps for item, *_ in cluster])
     spacing = round(float(np.median(steps)) - 1.0, 2) if len(steps) else 0.0
     if spacing <= 0.0:
         return None

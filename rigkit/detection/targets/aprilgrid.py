@@ -15,7 +15,7 @@ from rigkit.core.detections import BoardDetection
 from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import GreyImage, Level, each_level
-from rigkit.detection.saddles.saddle import Corners, find_corners
+from rigkit.detection.saddles.saddle import Corners, each_once, find_corners
 from rigkit.detection.tags.corners import tag_corners
 from rigkit.detection.tags.placing import TagBoard, placed_lattices
 from rigkit.detection.tags.quads import placed_tags
@@ -50,8 +50,15 @@ class AprilGridFinder(Finder):
         corners, _ = find_corners([finest])
         placed = list(_placed_by(corners, finest, search.grey, joined))
         if not all(_nearly_whole(item, pixels, search.grey.shape) for item, pixels in placed):
-            corners, _ = find_corners(levels, corners)
+            coarser = list(levels)
+            corners, saddles = find_corners(coarser, corners)
             placed = list(_placed_by(corners, finest, search.grey, joined))
+            # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
+            for k, level in enumerate(coarser):
+                alone = each_once(saddles.by_level[k:])
+                if len(alone) < MIN_SEEN_AT_FIRST or any(np.isfinite(pixels).any() for _, pixels in placed):
+                    break
+                placed = list(_placed_by(alone, level, search.grey, joined))
         yield from placed
 
 
