@@ -48,7 +48,7 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
         codes, least = Codes.of(pattern, pattern.numbers(*board.size).ravel()), MIN_LIKENESS
     else:
         codes, least = marker_codes(board), MIN_MARKER_LIKENESS
-        grey = 255 - grey if isinstance(pattern, Charuco) and pattern.inverted else grey
+    grey = 255 - grey if isinstance(pattern, Charuco | AprilGrid) and pattern.inverted else grey
     quads = quadrilaterals(grey)
     tags = read_tags(grey, quads, codes)
     seen = tags.likeness >= least

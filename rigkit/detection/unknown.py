@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
@@ -105,7 +106,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
         for k in sure:
             if not tags.look(k, images[k]):
                 markers.look(k, images[k])
-    guess = _guess_of(images, plain, tags, markers)
+    guess = _guess_of(images, plain, tags, markers, marked=not sure)
     progress(LOOKING, len(images), len(images))
     if guess is not None and guess.board.pattern.type == Chessboard.type:
         return replace(guess, marked=not sure)
@@ -117,6 +118,8 @@ def _guess_of(
     plain: Sequence[Sequence[GridSeen]],
     tags: TagSightings,
     markers: MarkerSightings,
+    *,
+    marked: bool,
 ) -> BoardGuess | None:
     grids = guessed_grids(tags)
     if grids:
@@ -126,14 +129,31 @@ def _guess_of(
         board, sure = _of_pattern(charuco, [images[k] for k in markers.images])
         return BoardGuess(board=board, images=tuple(markers.images), either_pattern=not sure)
     guess = _plain_guess(images, plain)
-    if guess is not None and guess.told:
+    told = guess is not None and guess.told
+    # A chessboard may hang on the wall, and an unread mark be taken for ink in its squares.
+    unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
+    if told and not unexplained and not (marked and guess is not None and guess.board.pattern.type == Chessboard.type):
         return guess
-    # Last, as the markers of ChArUco boards stand in rows, too.
-    aruco = TagSightings(ARUCO_TAGS)
-    for k, image in enumerate(images):
-        aruco.look_alone(k, image)
-    grids = guessed_grids(aruco)
+    grids = _rarer_grids(images, unexplained or range(len(images)), told=told)
     return _of_grids(grids) if grids else guess
+
+
+def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, told: bool) -> list[GuessedGrid]:
+    """Return the grids of tags that are white on black, if `some` of the images show tags, or, where no other board is
+    `told`, of ArUco markers."""
+    white = TagSightings(inverted=True)
+    for k in some:
+        white.look(k, images[k])
+    for k in (k for k in range(len(images)) if white.seen and k not in some):
+        white.look(k, images[k])
+    grids = guessed_grids(white)
+    # Last, as the markers of ChArUco boards stand in rows, too.
+    for inverted in (False, True) if not grids and not told else ():
+        aruco = TagSightings(ARUCO_TAGS, inverted=inverted)
+        for k, image in enumerate(images):
+            aruco.look_alone(k, image)
+        grids = grids or guessed_grids(aruco)
+    return grids
 
 
 def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
@@ -230,13 +250,17 @@ def difference(guess: Board, declared: Board) -> str | None:
     if type(seen) is not type(said):
         word = "" if seen.type.endswith("board") else " board"
         return f'{_article(seen.type)}{word} of {size} is seen; set type = "{seen.type}"'
+    if (
+        isinstance(seen, Charuco | AprilGrid)
+        and isinstance(said, Charuco | AprilGrid)
+        and seen.inverted != said.inverted
+    ):
+        negation = "" if seen.inverted else "not "
+        return f"black and white are {negation}exchanged: set inverted = {str(seen.inverted).lower()}"
     if isinstance(seen, Charuco) and isinstance(said, Charuco):
         if seen.legacy != said.legacy and guess.rows % 2 == 1:
             words = "this is the legacy pattern" if seen.legacy else "this is not the legacy pattern"
             return f"{words}: set legacy_pattern = {str(seen.legacy).lower()}"
-        if seen.inverted != said.inverted:
-            negation = "" if seen.inverted else "not "
-            return f"black and white are {negation}exchanged: set inverted = {str(seen.inverted).lower()}"
         if seen.dictionary.rpartition("_")[0] != said.dictionary.rpartition("_")[0]:
             return f'the markers are of {seen.dictionary}: set dictionary = "{seen.dictionary}"'
     if isinstance(seen, Circles) and isinstance(said, Circles):

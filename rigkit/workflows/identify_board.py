@@ -162,18 +162,17 @@ def _mirrored(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 
 
 def _otherwise(pictures: Sequence[tuple[str, GreyImage]], guess: BoardGuess | None) -> str | None:
-    """Say that images are mirrored, or negatives, where boards with marks are seen in them when that is undone, and
-    without it only `guess`, which may be wrong: nothing, few chessboards, or some with something in their squares."""
+    """Say that images are mirrored, where boards with marks are seen in them when that is undone, and without it only
+    `guess`, which may be wrong: nothing, few chessboards, or some with something in their squares."""
     if guess is not None and (
         guess.board.pattern.type != Chessboard.type
         or (not guess.marked and len(guess.images) >= MIN_SHARE_OF_IMAGES * len(pictures))
     ):
         return None
     some = pictures[:: max(1, -(-len(pictures) // EXPLAINING_IMAGES))]
-    for undone, said in ((_flipped, _in_a_mirror), (_exchanged, _in_negatives)):
-        marks = guess_board([undone(image) for _, image in some])
-        if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
-            return said(some[marks.images[0]][0])
+    marks = guess_board([_flipped(image) for _, image in some])
+    if marks is not None and marks.board.identified and len(marks.images) >= MIN_SHARE_OF_IMAGES * len(some):
+        return _in_a_mirror(some[marks.images[0]][0])
     return None
 
 
@@ -190,21 +189,10 @@ def _flipped(image: GreyImage) -> GreyImage:
     return image[:, ::-1].copy()
 
 
-def _exchanged(image: GreyImage) -> GreyImage:
-    return 255 - image
-
-
 def _in_a_mirror(name: str) -> str:
     return (
         f"the images are mirrored: '{Path(name).name}' shows its board only when it is flipped left to right; "
         "switch off mirroring in the camera or the program that writes them, or flip all of them"
-    )
-
-
-def _in_negatives(name: str) -> str:
-    return (
-        f"the images are negatives: '{Path(name).name}' shows its board only with black and white exchanged; "
-        "exchange them in all images"
     )
 
 

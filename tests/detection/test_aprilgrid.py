@@ -182,3 +182,17 @@ def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
 def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
     with pytest.raises(InputError, match="board 'k'"):
         replace(KALIBR, pattern=AprilGrid(**{"spacing": 0.3, **pattern}))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("squares", [True, False])
+def test_white_tags_are_found_where_black_ones_are_in_the_negative(squares: bool, rng: np.random.Generator) -> None:
+    black = Board("b", 8, 6, 60.0, 60.0, pattern=AprilGrid(0.3, corner_squares=squares))
+    white = replace(black, pattern=replace(black.pattern, inverted=True))
+    scene = facing(white)
+    image = np.asarray(scene.render(optics=Optics(0.5), noise_levels=2.0, rng=rng), np.uint8)
+    (found,) = detect_boards(image, [white])
+    assert found.complete and found.board_id == "b"
+    (negative,) = detect_boards(255 - image, [black])
+    np.testing.assert_array_equal(found.pixels, negative.pixels)
+    assert np.sqrt((errors(found, scene.truth()[0]) ** 2).sum(axis=1).mean()) < 0.05
+    assert detect_boards(image, [black]) == ()

@@ -34,6 +34,7 @@ PLACES = (0.01, 0.02)
     [
         ((10, 8), AprilGrid(0.25)),
         ((8, 6), AprilGrid(0.5, "tag25h9", 1, 4, "opencv")),
+        ((8, 6), AprilGrid(0.3, inverted=True)),
         ((8, 6), AprilGrid(0.4, corner_squares=False)),
         ((10, 14), AprilGrid(0.2, "DICT_6X6_50", 1, 3, "opencv", corner_squares=False)),
         ((8, 5), Charuco("DICT_5X5_50", 45.0)),
@@ -43,7 +44,19 @@ PLACES = (0.01, 0.02)
         ((4, 11), Circles("asymmetric", diameter_mm=24.0)),
         ((8, 7), Circles("hexagonal", diameter_mm=30.0, inverted=True)),
     ],
-    ids=["kalibr", "opencv", "alone", "aruco", "charuco", "legacy", "chessboard", "circles", "asymmetric", "hexagonal"],
+    ids=[
+        "kalibr",
+        "opencv",
+        "white",
+        "alone",
+        "aruco",
+        "charuco",
+        "legacy",
+        "chessboard",
+        "circles",
+        "asymmetric",
+        "hexagonal",
+    ],
 )
 def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Pattern) -> None:
     board = Board("b", *size, 60.0, 60.0, pattern=pattern)
@@ -62,6 +75,7 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert abs(found.spacing - pattern.spacing) <= PLACES[0] + 1e-9
         assert (found.family, found.border, found.numbering) == (pattern.family, pattern.border, pattern.numbering)
         assert (found.corner_squares, found.first_tag) == (pattern.corner_squares, pattern.first_tag)
+        assert found.inverted == pattern.inverted
     elif isinstance(pattern, Charuco):
         assert isinstance(found, Charuco)
         assert abs(found.marker_mm - 0.75) <= PLACES[1] + 1e-9

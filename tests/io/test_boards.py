@@ -19,7 +19,7 @@ from rigkit.io.board_words import board_in_words, board_of_words
 PATTERNS = [
     Chessboard(),
     Charuco("DICT_4X4_100", 20.0, 3, legacy=True, inverted=True),
-    AprilGrid(0.25, "tag25h9", 1, 2, "opencv", corner_squares=False),
+    AprilGrid(0.25, "tag25h9", 1, 2, "opencv", corner_squares=False, inverted=True),
     Circles("asymmetric", "left", 12.0),
     Circles(diameter_mm=12.0),
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -39,6 +39,7 @@ class AprilGrid(Pattern):
     first_tag : number of the first tag; boards in one image need different ones.
     numbering : "kalibr" or "opencv".
     corner_squares : small black squares fill the corners between tags, and touch them.
+    inverted : black and white are exchanged.
     """
 
     type: ClassVar[str] = "aprilgrid"
@@ -54,6 +55,7 @@ class AprilGrid(Pattern):
         Key("first_tag", "first_tag", int, "first_tag = 0"),
         Key("numbering", "numbering", str, 'numbering = "kalibr" (rows from the bottom) or "opencv" (from the top)'),
         Key("corner_squares", "corner_squares", bool, "corner_squares = true (small black squares between the tags)"),
+        Key("inverted", "inverted", bool, "inverted = false (true: black and white exchanged)"),
     )
 
     spacing: float
@@ -61,7 +63,9 @@ class AprilGrid(Pattern):
     border: int = 2
     first_tag: int = 0
     numbering: str = "kalibr"
+    _: KW_ONLY
     corner_squares: bool = True
+    inverted: bool = False
 
     @property
     def points_per_count(self) -> int:
@@ -134,10 +138,11 @@ class AprilGrid(Pattern):
             size = self.spacing * np.array(squares_mm)
             place = np.stack([column.ravel(), row.ravel()], axis=-1) * step - size
             out.append(np.concatenate([place, np.tile(size, (len(place), 1))], axis=1))
-        return Ink(rectangles=np.concatenate(out))
+        return Ink(rectangles=np.concatenate(out), inverted=self.inverted)
 
     def describe(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> str:
         plain = Pattern.describe(self, columns, rows, squares_mm)
         last = self.first_tag + columns * rows // 4 - 1
         words = f"{plain}, {self.family} {self.first_tag} to {last}, border {self.border}, spacing {self.spacing:g}"
-        return words + ("" if self.corner_squares else ", no squares between") + f", numbered as {self.numbering}"
+        words += ("" if self.corner_squares else ", no squares between") + f", numbered as {self.numbering}"
+        return words + (", inverted" if self.inverted else "")

@@ -27,7 +27,7 @@ ENOUGH_TAGS = 12
 OUTLINE_STEP = 0.5
 """Widths of tags that are tried, modules: between them likeness is a parabola."""
 
-MOVED = np.arange(-4, 5) / SAMPLES
+EDGE_MOVES = np.arange(-4, 5) / SAMPLES
 """By how much edges may have moved into what is dark, modules: at half a module a lone bit is gone."""
 
 
@@ -66,13 +66,13 @@ def module_size(image: GreyImage, upright: FloatArray, bits: BoolArray, step: fl
     along = (np.arange(0, SAMPLES * (count - 1), STRIDE) + 0.5) / SAMPLES - 0.5 * (count - 1)
     places = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
     models = _normal(_codes(bits))
-    likeness = np.zeros((len(outlines), len(MOVED)))
+    likeness = np.zeros((len(outlines), len(EDGE_MOVES)))
     for k, outline in enumerate(outlines):
-        seen = _normal(sample(image, transferred(maps, 0.5 + places / outline)))
+        seen = _normal(sample(image, transferred(maps, 0.5 + places / outline)).astype(np.float64))
         likeness[k] = np.einsum("ns,dns->d", seen, models)
     at, way = np.unravel_index(likeness.argmax(), likeness.shape)
     outline = outlines[0] + OUTLINE_STEP * _peak(likeness[:, way], int(at))
-    moved = MOVED[0] + _peak(likeness[at], int(way)) / SAMPLES
+    moved = EDGE_MOVES[0] + _peak(likeness[at], int(way)) / SAMPLES
     edges = _edges(image, maps, outline, count, step * outline)
     if edges is None:
         return None
@@ -89,11 +89,11 @@ def _codes(bits: BoolArray) -> FloatArray:
     first = SAMPLES + SAMPLES // 2
     part = slice(first, first + SAMPLES * (count - 1), STRIDE)
     out = []
-    for moved in np.rint(MOVED * SAMPLES).astype(int):
+    for moved in np.rint(EDGE_MOVES * SAMPLES).astype(int):
         window = np.ones((2 * abs(moved) + 1,) * 2, np.uint8)
         run = cv2.dilate if moved > 0 else cv2.erode
         out.append(np.stack([run(one, window)[part, part] for one in fine]))
-    return np.array(out, np.float64).reshape(len(MOVED), len(bits), -1)
+    return np.array(out, np.float64).reshape(len(EDGE_MOVES), len(bits), -1)
 
 
 def _normal(levels: FloatArray) -> FloatArray:

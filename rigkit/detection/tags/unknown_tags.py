@@ -108,14 +108,17 @@ Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
 
 @dataclass(eq=False, slots=True)
 class TagSightings:
-    """The tags of all images, as `seen`; `kinds` has the sum of likenesses of each kind."""
+    """The tags of all images, as `seen`; `kinds` has the sum of likenesses of each kind. Inverted tags are white on
+    black."""
 
     families: tuple[Family, ...] = APRIL_TAGS
+    inverted: bool = False
     kinds: Counter[Kind] = field(default_factory=Counter)
     seen: list[_SeenTags] = field(default_factory=list)
 
     def look(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image; say whether there are some."""
+        image = 255 - image if self.inverted else image
         seen = Seen.of(image)
         # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
         for at in (seen, *seen.coarser()):
@@ -123,7 +126,7 @@ class TagSightings:
             found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
             if any(found):
                 return True
-        return self.look_alone(index, image)
+        return self._look_alone(index, image)
 
     def _read(self, index: int, image: GreyImage, lattice: Lattice) -> bool:
         quads, squares = squares_of(lattice, dark=True)
@@ -161,6 +164,9 @@ class TagSightings:
     def look_alone(self, index: int, image: GreyImage) -> bool:
         """Read the tags of an image that stand alone, without squares between their corners; say whether there are
         some."""
+        return self._look_alone(index, 255 - image if self.inverted else image)
+
+    def _look_alone(self, index: int, image: GreyImage) -> bool:
         quads = quadrilaterals(image)
         return any(self._count_alone(index, image, quads, *read) for read in _read_kinds(image, quads, self.families))
 
@@ -295,7 +301,7 @@ def guessed_grids(seen: TagSightings) -> list[GuessedGrid]:
     for cluster in _of_one_board(groups):
         # Corners between squares lie where they were printed, whatever light and ink do.
         sure = [group for group in cluster if not group[0].rough]
-        board = _board_of(cluster, kind, _steps_of(sure or cluster))
+        board = _board_of(cluster, kind, _steps_of(sure or cluster), seen.inverted)
         if board is not None:
             tags = sum(len(own) for *_, own in cluster)
             images = tuple(sorted({item.image for item, *_ in cluster}))
@@ -331,7 +337,7 @@ def _of_one_board(groups: Sequence[Counted]) -> list[list[Counted]]:
     return [members for _, members in clusters]
 
 
-def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray) -> Board | None:
+def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray, inverted: bool) -> Board | None:
     """Return the board, with tags of 1 mm, that groups of its tags show, with `steps` (K,) from tag to tag; None where
     they do not tell its spacing."""
     family, border, alone = kind
@@ -352,5 +358,5 @@ def _board_of(cluster: Sequence[Counted], kind: Kind, steps: FloatArray) -> Boar
     if first + columns * rows > marker_count(TAG_FAMILIES.get(family, family)):
         return None
     family = smallest_dictionary(family, first + columns * rows)
-    pattern = AprilGrid(spacing, family, border, first, numbering, not alone)
+    pattern = AprilGrid(spacing, family, border, first, numbering, corner_squares=not alone, inverted=inverted)
     return Board("board", 2 * columns, 2 * rows, 1.0, 1.0, pattern=pattern)

@@ -31,34 +31,38 @@ class AprilGridFinder(Finder):
     """Corners of tags are linked as those of chessboards are, only that opposite neighbours may lie further apart."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
-        tags = [TagBoard.of(board) for board in boards]
+        every = [TagBoard.of(board) for board in boards]
         found = []
-        for board, pixels in self._placed(search, tags):
-            seen = tag_corners(search.grey, board, pixels, search.camera) if np.isfinite(pixels).any() else None
-            if seen is not None and len(seen.grid) >= search.min_corners:
-                found.append(seen)
+        for inverted in (False, True):
+            tags = [item for item in every if item.pattern.inverted == inverted]
+            # The negative of an image has its corners in the same places.
+            grey = 255 - search.grey if inverted and tags else search.grey
+            for item, pixels in self._placed(grey, tags):
+                seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
+                if seen is not None and len(seen.grid) >= search.min_corners:
+                    found.append(seen)
         return found
 
-    def _placed(self, search: Search, tags: Sequence[TagBoard]) -> Iterator[tuple[TagBoard, FloatArray]]:
+    def _placed(self, grey: GreyImage, tags: Sequence[TagBoard]) -> Iterator[tuple[TagBoard, FloatArray]]:
         """Yield the boards and their rough corners (R, C, 2), NaN where none is seen."""
         joined = [item for item in tags if item.pattern.corner_squares]
-        yield from ((item, placed_tags(search.grey, item)) for item in tags if not item.pattern.corner_squares)
+        yield from ((item, placed_tags(grey, item)) for item in tags if not item.pattern.corner_squares)
         if not joined:
             return
-        levels = each_level(search.grey)
+        levels = each_level(grey)
         finest = next(levels)
         corners, _ = find_corners([finest])
-        placed = list(_placed_by(corners, finest, search.grey, joined))
-        if not all(_nearly_whole(item, pixels, search.grey.shape) for item, pixels in placed):
+        placed = list(_placed_by(corners, finest, grey, joined))
+        if not all(_nearly_whole(item, pixels, grey.shape) for item, pixels in placed):
             coarser = list(levels)
             corners, saddles = find_corners(coarser, corners)
-            placed = list(_placed_by(corners, finest, search.grey, joined))
+            placed = list(_placed_by(corners, finest, grey, joined))
             # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
             for k, level in enumerate(coarser):
                 alone = each_once(saddles.by_level[k:])
                 if len(alone) < MIN_SEEN_AT_FIRST or any(np.isfinite(pixels).any() for _, pixels in placed):
                     break
-                placed = list(_placed_by(alone, level, search.grey, joined))
+                placed = list(_placed_by(alone, level, grey, joined))
         yield from placed
 
 
