@@ -19,9 +19,9 @@ from rigkit.core.progress import Progress, silent
 from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.tags.in_squares import likeness_at
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagSightings, guessed_grids
+from rigkit.detection.whole_charuco import next_row, of_pattern
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
     MIN_SURE_CORNERS,
@@ -34,12 +34,6 @@ from rigkit.detection.whole_grids import (
 
 LOOKING = "looking which board it is"
 """What progress is told of."""
-
-IMAGES_OF_PATTERN = 8
-"""Images that are asked which of two patterns a board has, where the places of its markers do not tell."""
-
-SURE_OF_PATTERN = 3.0
-"""They tell where this many standard deviations speak for one of the two."""
 
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
@@ -94,7 +88,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     sure: list[int] = []
     for k, found in enumerate(in_threads(detect_boards, images)):
         progress(LOOKING, k, len(images))
-        grids = [(one, seen) for one in found if (seen := grid_seen(one, images[k].shape)) is not None]
+        grids = [(one, seen) for one in found if (seen := grid_seen(one, images[k])) is not None]
         plain.append([seen for _, seen in grids])
         if any(_without_marks(images[k], one) for one, _ in grids):
             sure.append(k)
@@ -126,8 +120,13 @@ def _guess_of(
         return _of_grids(grids)
     charuco = guessed_charuco(markers)
     if charuco:
-        board, sure = _of_pattern(charuco, [images[k] for k in markers.images])
-        return BoardGuess(board=board, images=tuple(markers.images), either_pattern=not sure)
+        shown = [images[k] for k in markers.images]
+        more = next_row(charuco[0], shown)
+        while more and (taller := guessed_charuco(markers, charuco[0].rows + 1)):
+            charuco, more = taller, next_row(taller[0], shown)
+        board, sure = of_pattern(charuco, shown)
+        sizes = () if more is False else (board.size,)
+        return BoardGuess(board=board, images=tuple(markers.images), sizes=sizes, either_pattern=not sure)
     guess = _plain_guess(images, plain)
     told = guess is not None and guess.told
     # A chessboard may hang on the wall, and an unread mark be taken for ink in its squares.
@@ -165,37 +164,6 @@ def _of_grids(grids: Sequence[GuessedGrid]) -> BoardGuess:
         rough=first.rough,
         either=first.either,
     )
-
-
-def _of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
-    """Return the board of the pattern of today or of the one before it, and whether the images tell which.
-
-    Where a row has an odd number of squares, the two are numbered alike but for one marker in every second row, which
-    has its place at one end or at the other: there that marker is like what is seen, or it is not.
-    """
-    if len(boards) == 1:
-        return boards[0], True
-    some = images[:: -(-len(images) // IMAGES_OF_PATTERN)]
-    excess, places = np.sum(list(in_threads(lambda image: _for_the_second(boards, image), some)), axis=0)
-    return boards[int(excess > 0.0)], bool(abs(excess) >= SURE_OF_PATTERN * np.sqrt(max(places, 1.0)))
-
-
-def _for_the_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, int]:
-    """Return by how much more the markers that two boards have in different places are like what is seen where the
-    second has them, in standard deviations of one, and at how many places."""
-    found = next((item for item in detect_boards(image, boards[:1]) if item.board_id is not None), None)
-    pattern = boards[0].pattern
-    if found is None or not isinstance(pattern, Charuco):
-        return 0.0, 0
-    # Where both have them in this board's grid: the second's may be moved by a column.
-    own, others = (board.pattern.places(*board.size) for board in boards if isinstance(board.pattern, Charuco))
-    steps, counts = np.unique(own - others, axis=0, return_counts=True)
-    others = others + steps[counts.argmax()]
-    apart = np.flatnonzero((own != others).any(axis=1))
-    ways = [
-        likeness_at(image, found.lattice(), at[apart], pattern.first_marker + apart, boards[0]) for at in (own, others)
-    ]
-    return float(ways[1].sum() - ways[0].sum()), sum(int(np.count_nonzero(way)) for way in ways)
 
 
 def _without_marks(image: GreyImage, found: BoardDetection) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardDetection
+from rigkit.detection.saddles.response import GreyImage, sample
 
 MIN_SHARE_OF_LINE = 0.5
 """A grid ends where this part of its next line would be seen, but is not: the frame may hide the rest."""
@@ -22,6 +23,14 @@ MIN_SURE_CORNERS = 20
 
 UNSEEN_BORDER_PX = 5.0
 """Corners nearer to the image's border may be missed (sharp ones are found from 3 px on): a grid may go on there."""
+
+IN_SQUARE = 0.4
+"""Where in a square it is looked at, from the line on: the next line may be foretold a little too near."""
+
+MIN_SQUARES_BEYOND, MIN_CONTRAST_BEYOND, SURE_BEYOND = 5, 0.1, 3.0
+"""Beyond the last line of a grid, so many squares beside others that are as those two rows before, with this part of
+their contrast and by so many standard deviations, are squares. At the rim of a fisheye these are 0.1 to 0.4 and 3.4 to
+12 where a board goes on, and -0.1 to 0.12 and -3 to 2.4 where it ends (REAL)."""
 
 MIN_IMAGES_OF_GUESS = 2
 """A size of chessboards is told from so many images, or from the only one."""
@@ -72,31 +81,59 @@ class GridSeen:
         )
 
 
-def grid_seen(found: BoardDetection, shape: tuple[int, int]) -> GridSeen | None:
-    """Return how far a grid goes in an image of so many rows and columns; None where it is no more than a patch."""
+def grid_seen(found: BoardDetection, image: GreyImage) -> GridSeen | None:
+    """Return how far a grid goes in an image; None where it is no more than a patch."""
     if not found.complete and len(found.grid) < max(MIN_SURE_CORNERS, MIN_SHARE_OF_GRID * found.columns * found.rows):
         return None
     lattice = found.lattice()
-    borders = np.array(shape[::-1]) - 1.0
+    borders = np.array(image.shape[::-1]) - 1.0
     along_columns = lattice.transpose(1, 0, 2)
     first, last, top, bottom = (
         _next_line(lines, borders) for every in (along_columns, lattice) for lines in (every, every[::-1])
     )
     ends = tuple(
         min(inside for inside, _ in both) >= MIN_SHARE_OF_LINE * lines.shape[1]
+        and not any(_goes_on(image, side) for side in (lines, lines[::-1]))
         for both, lines in (((first, last), along_columns), ((top, bottom), lattice))
     )
     cut = any(outside > inside for inside, outside in (first, last, top, bottom))
     return GridSeen((found.columns, found.rows), (ends[0], ends[1]), cut)
 
 
-def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
-    """Return how many corners before the first line of a grid (lines, corners of each, 2), NaN where there is none,
-    would be in the image, and were not found there, and how many would not, as far as the first line foretells it."""
+def _beyond(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the two lines before the first of a grid (lines, corners of each, 2), as far as it foretells them."""
     first, second, third = (lines[k] if k < len(lines) else np.full_like(lines[0], np.nan) for k in range(3))
     # Lenses bend lines; where the third corner is missing they are taken for straight.
     bend = np.nan_to_num(first - 2.0 * second + third)
-    beyond = 2.0 * first - second + bend
+    return 2.0 * first - second + bend, 3.0 * first - 2.0 * second + 3.0 * bend
+
+
+def _goes_on(image: GreyImage, lines: FloatArray) -> bool:
+    """Say whether squares are seen beyond the next line before the first of a grid (lines, corners of each, 2): at the
+    rim of a lens, in poor light or blur a board goes on where its corners are not found."""
+    first, (near, far) = lines[0], _beyond(lines)
+    places = np.stack([first + IN_SQUARE * (lines[1] - first), near + IN_SQUARE * (far - near)])
+    places = 0.5 * (places[:, 1:] + places[:, :-1])
+    last = np.array(image.shape[::-1]) - 1.0
+    seen = (np.isfinite(places) & (places >= 0.0) & (places <= last)).all(axis=(0, 2))
+    # Squares beside each other.
+    pairs = seen[1:] & seen[:-1]
+    count = int(np.count_nonzero(pairs))
+    if count < MIN_SQUARES_BEYOND:
+        return False
+    within, beyond = np.diff(sample(image, np.where(seen[:, None], places, 0.0)), axis=1)[:, pairs].astype(np.float64)
+    # Every second row has the same colours; what lies beyond a board does not change with its squares.
+    alike = beyond * np.sign(within)
+    scatter = float(alike.std()) / np.sqrt(count)
+    return bool(
+        np.median(alike) > MIN_CONTRAST_BEYOND * np.median(np.abs(within)) and alike.mean() > SURE_BEYOND * scatter
+    )
+
+
+def _next_line(lines: FloatArray, borders: FloatArray) -> tuple[int, int]:
+    """Return how many corners before the first line of a grid (lines, corners of each, 2), NaN where there is none,
+    would be in the image, and were not found there, and how many would not, as far as the first line foretells it."""
+    beyond, _ = _beyond(lines)
     # Corners that are missing are NaN, and not inside.
     inside = ((beyond >= UNSEEN_BORDER_PX) & (beyond <= borders - UNSEEN_BORDER_PX)).all(axis=1)
     return int(np.count_nonzero(inside)), int(np.count_nonzero(np.isfinite(beyond[:, 0]) & ~inside))

@@ -229,7 +229,7 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
 
 def _untold(guess: BoardGuess) -> str:
     """Say what images show of a board, where that is not all: a chessboard that has one of several sizes, or the only
-    one at least, or an AprilGrid whose edges are aside of where they were printed."""
+    one at least, a ChArUco board with more rows, or an AprilGrid whose edges are aside of where they were printed."""
     if not guess.sizes:
         either = [guess.board, *filter(None, [guess.either])]
         return (
@@ -238,6 +238,11 @@ def _untold(guess: BoardGuess) -> str:
             "hundredths; take images with less light, or measure a tag and the gap beside it"
         )
     words = " or ".join(f"{columns} x {rows}" for columns, rows in guess.sizes)
+    if guess.board.identified:
+        return (
+            f"a ChArUco board of at least {words} inner corners, {words_of_board(guess.board)}: none shows where its "
+            "rows end; count them on the board"
+        )
     if len(guess.sizes) > 1:
         return f"a chessboard of {words} inner corners and do not tell which; count them on the board"
     return (

@@ -56,6 +56,21 @@ def test_a_grid_ends_where_most_of_its_last_line_is_seen(missing: int, ends: tup
     grid = np.stack([column, row], axis=1)[missing:]
     pixels = np.asarray(60.0 + 40.0 * grid, np.float64)
     board = BoardDetection(None, 8, 6, grid, pixels, np.array([0.1] * len(grid), np.float64))
-    assert grid_seen(board, (500, 500)) == GridSeen((8, 6), ends)
-    cut = grid_seen(board, (290, 500))
+    image = np.full((500, 500), 128, np.uint8)
+    assert grid_seen(board, image) == GridSeen((8, 6), ends)
+    cut = grid_seen(board, image[:290])
     assert cut is not None and cut.cut
+
+
+@pytest.mark.parametrize("rows", [6, 9])
+def test_a_grid_goes_on_where_squares_are_seen_beyond_its_last_corners(rows: int) -> None:
+    """Six rows of corners were found; a board of nine has fainter squares below them."""
+    v, u = np.indices((500, 500))
+    squares = (((u - 60) // 40 + (v - 60) // 40) % 2 == 0) & (u >= 20) & (u < 380) & (v >= 20) & (v < 60 + 40 * rows)
+    image = np.where(squares, 40, 200).astype(np.float64)
+    image = 120.0 + (image - 120.0) * np.where(v < 280, 1.0, 0.25)
+    image += np.random.default_rng(1).normal(0.0, 2.0, image.shape)
+    row, column = np.indices((6, 8)).reshape(2, -1)
+    grid = np.stack([column, row], axis=1)
+    board = BoardDetection(None, 8, 6, grid, 60.0 + 40.0 * grid, np.full(len(grid), 0.1))
+    assert grid_seen(board, np.clip(image, 0, 255).astype(np.uint8)) == GridSeen((8, 6), (True, rows == 6))

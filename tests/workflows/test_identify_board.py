@@ -119,3 +119,17 @@ def test_tags_whose_edges_have_moved(
     assert "take images with less light" in err
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
     assert "measure a tag and the gap beside it, and give it as --board" in capsys.readouterr().err
+
+
+def test_rows_of_a_marked_board_that_no_image_shows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40), np.uint8))
+    board = Board("b", 10, 6, 1.0, 1.0, pattern=Charuco("DICT_4X4_50", 0.75))
+    seen = BoardGuess(board=board, images=(0,), sizes=(board.size,))
+    monkeypatch.setattr(identify_board, "guess_board", lambda *_: seen)
+    assert main(["board", "identify", str(tmp_path)]) == 1
+    words = "a ChArUco board of at least 10 x 6 inner corners, charuco:10x6xMM,dictionary=DICT_4X4_50"
+    assert words in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
+    assert "count them on the board, and give it as --board" in capsys.readouterr().err

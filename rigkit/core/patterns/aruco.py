@@ -49,3 +49,9 @@ def smallest_dictionary(name: str, count: int) -> str:
     if not kind or size != str(SIZES[-1]):
         return name
     return next((f"{kind}_{n}" for n in SIZES if count <= n), name)
+
+
+def largest_dictionary(name: str) -> str:
+    """Return the largest dictionary of the kind of `name`, which begins with the same markers."""
+    kind, _, size = name.rpartition("_")
+    return f"{kind}_{SIZES[-1]}" if size in map(str, SIZES) else name

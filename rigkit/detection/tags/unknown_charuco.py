@@ -130,9 +130,9 @@ def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntAr
         yield np.array(list(places)), np.array(list(places.values()))
 
 
-def guessed_charuco(seen: MarkerSightings) -> list[Board]:
+def guessed_charuco(seen: MarkerSightings, exactly: int | None = None) -> list[Board]:
     """Return the ChArUco board that most markers are of, with squares of 1 mm: one of either pattern where the markers
-    fit both, none where no board is told."""
+    fit both, none where no board is told. It has `exactly` so many rows, or those that were read."""
     if not seen.markers:
         return []
     (dictionary, inverted), _ = seen.kinds.most_common(1)[0]
@@ -153,10 +153,11 @@ def guessed_charuco(seen: MarkerSightings) -> list[Board]:
     first = _first_marker(own)
     last = max(int(numbers.max()) for numbers, *_ in own)
     side = round(float(np.median([side for _, _, side in own])), 2)
-    tall = Counter(int(np.ptp(places[:, 1])) for _, places, _ in own)
+    tall = {int(np.ptp(places[:, 1])) for _, places, _ in own}
+    tall = {*tall, round(2.0 * (last + 1 - first) / (columns + 1)) - 1} if exactly is None else {exactly}
     found: list[tuple[tuple[int, int], Board]] = []
     for legacy in (False, True):
-        for rows in sorted({*tall, round(2.0 * (last + 1 - first) / (columns + 1)) - 1}):
+        for rows in sorted(tall):
             if rows < 2:
                 continue
             least = smallest_dictionary(dictionary, first + ((columns + 1) * (rows + 1) + 1) // 2)

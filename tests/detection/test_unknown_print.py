@@ -1,0 +1,119 @@
+"""Boards that nobody has described, where light or ink has moved edges, or rows of markers were not read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from detection_bench.scenes import one_board
+
+from rigkit.cameras.pinhole import Pinhole
+from rigkit.core.boards import Board
+from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.detection.saddles.response import GreyImage, grey_image
+from rigkit.detection.tags import unknown_tags
+from rigkit.detection.tags.unknown_charuco import MarkerSightings
+from rigkit.detection.tags.unknown_tags import TagSightings
+from rigkit.detection.unknown import guess_board
+from rigkit.detection.whole_charuco import next_row
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.synthetic.render import Optics, render
+from rigkit.synthetic.scene import PlacedBoard
+
+SURE_PLACES, SPREAD_PLACES = 0.01, 0.06
+"""How well spacing is read between squares, and where edges have moved by up to a third of the gap."""
+
+
+@pytest.mark.parametrize(
+    ("pattern", "moved_px", "rough"),
+    [
+        (AprilGrid(0.3), 1, False),
+        (AprilGrid(0.3, border=1, numbering="opencv", corner_squares=False), 1, True),
+        (AprilGrid(0.4, corner_squares=False), 1, True),
+    ],
+    ids=["squares", "one", "two"],
+)
+def test_tags_whose_edges_have_moved(pattern: AprilGrid, moved_px: int, rough: bool) -> None:
+    """Bright parts run over into dark ones, or dark ones into bright ones: the print is told, not what it looks like,
+    or that it is not known; between squares corners stay where they were."""
+    board = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
+    images = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        seen = one_board(rng, board=board, max_tilt_deg=35.0).render(optics=Optics(0.5), noise_levels=2.0, rng=rng)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(moved_px) + 1,) * 2)
+        run = (cv2.dilate if moved_px > 0 else cv2.erode)(np.asarray(seen, np.uint8), disc)
+        images.append(grey_image(cv2.GaussianBlur(run, (0, 0), 0.6)))
+    guess = guess_board(images)
+    assert guess is not None and isinstance(guess.board.pattern, AprilGrid)
+    found = guess.board.pattern
+    assert (found.border, found.corner_squares) == (pattern.border, pattern.corner_squares)
+    assert abs(found.spacing - pattern.spacing) <= (SPREAD_PLACES if rough else SURE_PLACES)
+    assert (guess.rough, guess.told) == (rough, not rough)
+
+
+@pytest.mark.parametrize("sure", [False, True])
+def test_edges_that_have_moved_too_far_for_the_border(sure: bool) -> None:
+    """Both borders are named, with modules as large and tags as far apart; one image that is sure is enough."""
+    seen = TagSightings()
+    row, column = np.divmod(np.arange(12), 4)
+    for image, either in enumerate((True, not sure)):
+        own = unknown_tags._SeenTags(
+            image=image,
+            kind=("tag36h11", 2, True),
+            numbers=np.arange(12),
+            places=np.stack([column, row], axis=-1),
+            steps=np.full(17, 1.45),
+            rough=either,
+            either=either,
+        )
+        seen.kinds[own.kind] += 1
+        seen.seen.append(own)
+    (grid,) = unknown_tags.guessed_grids(seen)
+    assert grid.board.size == (8, 6) and grid.rough is not sure
+    if sure:
+        assert grid.either is None
+    else:
+        assert grid.either is not None and isinstance(grid.either.pattern, AprilGrid)
+        assert (grid.either.pattern.border, grid.either.pattern.spacing) == (1, 0.81)
+
+
+MARKED = Board("b", 10, 7, 60.0, 60.0, pattern=Charuco("DICT_4X4_50", 45.0))
+LEGACY = replace(MARKED, pattern=Charuco("DICT_4X4_50", 45.0, legacy=True))
+
+
+def straight(board: Board) -> list[GreyImage]:
+    """Return images of 720 x 520 px of a board with squares of 50 px, corners from row 110 on."""
+    camera = Pinhole((720, 520), np.array([500.0, 500.0, 110.0, 110.0]))
+    places = [PlacedBoard(board, Rigid3(np.eye(3), [shift, 0.0, 600.0])) for shift in (0.0, 30.0)]
+    return [grey_image(render([place], camera, Rigid3.identity(), optics=Optics(0.6))) for place in places]
+
+
+@pytest.mark.parametrize("board", [MARKED, LEGACY], ids=["today", "legacy"])
+def test_whether_a_board_has_one_more_row_of_markers(board: Board) -> None:
+    whole = straight(board)
+    assert next_row(board, whole) is False
+    assert next_row(replace(MARKED, rows=6), whole) is True
+    # Below the row of squares before the fifth row of corners the frame ends.
+    assert next_row(replace(MARKED, rows=4), [image[:330].copy() for image in whole]) is None
+
+
+def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
+    guess = guess_board([image[:330].copy() for image in straight(MARKED)])
+    assert guess is not None and guess.board.pattern.type == "charuco" and not guess.told
+    assert guess.sizes == ((10, 4),)
+
+
+def test_rows_that_were_not_read_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blur hides markers, not where they are."""
+    read = MarkerSightings.look
+
+    def upper(self: MarkerSightings, index: int, image: GreyImage) -> bool:
+        return read(self, index, image[:380].copy())
+
+    monkeypatch.setattr(MarkerSightings, "look", upper)
+    guess = guess_board(straight(MARKED))
+    assert guess is not None and guess.told and guess.board.size == (10, 7)
