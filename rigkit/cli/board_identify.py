@@ -32,6 +32,9 @@ def identify(args: argparse.Namespace) -> int:
     print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
     if found.beside:
         print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}")
+    if found.elsewhere:
+        words, others = found.elsewhere
+        print(f"{len(others)} other images, such as '{others[0]}', show another board: --board {words}")
     if path is not None:
         text = board_text(board.with_squares(args.square_mm, args.square_mm), "as seen in images", path)
         write_atomic(path, text, force=args.force)

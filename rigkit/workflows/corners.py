@@ -77,7 +77,9 @@ def session_views(
         if item.size_px != size_px:
             width, height = item.size_px
             turned = ", turned by some program" if item.size_px == size_px[::-1] else ""
-            dropped.append((name, f"{width}x{height} px{turned}, most images have {size_px[0]}x{size_px[1]}"))
+            dropped.append(
+                (name, f"{width}x{height} px{turned}, most images with boards have {size_px[0]}x{size_px[1]}")
+            )
             continue
         own, reason = views_of_image(name, boards[name], session.boards)
         views += own
@@ -100,9 +102,11 @@ def session_views(
 
 
 def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[int, int]:
-    """Return the size that most images have; raises InputError where as many as a third have another."""
-    counts = Counter(item.size_px for item in found.values()).most_common()
-    if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(found):
+    """Return the size that most images with boards have, or most of all where none has one; raises InputError where as
+    many as a third have another."""
+    counted_ones = [item for item in found.values() if item.detections] or list(found.values())
+    counts = Counter(item.size_px for item in counted_ones).most_common()
+    if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(counted_ones):
         first = {item.size_px: name for name, item in reversed(list(found.items()))}
         sizes = " and ".join(f"{w}x{h} px ({n}, such as '{first[w, h]}')" for (w, h), n in counts[:2])
         raise InputError(

@@ -16,6 +16,7 @@ from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
+from rigkit.detection.whole_grids import MIN_IMAGES_OF_GUESS
 from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
 from rigkit.io.video import Video, is_video
@@ -45,6 +46,7 @@ class IdentifiedBoard:
     beside : the words of other boards that the images show.
     unreadable : why other images could not be read.
     alike : names of images that show two of these boards: nothing tells whose marks are whose.
+    elsewhere : the words of a board that other images show, and their names, as far as they were looked at.
     either_pattern : it may as well be of the other ChArUco pattern (`BoardGuess.either_pattern`).
     """
 
@@ -55,6 +57,7 @@ class IdentifiedBoard:
     beside: tuple[str, ...] = ()
     unreadable: tuple[InputError, ...] = ()
     alike: tuple[str, ...] = ()
+    elsewhere: tuple[str, tuple[str, ...]] | None = None
     either_pattern: bool = False
 
 
@@ -90,6 +93,7 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
     if not guess.told:
         raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess)}")
     pictures = list(images.values())
+    elsewhere = _elsewhere([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images])
     twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
         board=guess.board,
@@ -99,8 +103,20 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
         beside=tuple(words_of_board(board) for board in guess.beside),
         unreadable=tuple(unreadable),
         alike=twice,
+        elsewhere=elsewhere,
         either_pattern=guess.either_pattern,
     )
+
+
+def _elsewhere(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, ...]] | None:
+    """Return the board, in words, that images show which do not show the one told, and their names; None where not most
+    of them show one."""
+    if len(rest) < MIN_IMAGES_OF_GUESS:
+        return None
+    guess = guess_board([image for _, image in rest])
+    if guess is None or not guess.told or len(guess.images) < max(MIN_IMAGES_OF_GUESS, MIN_SHARE_OF_IMAGES * len(rest)):
+        return None
+    return words_of_board(guess.board), tuple(rest[k][0] for k in guess.images)
 
 
 def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:

@@ -121,7 +121,7 @@ def test_images_left_out_are_named(rng: np.random.Generator) -> None:
     wrong = replace(views[3], pixels=np.clip(views[3].pixels + 30.0 * rng.normal(size=(54, 2)), 0.0, [1623.0, 1239.0]))
     result = calibrate([*views[:3], wrong, *views[4:]], SIZE, model="brown", board="flat")
     assert said(result, "image '003.png' is left out: only")
-    session = judge_session(result, [("a.png", "800x600 px, most images have 1624x1240")])
+    session = judge_session(result, [("a.png", "800x600 px, most images with boards have 1624x1240")])
     assert session[0] == result.verdicts[0] and "'a.png' is left out: 800x600 px" in session[1].message
     many = judge_session(result, [(f"{i}.png", "no board found") for i in range(5)])
     assert "5 images are left out, '0.png' the first: no board found" in many[1].message

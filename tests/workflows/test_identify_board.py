@@ -133,3 +133,15 @@ def test_rows_of_a_marked_board_that_no_image_shows(
     assert words in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path), "--square-mm", "40"]) == 2
     assert "count them on the board, and give it as --board" in capsys.readouterr().err
+
+
+def test_a_folder_of_two_boards(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Half of the images show one, half the other; calibration takes the images of one size that show its board."""
+    boards = [Board("a", 8, 6, 40.0, 40.0, pattern=AprilGrid(0.3)), Board("b", 8, 6, 40.0, 40.0)]
+    for k in range(4):
+        picture = one_board(np.random.default_rng(k), board=boards[k % 2], max_tilt_deg=10.0).render()
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.asarray(picture))
+    assert main(["board", "identify", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "seen in 2 of 4 images\n--board aprilgrid:4x3xMM,spacing=0.3" in out
+    assert "2 other images, such as '1.png', show another board: --board 8x6xMM" in out
