@@ -31,7 +31,8 @@ def identify(args: argparse.Namespace) -> int:
     print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
     print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
     if found.beside:
-        print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}")
+        seen = "" if board.identified else "   (as far as it is seen)"
+        print(f"beside it: {', '.join(f'--board {words}' for words in found.beside)}{seen}")
     if found.elsewhere:
         words, others = found.elsewhere
         print(f"{len(others)} other images, such as '{others[0]}', show another board: --board {words}")

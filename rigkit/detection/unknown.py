@@ -28,6 +28,7 @@ from rigkit.detection.whole_grids import (
     GridSeen,
     Size,
     grid_seen,
+    sizes_beside,
     told_size,
     whole_sizes,
 )
@@ -51,7 +52,7 @@ class BoardGuess:
     ----------
     board : with squares, or tags, of 1 mm.
     images : indices of the images that show it.
-    beside : other boards that images show.
+    beside : other boards that images show; chessboards as far as they are seen.
     sizes : empty where the images tell how large the board is. Otherwise it has so many columns and rows, or more; or
         one of several sizes, between which images do not decide.
     rough : light or ink has moved the edges of tags in all images: the spacing is known to some hundredths.
@@ -203,7 +204,8 @@ def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]
     if best is not None:
         sizes, shown = best
         board = Board("board", *sizes[0], 1.0, 1.0)
-        return BoardGuess(board=board, images=shown, sizes=sizes if len(sizes) > 1 else ())
+        others = tuple(Board("board", *size, 1.0, 1.0) for size in sizes_beside(plain, sizes[0], shown))
+        return BoardGuess(board=board, images=shown, beside=others, sizes=sizes if len(sizes) > 1 else ())
     shown = tuple(k for k, found in enumerate(plain) if found)
     if len(shown) < 0.5 * len(plain) or not shown:
         return None

@@ -38,6 +38,9 @@ MIN_IMAGES_OF_GUESS = 2
 MAX_SHARE_ALIKE_PARTS = 0.5
 """Parts of a board that the frame cuts are of one size in fewer of the images."""
 
+MIN_SHARE_BESIDE = 0.5
+"""Of the images that show a board, those with another beside it, at least: what clutter shows changes."""
+
 FEW, MANY = 0.25, 0.5
 """Images that show more of a board than others, in those that show the others' size: so few may see a row beside it
 that is none of it (of 1100 REAL images, sharp and made worse, none does), and so many are believed: rows where blur,
@@ -169,6 +172,15 @@ def told_size(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tu
     if not once or _more(plain, once[0]):
         return None
     return (once[0],), _showing(plain, once[0])
+
+
+def sizes_beside(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
+    """Return the sizes of grids that most of the images that show a board of this size show beside it, as far as they
+    are seen."""
+    counts = Counter(other for k in shown for other in {grid.size for grid in plain[k]} - {size})
+    return tuple(
+        other for other in _by_count(counts) if counts[other] >= max(MIN_IMAGES_OF_GUESS, MIN_SHARE_BESIDE * len(shown))
+    )
 
 
 def _weighed(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:

@@ -240,7 +240,9 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
         return Suggestion(doubt=_doubtful(pictures))
     if not guess.told:
         return Suggestion(part=_untold(guess))
-    return Suggestion(" --board ".join(words_of_board(board) for board in (guess.board, *guess.beside)))
+    # Chessboards beside it may hang on a wall.
+    boards = [guess.board, *(board for board in guess.beside if board.identified)]
+    return Suggestion(" --board ".join(map(words_of_board, boards)))
 
 
 def _untold(guess: BoardGuess) -> str:

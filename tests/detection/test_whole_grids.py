@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.whole_grids import GridSeen, Size, grid_seen, told_size
+from rigkit.detection.whole_grids import GridSeen, Size, grid_seen, sizes_beside, told_size
 
 WHOLE = (True, True)
 ONE_SIDE = (True, False)
@@ -48,6 +48,12 @@ def test_a_board_whose_last_line_blur_hides() -> None:
 def test_another_board_beside_the_one_told_contradicts_nothing() -> None:
     both = [[GridSeen((9, 6), WHOLE), GridSeen((12, 9), WHOLE)]] * 2
     assert told_size([*both, *seen(*[(9, 6)] * 3, (12, 9), (12, 9))]) == (((9, 6),), (0, 1, 2, 3, 4))
+
+
+def test_what_most_images_show_beside_the_board() -> None:
+    three = [GridSeen((8, 6), WHOLE), GridSeen((8, 6), WHOLE), GridSeen((7, 6), ONE_SIDE)]
+    assert sizes_beside([three, three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1, 2)) == ((7, 6),)
+    assert sizes_beside([three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1)) == ()
 
 
 @pytest.mark.parametrize(("missing", "ends"), [(0, WHOLE), (5, ONE_SIDE)])
