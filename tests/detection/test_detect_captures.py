@@ -131,3 +131,11 @@ def test_overexposed_tags(gain: float) -> None:
     # Of ten; the finest level alone shows two and none.
     assert seen >= (6 if gain == 2.0 else 3)
     assert np.median(off) < 1.5 * MEDIAN_OF_RAYLEIGH
+
+
+def test_a_wide_board_is_not_taken_for_a_square_one() -> None:
+    """A few of its tags lie where the square board has them, and all its corners fit."""
+    image = read_grey(shared_data("public/aprilgrid") / "iphone.png")
+    (found,) = detect_boards(image, [Board("wide", 22, 12, 88.0, 88.0, pattern=AprilGrid(0.3))])
+    assert len(found.grid) > 200
+    assert detect_boards(image, [Board("square", 12, 12, 88.0, 88.0, pattern=AprilGrid(0.3))]) == ()

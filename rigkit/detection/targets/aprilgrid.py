@@ -16,6 +16,7 @@ from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.saddles.response import GreyImage, Level, each_level
 from rigkit.detection.saddles.saddle import Corners, each_once, find_corners
+from rigkit.detection.tags.codes import read_tags
 from rigkit.detection.tags.corners import tag_corners
 from rigkit.detection.tags.placing import TagBoard, placed_lattices
 from rigkit.detection.tags.quads import placed_tags
@@ -39,7 +40,11 @@ class AprilGridFinder(Finder):
             grey = 255 - search.grey if inverted and tags else search.grey
             for item, pixels in self._placed(grey, tags):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
-                if seen is not None and len(seen.grid) >= search.min_corners:
+                if seen is None or len(seen.grid) < search.min_corners:
+                    continue
+                # Few that vouch for a place may be of another board, whose corners all fit.
+                few = 2 * np.count_nonzero(np.isfinite(pixels[..., 0])) < len(seen.grid)
+                if not few or _confirmed(grey, item, seen):
                     found.append(seen)
         return found
 
@@ -76,6 +81,16 @@ def _placed_by(
         pixels, used = placed_lattices(image, lattices, item)
         lattices = [lattice for n, lattice in enumerate(lattices) if n not in used]
         yield item, pixels
+
+
+def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
+    """Return whether more of the tags that are seen are read as those that the board has there than as others."""
+    pixels = seen.lattice()
+    quads = np.stack([pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, 1::2], pixels[1::2, ::2]], axis=2)
+    whole = np.isfinite(quads).all(axis=(2, 3))
+    codes = read_tags(image, quads[whole], tags.codes)
+    own = (codes.number == tags.numbers[whole]) & (codes.turns == 0)
+    return bool(2 * np.count_nonzero(codes.read & own) > np.count_nonzero(codes.read))
 
 
 def _nearly_whole(tags: TagBoard, pixels: FloatArray, shape: tuple[int, ...]) -> bool:
