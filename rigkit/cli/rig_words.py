@@ -108,8 +108,10 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
             f"{c.name} {verdict}: {c.ours:.3f} {c.unit}, measured {c.measured:g} +- {c.measured_sigma:g} {c.unit} "
             f"({c.how}), off by {c.k:.1f} combined sigmas"
         )
+    # What is wrong with the rig comes before what that did to its cameras.
+    lines += map(str, gravest_first(rig.verdicts))
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in calibration_words.left_out(alone)]
         lines += [f"{camera.name} alone: {verdict}" for verdict in gravest_first(alone.verdicts)]
-    return "\n".join([*lines, *map(str, gravest_first(rig.verdicts))])
+    return "\n".join(lines)

@@ -17,6 +17,15 @@ def last_number(name: str) -> str:
     return str(int(numbers[-1])) if numbers else name
 
 
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Return by what names sort as a person counts.
+
+    >>> sorted(["b10", "b9", "a"], key=natural_key)
+    ['a', 'b9', 'b10']
+    """
+    return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", name.lower())]
+
+
 def check_identifier(name: str, what: str) -> str:
     """Return `name`; raises InputError, which calls it `what`, where it is not one.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.errors import InputError
-from rigkit.core.identifiers import check_identifier
+from rigkit.core.identifiers import check_identifier, natural_key
 from rigkit.core.progress import Progress, silent
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
@@ -213,7 +213,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
             f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}), nor folders left and right with "
             "some; give the folder of a camera's images, or one folder a camera"
         )
-    return _one_each(sorted(inside, key=lambda p: _natural(p.name)))
+    return _one_each(sorted(inside, key=lambda p: natural_key(p.name)))
 
 
 def _images(folder: Path) -> list[Path]:
@@ -251,15 +251,11 @@ def _by_names(folder: Path, images: Sequence[Path]) -> dict[str, list[tuple[Path
             sides.setdefault(side.lower(), {})[pattern + image.suffix] = None
     if len(sides) < 2:
         return {"": [(folder, f"*{suffix}") for suffix in _suffixes(images)]}
-    return {side: [(folder, pattern) for pattern in sides[side]] for side in sorted(sides, key=_natural)}
+    return {side: [(folder, pattern) for pattern in sides[side]] for side in sorted(sides, key=natural_key)}
 
 
 def _suffixes(images: Iterable[Path]) -> list[str]:
     return sorted({image.suffix for image in images})
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    return [(int(part) if part.isdigit() else -1, part) for part in re.split(r"(\d+)", name.lower())]
 
 
 def _board_file(words: str, place: Path, files: dict[Path, str]) -> str:

@@ -8,7 +8,8 @@ well. One camera before such a target is a rig too.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
@@ -18,8 +19,9 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
-from rigkit.calibration.rig.joint import solve_jointly
+from rigkit.calibration.rig.joint import BAD, solve_jointly
 from rigkit.calibration.rig.known import KnownCameras
+from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
 from rigkit.calibration.rig.observations import FrameObservations, Places, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
@@ -69,9 +71,9 @@ def calibrate_rig(
     if not views or (len(views) < 2 and not rigid_boards):
         raise InputError(f"rig: {len(views)} camera; a rig has at least two, or boards that are mounted to each other")
     _require_entries(views, sizes_px=sizes_px, model=model, degree=degree)
-    for name, own in views.items():
-        _require_one_image(name, own)
+    _require_one_image(views)
     _require_known(views, sizes_px, known)
+    same = same_pictures(views)
     options = _Options(sizes_px, model, degree, board, folds, known)
     single = options.each_alone(views, progress)
     seen = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
@@ -87,10 +89,35 @@ def calibrate_rig(
             again = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
             named, places, notes = board_places(rigid_boards, again, boards)
         seen = named
-    joint = solve_jointly(list(views), seen, single, places, progress, known)
-    heldout = heldout_rms(joint, folds)
-    rig, far = assemble_rig(list(views), single, joint, places, heldout)
-    return replace(rig, verdicts=judge_rig(rig, far, (*notes, *joint.notes), in_force=options.in_force))
+    with _mistakes_named(list(views), seen, single, places):
+        joint = solve_jointly(list(views), seen, single, places, progress, known)
+    rig, far = assemble_rig(list(views), single, joint, places, heldout_rms(joint, folds))
+    notes = (*same, *_mispaired(rig, seen, places, joint.cost_sigmas), *notes, *joint.notes)
+    return replace(rig, verdicts=judge_rig(rig, far, notes, in_force=options.in_force))
+
+
+@contextmanager
+def _mistakes_named(
+    names: Sequence[str], seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places
+) -> Iterator[None]:
+    """Say in errors which mistake with files made the cameras disagree."""
+    try:
+        yield
+    except DegenerateError as error:
+        cause = why_nothing_agrees(names, seen, single, places)
+        raise error if cause is None else DegenerateError(f"rig: {cause.text} ({error})") from error
+
+
+def _mispaired(
+    rig: RigCalibration, seen: Sequence[FrameObservations], places: Places, cost_sigmas: float
+) -> list[Finding]:
+    """Return which mistake with files made frames disagree, of those left out or, where sharing poses usually costs
+    more than a good rig, of all."""
+    names = [camera.name for camera in rig.cameras]
+    if cost_sigmas > BAD and (cause := why_nothing_agrees(names, seen, rig.single, places)):
+        return [cause]
+    mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
+    return put_together_wrongly(names, seen, mounts, rig.single, places, left_out)
 
 
 def _require_entries(views: Views, **given: object) -> None:
@@ -101,23 +128,24 @@ def _require_entries(views: Views, **given: object) -> None:
             raise InputError(f"rig: {what} has no entry for camera '{missing[0]}'")
 
 
-def _require_one_image(name: str, own: Sequence[tuple[str, BoardView]]) -> None:
-    """Raise InputError where the camera shows a board twice in a frame, or one image in two frames."""
-    shown: set[tuple[str, str]] = set()
-    frames: dict[str, str] = {}
-    for frame, view in own:
-        board = view.board.board_id
-        if (frame, board) in shown:
-            raise InputError(
-                f"rig: camera '{name}' shows board '{board}' twice in frame '{frame}'; a frame is one image of each "
-                "camera, and boards have names of their own"
-            )
-        shown.add((frame, board))
-        if frames.setdefault(view.image, frame) != frame:
-            raise InputError(
-                f"rig: camera '{name}': image '{view.image}' is of frame '{frame}' and of '{frames[view.image]}'; give "
-                "images names of their own"
-            )
+def _require_one_image(views: Views) -> None:
+    """Raise InputError where a camera shows a board twice in a frame, or one image in two frames."""
+    for name, own in views.items():
+        shown: set[tuple[str, str]] = set()
+        frames: dict[str, str] = {}
+        for frame, view in own:
+            board = view.board.board_id
+            if (frame, board) in shown:
+                raise InputError(
+                    f"rig: camera '{name}' shows board '{board}' twice in frame '{frame}'; a frame is one image of "
+                    "each camera, and boards have names of their own"
+                )
+            shown.add((frame, board))
+            if frames.setdefault(view.image, frame) != frame:
+                raise InputError(
+                    f"rig: camera '{name}': image '{view.image}' is of frame '{frame}' and of '{frames[view.image]}'; "
+                    "give images names of their own"
+                )
 
 
 def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known: KnownCameras | None) -> None:

@@ -1,0 +1,304 @@
+"""Frames of a rig that were put together wrongly: one picture twice, left for right, counted one off, turned, mirrored.
+
+Cameras that disagree on where a board is are usually not of one moment. Mistakes with files look the same, and need no
+other pictures: the same ones under the names of two cameras, the images of a frame under each other's names, an image
+that is missing in one camera, so that all later ones are one frame off, images that a program has turned by half a
+turn, and one camera whose images are mirrored, which a chessboard does not show. Each is tried, and told where it puts
+right what disagrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.disagree import shared_keys
+from rigkit.calibration.rig.frames import apart, mounts_of, turned_alike
+from rigkit.calibration.rig.observations import FrameObservations, Observation, Places
+from rigkit.calibration.rig.state import Key
+from rigkit.cameras.base import Camera
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding
+from rigkit.core.identifiers import natural_key
+from rigkit.geometry.rigid3 import Rigid3
+
+ONE_PICTURE_PX = 0.1
+"""Corners that two cameras see at the same pixels within this, rms, are those of one picture, perhaps saved again: two
+cameras do not even have the same noise, and those of a rig do not look through one lens."""
+PUT_RIGHT = 0.1
+"""A mistake is one where, put right, views lie apart by no more than this part of what they do as they are. As they are
+they lie apart by as much as boards are moved between frames, a hundred pixels and more; put right, by what is wrong
+with lenses that were found from mixtures: 2 to 8 px where images of bouguet-stereo are exchanged."""
+STEPS = (1, -1, 2, -2)
+"""So many frames off are tried."""
+MIN_PUT_RIGHT = 3
+"""Fewer frames that agree when they are counted otherwise may do so by chance: a mount of six numbers fits one frame
+exactly."""
+MIN_SHARE_PUT_RIGHT = 0.6
+"""Of the frames that disagree, the part that must agree then: some may be bad for another reason."""
+NAMED = 3
+"""So many frames are named."""
+
+
+def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
+    """Return a finding for every two cameras that have the same pictures in some frames, of (frame, view) by camera.
+
+    Raises InputError where two cameras have the same ones in all frames.
+    """
+    out = []
+    shown = {name: {(frame, view.board.board_id): view for frame, view in own} for name, own in views.items()}
+    for (a, own), (b, other) in combinations(shown.items(), 2):
+        shared = own.keys() & other.keys()
+        frames = _in_order({key[0] for key in shared if _one_picture(own[key], other[key])})
+        if not frames:
+            continue
+        total = len({frame for frame, _ in shared})
+        if len(frames) == total:
+            raise InputError(
+                f"rig: cameras '{a}' and '{b}' have the same pictures in all {total} frames; give each camera its own"
+            )
+        out.append(
+            Finding.bad(
+                f"cameras '{a}' and '{b}' have the same picture in {_named(frames)} of {total} frames",
+                "give each camera its own, and calibrate again",
+            )
+        )
+    return out
+
+
+def put_together_wrongly(
+    names: Sequence[str],
+    seen: Sequence[FrameObservations],
+    mounts: Sequence[Rigid3],
+    single: Sequence[Calibration],
+    places: Places,
+    left_out: Iterable[Key],
+) -> list[Finding]:
+    """Return findings on the frames `left_out` that agree with the `mounts` of the others when two cameras' images are
+    exchanged there, or when those of one camera are counted otherwise.
+
+    Parameters
+    ----------
+    seen : of every camera, as it was before anything was left out.
+    single : of every camera alone.
+    """
+    frames = {frame for frame, _ in left_out}
+    cameras = [c.camera for c in single]
+    own = [_of_frames(one, frames) for one in seen]
+    now = _by_frame(_off(own, mounts, cameras, places))
+    out = []
+    for i, j in combinations(range(len(seen)), 2):
+        trial = list(own)
+        trial[i], trial[j] = own[j], own[i]
+        right = _put_right(now, _by_frame(_off(trial, mounts, cameras, places)))
+        if right:
+            out.append(
+                Finding.bad(
+                    f"the images of '{names[i]}' and '{names[j]}' are exchanged in {_named(right)}: put right, the "
+                    "cameras agree there on where the boards are",
+                    "give them their own names, and calibrate again",
+                )
+            )
+    for k, camera in enumerate(cameras):
+        trial = list(own)
+        trial[k] = _turned(own[k], camera)
+        right = _put_right(now, _by_frame(_off(trial, mounts, cameras, places)))
+        if right:
+            out.append(
+                Finding.bad(
+                    f"the images of '{names[k]}' are turned by half a turn in {_named(right)}: turned back, the "
+                    "cameras agree there on where the boards are",
+                    "take them as the camera wrote them, and calibrate again",
+                )
+            )
+    return [*out, *_miscounted(names, seen, mounts, cameras, places, now)]
+
+
+def _miscounted(
+    names: Sequence[str],
+    seen: Sequence[FrameObservations],
+    mounts: Sequence[Rigid3],
+    cameras: Sequence[Camera],
+    places: Places,
+    now: Mapping[str, float],
+) -> list[Finding]:
+    """Return a finding where frames that are left out, and lie apart `now`, agree with others before or after them."""
+    if not now:
+        return []
+    # A frame that only one camera has may be where the other one's image belongs.
+    agree = {frame for frame, _ in shared_keys(seen)} - now.keys()
+    usual = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
+    for k in range(1, len(seen)):
+        for step in STEPS:
+            trial = [_of_frames(own, usual.keys() - agree) for own in seen]
+            trial[k] = _of_frames(_counted(seen, k, step), usual.keys() - agree)
+            right = _put_right(usual, _by_frame(_off(trial, mounts, cameras, places)))
+            if len(right) >= max(MIN_PUT_RIGHT, MIN_SHARE_PUT_RIGHT * len(now)):
+                moments = _in_order(usual)
+                called = [moments[moments.index(frame) + step] for frame in right]
+                message = (
+                    f"the images of '{names[k]}' in {_named(called)} are of {_steps(step)}: counted so, the cameras "
+                    "agree there on where the boards are; an image is missing, or was taken twice"
+                )
+                return [Finding.bad(message, "name the images of one moment alike, and calibrate again")]
+    return []
+
+
+def why_nothing_agrees(
+    names: Sequence[str], seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places
+) -> Finding | None:
+    """Return with which mistake put right the frames agree, where most of them do not; None with none."""
+    cameras = [c.camera for c in single]
+
+    def usual_px(trial: Sequence[FrameObservations]) -> float:
+        try:
+            mounts, _ = mounts_of(names, trial, places)
+        except InputError:
+            return np.inf
+        off = _off(trial, mounts, cameras, places)
+        return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_PUT_RIGHT else np.inf
+
+    limit = PUT_RIGHT * usual_px(seen)
+    for k, camera in enumerate(cameras):
+        for step in STEPS if k else ():
+            if usual_px([*seen[:k], _counted(seen, k, step), *seen[k + 1 :]]) <= limit:
+                return Finding.bad(
+                    f"the images of '{names[k]}' are of {_steps(step)} in all frames: counted so, the cameras agree; "
+                    "an image is missing, or they did not begin together",
+                    "name the images of one moment alike",
+                )
+        for axis in (0, 1):
+            mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
+            if usual_px([*seen[:k], mirrored, *seen[k + 1 :]]) <= limit:
+                # Of two cameras either may be the mirrored one.
+                who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
+                return Finding.bad(
+                    f"the images of {who} are mirrored: mirrored back, the cameras agree",
+                    "take them as the camera wrote them",
+                )
+        turned = _turned(seen[k], camera)
+        for sides in _as_one_frame_has_it(names, seen, k, turned, cameras, places):
+            some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
+            if sides and usual_px([*seen[:k], some, *seen[k + 1 :]]) <= limit:
+                return Finding.bad(
+                    f"the images of '{names[k]}' are turned by half a turn in {_named(_in_order(sides))}, or in all "
+                    "others: turned back, the cameras agree",
+                    "take them as the camera wrote them",
+                )
+    return None
+
+
+def _as_one_frame_has_it(
+    names: Sequence[str],
+    seen: Sequence[FrameObservations],
+    k: int,
+    changed: FrameObservations,
+    cameras: Sequence[Camera],
+    places: Places,
+) -> Iterator[set[str]]:
+    """Yield for each frame in which ones what camera k saw agrees better `changed`, by the mount that it tells."""
+    trial = [*seen[:k], changed, *seen[k + 1 :]]
+    for frame in _in_order({frame for frame, _ in seen[k]}):
+        try:
+            mounts, _ = mounts_of(names, [_of_frames(own, {frame}) for own in seen], places)
+        except InputError:
+            continue
+        now, then = (_by_frame(_off(one, mounts, cameras, places)) for one in (seen, trial))
+        yield {name for name, value in then.items() if value < now[name]}
+
+
+def _off(
+    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
+) -> dict[Key, float]:
+    some = [k for k, own in enumerate(seen) if own]
+    seen, mounts, cameras = [seen[k] for k in some], [mounts[k] for k in some], [cameras[k] for k in some]
+    return apart(turned_alike(seen, mounts, places), mounts, cameras, places)
+
+
+def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:
+    """Return how far apart views are in each frame, the worst board of each."""
+    out: dict[str, float] = {}
+    for (frame, _), value in off_px.items():
+        out[frame] = max(out.get(frame, 0.0), value)
+    return out
+
+
+def _put_right(now: Mapping[str, float], then: Mapping[str, float]) -> list[str]:
+    """Return the frames in which views that are far apart `now` no longer are."""
+    return _in_order(frame for frame, value in then.items() if value <= PUT_RIGHT * now.get(frame, 0.0))
+
+
+def _frames_of(seen: Sequence[FrameObservations]) -> set[str]:
+    return {frame for own in seen for frame, _ in own}
+
+
+def _of_frames(own: FrameObservations, frames: Iterable[str]) -> FrameObservations:
+    return {key: entry for key, entry in own.items() if key[0] in frames}
+
+
+def _counted(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObservations:
+    """Return what camera k saw with every image taken for that of so many frames before."""
+    frames = _in_order(_frames_of(seen))
+    before = {frames[n]: frames[n - step] for n in range(len(frames)) if 0 <= n - step < len(frames)}
+    return {
+        (before[frame], board): replace(entry, frame=before[frame], key=(before[frame], entry.key[1]))
+        for (frame, board), entry in seen[k].items()
+        if frame in before
+    }
+
+
+def _turned(own: FrameObservations, camera: Camera) -> FrameObservations:
+    """Return what a camera saw as it is in images turned by half a turn, about the lens's axis."""
+    half = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    return {
+        key: replace(
+            entry,
+            view=replace(entry.view, pixels=2.0 * camera.axis_px - entry.view.pixels),
+            cam_from_board=half @ entry.cam_from_board,
+        )
+        for key, entry in own.items()
+    }
+
+
+def _mirrored(entry: Observation, camera: Camera, axis: int) -> Observation:
+    """Return a board as it is in the mirrored image, left and right of the lens's axis exchanged. It is right-handed as
+    before where columns (`axis` 0) or rows (1) are counted from the other end: which, the colours of its squares say.
+    """
+    view, board = entry.view, entry.view.board
+    pixels, grid = view.pixels.copy(), view.grid.copy()
+    pixels[:, 0] = 2.0 * camera.axis_px[0] - pixels[:, 0]
+    grid[:, axis] = board.size[axis] - 1 - grid[:, axis]
+    image, on_board = np.array([-1.0, 1.0, 1.0]), np.ones(3)
+    on_board[axis] = -1.0
+    old, far = entry.cam_from_board, np.zeros(3)
+    far[axis] = (board.size[axis] - 1) * (board.square_x_mm, board.square_y_mm)[axis]
+    pose = Rigid3(image[:, None] * old.rotation * on_board, image * old.apply(far))
+    return replace(entry, view=replace(view, pixels=pixels, grid=grid), cam_from_board=pose)
+
+
+def _one_picture(one: BoardView, other: BoardView) -> bool:
+    """Say whether two views have the same corners at the same pixels."""
+    if one.grid.shape != other.grid.shape or (one.grid != other.grid).any():
+        return False
+    return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= ONE_PICTURE_PX)
+
+
+def _steps(step: int) -> str:
+    count = "one frame" if abs(step) == 1 else f"{abs(step)} frames"
+    return f"{count} {'before' if step > 0 else 'after'}"
+
+
+def _in_order(frames: Iterable[str]) -> list[str]:
+    return sorted(frames, key=natural_key)
+
+
+def _named(frames: Sequence[str]) -> str:
+    if len(frames) == 1:
+        return f"frame '{frames[0]}'"
+    more = f" and {len(frames) - NAMED} more" if len(frames) > NAMED else ""
+    return f"frames {', '.join(repr(frame) for frame in frames[:NAMED])}{more}"
