@@ -64,7 +64,7 @@ class Extent:
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
 
-def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, clusters: IntArray) -> list[Finding]:
+def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
     views, those that repeat others as those."""
     images = [view.image for view in calibration.views]
@@ -76,7 +76,6 @@ def judge_capture(calibration: Calibration, extent: Extent, far: FarProjection, 
         *_parallel(calibration),
         *_distances(calibration),
         *_upright(calibration),
-        *_extrapolated(calibration, extent, far),
     ]
 
 
@@ -175,7 +174,7 @@ def _distances(c: Calibration) -> list[Finding]:
     return [Finding.look("all boards were at one distance", "hold some at half and some at double of it")]
 
 
-def _extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
+def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
     """Say where most of the image is known from elsewhere, and not well."""
     if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
         return []

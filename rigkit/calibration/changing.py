@@ -62,11 +62,12 @@ WAYS = {
     ),
     "lens": _Way(
         "the picture is scaled and shifted on the sensor from image to image (focus, zoom or stabilisation)",
-        "switch autofocus, zoom and image stabilisation off, and retake all",
+        "switch autofocus, zoom and image stabilisation off, and retake all, unless a program cropped, turned or "
+        "resized some",
     ),
     "shift": _Way(
         "the picture is shifted on the sensor from image to image",
-        "switch image stabilisation off, and retake all",
+        "switch image stabilisation off, and retake all, unless a program turned or cropped some",
     ),
     "rows": _Way(
         "boards are sheared as if they moved while the image was read row by row (rolling shutter)",

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, judge_capture
+from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, extrapolated, judge_capture
 from rigkit.calibration.changing import MOTION, changing
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.mixed import two_cameras
@@ -95,6 +95,10 @@ def judge(
     steady = not any(finding.severity is Severity.BAD for finding in also)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
+    pattern = [] if mixed else _pattern(calibration, correlation, in_force)
+    effects = _unsure(calibration, far)
+    # Images that contradict each other make a lens unsure, however many there are.
+    contradicting = worst(effects) is Severity.BAD
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
@@ -102,7 +106,9 @@ def judge(
         *_of_another_kind(calibration),
         *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS)),
         *unlike,
-        *judge_capture(calibration, extent, far, clusters),
+        *judge_capture(calibration, clusters),
+        *(pattern if contradicting else []),
+        *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not mixed),
     ]
     found = [
@@ -113,14 +119,14 @@ def judge(
     if not mixed:
         found += [
             *unclear,
-            *_pattern(calibration, correlation, in_force),
+            *([] if contradicting else pattern),
             *_overfit(calibration),
             *_boards(calibration),
             *_outliers(calibration),
         ]
     share = extent.share
     where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
-    return (*with_headline(calibration, causes, _unsure(calibration, far), where), *found)
+    return (*with_headline(calibration, causes, effects, where), *found)
 
 
 def judge_session(

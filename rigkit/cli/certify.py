@@ -1,4 +1,7 @@
-"""`rigkit certify`: how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig."""
+"""`rigkit certify`: how wrong a length, depth, plane or angle may be that is measured with a calibration or a rig.
+
+Exit code 1 above --limit, and with a calibration that was called bad.
+"""
 
 from __future__ import annotations
 

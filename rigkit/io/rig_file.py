@@ -23,10 +23,18 @@ from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding
 from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
-from rigkit.io.calibration_file import Made, camera_from_json, camera_to_json, damage_named, findings_to_json
+from rigkit.io.calibration_file import (
+    Made,
+    camera_from_json,
+    camera_to_json,
+    damage_named,
+    findings_from_json,
+    findings_to_json,
+)
 from rigkit.io.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
 from rigkit.kernels.departures import DISPLACEMENTS
@@ -47,7 +55,7 @@ class SavedRig:
     degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
     are those it was calibrated with, none in a file that does not say; `outlines` by name are convex, (N, 2) px, around
     all corners that a camera saw, of those of which the file says it; `departures` are what each lens may do beyond its
-    model, none in a file that does not say."""
+    model, none in a file that does not say; `verdicts` are what was said of it."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -58,6 +66,7 @@ class SavedRig:
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     departures: tuple[LensModes, ...] = ()
+    verdicts: tuple[Finding, ...] = ()
 
     def stated(self, path: str | Path) -> tuple[tuple[Camera, ...], FloatArray, float]:
         """Return `with_departures` and the corners' sigma; raises InputError where the file at `path` lacks them."""
@@ -171,6 +180,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         of_freedom = freedom(data.get("freedom"))
         overdispersion = positive(data.get("overdispersion", data.get("spread", 1.0)))
         boards = tuple(board_of_values(entry["target"], entry["board_id"]) for entry in data.get("boards", ()))
+        verdicts = findings_from_json(data.get("verdicts", ()))
     return SavedRig(
         cameras=cameras,
         covariance=covariance,
@@ -181,6 +191,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         boards=boards,
         outlines=outlines,
         departures=beyond,
+        verdicts=verdicts,
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigkit.core.findings import Severity
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.tables import Table, cells, columns
 from rigkit.report.figures import DPI, as_pdf, as_png, new_figure
 from rigkit.report.page_facts import PageFacts, build_facts_page
@@ -32,7 +32,10 @@ LINE_CHARACTERS = 98
 
 
 def certificate_facts(certificate: Certificate, limit: float | None = None) -> PageFacts:
-    """Return what a certificate states, against `limit` (in the task's unit) where one is given, and its table."""
+    """Return what a certificate states, against `limit` (in the task's unit) where one is given, and its table.
+
+    What rests on a calibration that was called bad is no certificate, whatever the limit.
+    """
     task, unit = certificate.task, certificate.task.unit
     what = WHAT[task.quantity].format(size=f"{task.size_mm:g}") + f", {task.distance_mm:g} mm away"
     percent = f"{100.0 * task.confidence:g} %"
@@ -48,14 +51,23 @@ def certificate_facts(certificate: Certificate, limit: float | None = None) -> P
         passed = certificate.worst <= limit
         share = certificate.share_within(limit)
         sentences.insert(0, f"The limit of {limit:g} {unit} is kept in {100.0 * share:.0f} % of the view.")
-    sentences += [finding.text[0].upper() + finding.text[1:] + "." for finding in certificate.findings]
+    badge = {None: "no limit given", True: "within the limit", False: "beyond the limit"}[passed]
+    bad = [finding for finding in certificate.findings if finding.severity is Severity.BAD]
+    others = [finding for finding in certificate.findings if finding.severity is not Severity.BAD]
+    if bad:
+        passed, badge = False, "not to be trusted"
+    sentences = [*map(_sentence, bad), *sentences, *map(_sentence, others)]
     return PageFacts(
         headline=headline,
-        badge={None: "no limit given", True: "within the limit", False: "beyond the limit"}[passed],
+        badge=badge,
         passed=passed,
         sentences=tuple(sentences),
         tables=(causes_table(certificate),),
     )
+
+
+def _sentence(finding: Finding) -> str:
+    return finding.text[0].upper() + finding.text[1:] + "."
 
 
 def causes_table(certificate: Certificate) -> Table:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
@@ -63,6 +64,7 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         raise InputError(f"certificate: the limit must be positive, got {options.limit}")
     with about(path):
         certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
+    certificate = replace(certificate, findings=(*_doubts(path), *certificate.findings))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}
@@ -73,6 +75,14 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     write_together(files, force=options.force)
     words = certificate_facts(certificate, options.limit)
     return CertifiedFile(certificate=certificate, words=words, written=tuple(files))
+
+
+def _doubts(path: str | Path) -> list[Finding]:
+    """Return why a calibration is not to be trusted, where that was said of it: its sigmas hold for lenses and boards
+    that are as it takes them to be."""
+    verdicts = load_saved_rig(path).verdicts if is_rig_file(path) else load_calibration(path).verdicts
+    bad = [finding for finding in verdicts if finding.severity is Severity.BAD]
+    return [replace(bad[0], message=f"the calibration was called bad: {bad[0].message}")] if bad else []
 
 
 def load_instrument(

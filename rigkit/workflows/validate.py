@@ -144,7 +144,7 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     except RigkitError as error:
         if not causes:
             raise
-        raise type(error)(f"{error}; probable cause: {'; '.join(causes)}") from error
+        raise type(error)(f"{'; '.join(causes)} ({error})") from error
 
 
 def _judge(

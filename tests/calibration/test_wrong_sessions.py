@@ -15,6 +15,7 @@ from rigkit.calibration.changing import MIN_NEIGHBOUR_CORRELATION, changing
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.verdicts import judge
 from rigkit.calibration.view_evidence import view_evidence
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
@@ -287,6 +288,19 @@ def test_boards_in_hand_that_move_while_rows_are_read(how: dict[str, Any], rng: 
         assert all("(rolling shutter)" in finding.message for finding in found)
         named += len(found)
     assert named >= 7
+
+
+def test_images_that_contradict_each_other_come_before_what_that_does_to_the_lens(rng: np.random.Generator) -> None:
+    """More of such images would not make it surer."""
+    views = []
+    for view in random_views(lens("reg"), 12, rng, reach_deg=18.0, noise_px=0.05)[0]:
+        bent = view.pixels + 1.5 * np.sin(view.pixels / 120.0 + rng.uniform(0.0, 6.0, 2))
+        views.append(replace(view, pixels=np.clip(bent, -0.5, np.array(SIZE) - 0.5)))
+    result = calibrate(views, SIZE, model="brown", board="flat")
+    headline, *others = judge(result, in_force=("model", "board_shape"))
+    assert headline.severity is Severity.BAD
+    assert "so that something differs between images" in headline.message
+    assert any("the projection is uncertain by" in finding.message for finding in others)
 
 
 @pytest.mark.parametrize("again", ["in half of the images", "in each image"])

@@ -56,6 +56,24 @@ def test_a_length_with_page_sheet_and_limit(rig: Path, capsys: pytest.CaptureFix
     assert "beyond the limit" in capsys.readouterr().out
 
 
+def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its sigmas hold for lenses as it takes them to be: a limit that is kept says nothing."""
+    data = json.loads(rig.read_text())
+    asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--limit", "1000"]
+    for severity, code in (("look", 0), ("bad", 1)):
+        said = {
+            "severity": severity,
+            "message": "held-out RMS 0.1 px, but the focal length differs",
+            "remedy": "fix it",
+        }
+        rig.write_text(json.dumps(data | {"verdicts": [said]}))
+        assert main([*asked, "--report", str(rig.with_suffix(".html")), "--force"]) == code
+        words = capsys.readouterr().out.splitlines()
+        called = "  The calibration was called bad: held-out RMS 0.1 px, but the focal length differs; fix it."
+        assert (words[1] == called) == (severity == "bad")
+        assert ("not to be trusted" in rig.with_suffix(".html").read_text()) == (severity == "bad")
+
+
 @pytest.mark.parametrize("quantity", ["depth", "plane", "angle"])
 def test_the_result_for_programs(quantity: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["certify", str(rig), f"--{quantity}", "50", "--distance", "900", "--json"]
