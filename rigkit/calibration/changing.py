@@ -20,6 +20,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.solver import solve
 from rigkit.calibration.two_kinds import two_kinds
 from rigkit.calibration.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
+from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 
 MIN_VARIANCE_RATIO = 6.0
@@ -99,6 +100,7 @@ def changing(
     correlation: float,
     solved: tuple[Observations, Fit] | None = None,
     but: Collection[str] = (),
+    clusters: IntArray | None = None,
 ) -> list[Finding]:
     """Return a finding where one thing differs from image to image that the calibration takes for constant.
 
@@ -108,15 +110,16 @@ def changing(
     solved : what was calibrated, where it is known: a lens that changes is then solved for, not only looked for at
         first order.
     but : names of ways to change that are not to be told.
+    clusters : as for `view_evidence`.
     """
-    evidence = view_evidence(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else None
+    evidence = view_evidence(calibration, clusters) if correlation > MIN_NEIGHBOUR_CORRELATION else None
     changes = evidence.changes() if evidence is not None else {}
     if evidence is None or not changes:
         return []
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
         return [kinds]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
-        changes |= {way: _solved_for(way, evidence, calibration, *solved, changes[way]) for way in OF_LENS}
+        changes |= {way: _solved_for(way, evidence, calibration, *solved, changes[way], clusters) for way in OF_LENS}
     best = min(changes, key=lambda way: changes[way].criterion)
     if best in OF_LENS and _leads(changes, best, but=OF_LENS):
         # A zoom about another centre is both; what is nearly as good with one of them is that one.
@@ -161,6 +164,7 @@ def _solved_for(
     observations: Observations,
     fit: Fit,
     at_first: ViewChange,
+    clusters: IntArray | None,
 ) -> ViewChange:
     """Return what a lens that changes in this way explains when all is solved with it; `at_first` order where that is
     more."""
@@ -176,7 +180,7 @@ def _solved_for(
                 views=view_results(observations, start, residuals, fit.kept),
                 boards=board_shapes(observations, start.shape, start.unknowns),
             )
-            now = view_evidence(solved)
+            now = view_evidence(solved, clusters)
             if now is None:
                 return at_first
             evidence, (_, _, amounts) = now, now.explained(columns)

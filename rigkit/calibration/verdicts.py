@@ -104,7 +104,7 @@ def judge(
         *_not_converged(calibration, in_force),
         *mixed,
         *_of_another_kind(calibration),
-        *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS)),
+        *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS, clusters)),
         *unlike,
         *judge_capture(calibration, clusters),
         *(pattern if contradicting else []),

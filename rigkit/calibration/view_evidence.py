@@ -117,9 +117,17 @@ class ViewEvidence:
         return out
 
 
-def view_evidence(calibration: Calibration) -> ViewEvidence | None:
-    """Return what the residuals say; None where that is nothing."""
+def view_evidence(calibration: Calibration, clusters: IntArray | None = None) -> ViewEvidence | None:
+    """Return what the residuals say; None where that is nothing.
+
+    `clusters` (V,) number the views' images, as `cluster_numbers` has it: those that repeat another one say nothing
+    that it does not say, and are not asked.
+    """
     telling = [k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
+    if clusters is not None:
+        images = [view.image for view in calibration.views]
+        first = dict(zip(clusters[::-1].tolist(), images[::-1], strict=True))
+        telling = [k for k in telling if images[k] == first[int(clusters[k])]]
     if len(telling) < MIN_TELLING_VIEWS:
         return None
     rows, count = _rows(calibration, [calibration.views[k] for k in telling])

@@ -111,3 +111,16 @@ def test_four_images_after_four_others_are_of_two_kinds_as_in_turns(rng: np.rand
         session = [replace(views[k], image=f"{i}.png") for i, k in enumerate(order)]
         said = calibrate(session, SIZE, model="brown", board="flat").verdicts[0]
         assert KINDS in said.message and "as if some were mirrored" in said.message
+
+
+def test_copies_of_images_are_no_kind_of_their_own() -> None:
+    """Two pictures that are unlike the six others, saved three times as all are, are two pictures."""
+    camera = off_the_middle()
+    zoomed = camera.with_parameters(camera.parameters * [1.02, 1.02, *[1.0] * 7])
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        views = [*seen(camera, 6, rng), *seen(zoomed, 2, rng, first=6)]
+        copies = [replace(view, image=f"{ending} {view.image}") for ending in ("jpg", "JPG", "png") for view in views]
+        _, every = told(copies, rng)
+        assert not any(KINDS in verdict for verdict in every)
+        assert any("show the board where another one does" in verdict for verdict in every)
