@@ -45,26 +45,37 @@ def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf"
 
 def _watched(folders: Sequence[Path], until_idle_s: float) -> Iterator[Frame]:
     seen: set[str] = set()
+    unread: dict[str, tuple[tuple[int, int], ...]] = {}
     last = time.monotonic()
     while time.monotonic() - last < until_idle_s:
         for name, paths in _moments(folders).items():
-            if name in seen or not all(map(_settled, paths)):
+            state = None if name in seen else _settled(paths)
+            if state is None or unread.get(name) == state:
                 continue
-            seen.add(name)
             last = time.monotonic()
             try:
-                yield Frame([read_image(path) for path in paths], ", ".join(dict.fromkeys(path.name for path in paths)))
+                frame = Frame(
+                    [read_image(path) for path in paths], ", ".join(dict.fromkeys(path.name for path in paths))
+                )
             except InputError as error:
                 _log.warning("left out: %s", error)
+                # A slow copy may have rested: it is read again once it has grown.
+                unread[name] = state
+                continue
+            seen.add(name)
+            yield frame
         time.sleep(POLL_S)
 
 
-def _settled(path: Path) -> bool:
-    """Say whether nobody writes the picture any more; one that is gone while we look is none."""
+def _settled(paths: Sequence[Path]) -> tuple[tuple[int, int], ...] | None:
+    """Return when each picture was written, ns, and its bytes; None where one still is, or is gone while we look."""
     try:
-        return time.time() - path.stat().st_mtime >= SETTLED_S
+        found = [path.stat() for path in paths]
     except OSError:
-        return False
+        return None
+    if any(time.time() - one.st_mtime < SETTLED_S for one in found):
+        return None
+    return tuple((one.st_mtime_ns, one.st_size) for one in found)
 
 
 def _pictures(folder: Path) -> list[Path]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import http.client
 import json
+import os
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -170,6 +172,26 @@ def test_what_is_shown_can_be_taken_once_and_undone(pictures: list[np.ndarray], 
     again = open_coach(options(tmp_path))
     assert again.undo()["frames"] == 0
     assert (tmp_path / "images/frame-0001.png.dropped").exists() and again.keeper.frames == ["frame-0009.png"]
+
+
+def test_a_picture_that_was_copied_slowly_is_read_once_it_is_whole(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = cv2.imencode(".png", np.full((40, 50), 90, np.uint8))[1].tobytes()
+    place = tmp_path / "1.png"
+    place.write_bytes(whole[:-20])
+    os.utime(place, (0.0, 0.0))
+    frames = watched_frames([tmp_path], until_idle_s=1.5)
+
+    def copy_on() -> None:
+        """The copy rested for so long that it looked whole."""
+        place.write_bytes(whole)
+
+    later = threading.Timer(0.6, copy_on)
+    later.start()
+    assert [frame.source for frame in frames] == ["1.png"]
+    later.join()
+    assert caplog.text.count("left out: ") == 1 and "1.png" in caplog.text
 
 
 def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
