@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,8 @@ def check_pictures(
     together in the order of their names; or the images themselves, moment by moment, each in the rig's order. An image
     that cannot be read does not end the rest; its error is raised where there is no other.
 
-    Raises InputError: no covariance, no images, none with a board, or a file that cannot be written; DegenerateError:
-    pictures that say nothing of the camera.
+    Raises InputError: no covariance, no images, none with a board, images of two cameras exchanged, or a file that
+    cannot be written; DegenerateError: pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
     watched, known = load_watched(source)
@@ -112,6 +113,8 @@ def check_pictures(
         with about(source):
             views = _views(watched, source, frames, boards, left_out, unreadable, progress)
             check = check_views(watched, views, cost)
+            if not check.holds:
+                _require_right_order(check, views)
     files = _files(source, check, options)
     write_together(files, force=options.force)
     if options.history is not None:
@@ -239,6 +242,24 @@ def _views(
             f"check: no board was found in {where}: {left_out[0][1]}; take sharp pictures of the whole board"
         )
     return out
+
+
+def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:
+    """Raise InputError where the images of two cameras of a rig exchanged say that it holds, or are explained by what
+    may happen to it while these are not: cameras of one lens might as well have changed their places."""
+    names = check.watched.names
+    for i, j in combinations(range(len(names)), 2):
+        other = {i: j, j: i}
+        trial = [replace(view, camera=other.get(view.camera, view.camera)) for view in views]
+        try:
+            exchanged = check_views(check.watched, trial)
+        except (DegenerateError, InputError):
+            continue
+        if exchanged.holds or (check.unexplained and not exchanged.unexplained):
+            raise InputError(
+                f"check: the images of '{names[i]}' and '{names[j]}' are exchanged: put right, they fit; give them in "
+                f"the rig's order, {', '.join(names)}"
+            )
 
 
 def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before: Sequence[FreshView]) -> BoardView:

@@ -148,7 +148,7 @@ def rectify_stereo_images(
     """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
     same row in both; or two folders of such images, or one folder of both cameras' (left01, right01, or folders left
     and right), of which those of one name or number belong together, as for `calibrate_folders`; or two videos, of
-    which the frames of one number do.
+    which the frames of one number do. Where both are called as the cameras are, that says which is whose.
 
     Two images of which one cannot be read or has no partner are left out, as by `rectify_image`. Raises InputError for
     cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be written.
@@ -156,6 +156,9 @@ def rectify_stereo_images(
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
     both, (camera1, camera2), cam2_from_cam1 = import_pair(rig, names)
+    if names is None and not isinstance(images, (str, Path)):
+        called = {Path(one).name if Path(one).is_dir() else Path(one).stem: one for one in images}
+        images = (called[both[0]], called[both[1]]) if called.keys() == set(both) else images
     with ExitStack() as stack:
         sources, single = _pairs(images, both, stack)
         out = options.output

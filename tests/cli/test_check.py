@@ -19,7 +19,7 @@ from rigkit.cameras.brown import Brown
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -102,6 +102,27 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
     monkeypatch.setattr("rigkit.workflows.check.cam_from_seen_board", no_pose)
     turned = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,))).check
     assert turned.unexplained and turned.rms_px > 10.0
+
+
+def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) -> None:
+    poses = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-60.0, 0.0, 0.0]))
+    camera, optics = Pinhole((320, 240), np.array([260.0, 260.0, 160.3, 119.1])), Optics(0.6, supersample=2)
+    places = [Rigid3(exp_so3(np.array([0.2, tilt, 0.0])), [-70.0, -60.0, 400.0]) for tilt in (0.3, -0.3)]
+    pictures = [tmp_path / f"{name}{k}.png" for k in range(2) for name in ("left", "right")]
+    for path, (place, pose) in zip(pictures, [(a, b) for a in places for b in poses], strict=True):
+        cv2.imwrite(str(path), render([PlacedBoard(BOARD, place)], camera, pose, optics=optics))
+    cameras = [
+        {"name": name, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, pose in zip(("left", "right"), poses, strict=True)
+    ]
+    sure = (np.diag([0.1, 0.1, 0.1, 0.1] * 2 + [1e-4] * 3 + [0.05] * 3) ** 2).tolist()
+    rig, options = tmp_path / "rig.json", CheckOptions(boards=(BOARD,))
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "sigma_px": 0.05, "cameras": cameras, "covariance": sure}))
+    assert check_pictures(rig, pictures, options).check.holds
+    with pytest.raises(InputError, match=r"the images of 'left' and 'right' are exchanged: .*rig's order, left, right"):
+        check_pictures(rig, [pictures[k] for k in (1, 0, 3, 2)], options)
+    # Of different moments: that no order puts right.
+    assert check_pictures(rig, [pictures[k] for k in (0, 3)], options).check.unexplained
 
 
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -172,6 +172,10 @@ def test_folders_of_a_pair_are_rectified_with_their_geometry(
         assert main(["rectify", *given, "--rig", str(rig), "--interpolation", "linear", "-o", str(into)]) == 0
         for name in poses:
             assert (into / name / "2.png").read_bytes() == (out / name / "2.png").read_bytes()
+    # Folders that are called as the cameras are theirs, in whatever order they come.
+    assert main(["rectify", *both[::-1], *command[3:], "-o", str(tmp_path / "turned")]) == 0
+    for name in poses:
+        assert (tmp_path / "turned" / name / "2.png").read_bytes() == (out / name / "2.png").read_bytes()
     # What has no partner is left out; which belongs to which is told by names, not by the order.
     (tmp_path / "right" / "1.png").unlink()
     assert main([*command, "-o", str(tmp_path / "other")]) == 2
