@@ -133,9 +133,11 @@ def _camera_in_words(figures: dict[str, Any]) -> str:
         return line + NO_VERDICT
     low, high = figures["usual_px"]
     at = f" at {figures['rms_px']:.2g} px" if figures["verdict"] == CameraVerdict.UNIMPORTANT else ""
+    # No more than usual, and no chance all the same: it differs where, or in what, both are surer.
+    how = "" if figures["same"] or figures["rms_px"] > high else ", but in a way of which both are surer than that"
     return line + (
         f"expected of one camera {figures['predicted_px']:.4f} px ({low:.3f} to {high:.3f} in nine of ten cases), "
-        f"{figures['ratio']:.2f} times as much is found "
+        f"{figures['ratio']:.2f} times as much is found{how} "
         f"(chance {figures['chance']:.3g}): {figures['verdict']}{at}"
         + ("" if figures["same_model"] else "; the chance allows for what their different models make of one lens")
     )

@@ -1,0 +1,23 @@
+"""What is said of two cameras does not contradict its own figures."""
+
+from __future__ import annotations
+
+import pytest
+from helpers.calibration_scenes import lens
+
+from rigkit.calibration.compare import CalibrationComparison
+from rigkit.cameras.compare import compare_cameras
+from rigkit.workflows.diff import CameraPair
+from rigkit.workflows.diff_words import words_of
+
+
+@pytest.mark.parametrize(("usual_times", "surer"), [((0.5, 5.0), True), ((0.1, 0.5), False)])
+def test_another_camera_that_differs_by_no_more_than_usual(usual_times: tuple[float, float], surer: bool) -> None:
+    """Rms and chance ask different things: where most of what is usual is of one kind, little of another is none."""
+    camera = lens("reg")
+    difference = compare_cameras(camera, camera.with_parameters(camera.parameters * [1.002, 1.0, *[1.0] * 7]))
+    low, high = (times * difference.rms_px for times in usual_times)
+    judged = CalibrationComparison(difference, 0.5 * (low + high), (low, high), 0.001, True)
+    words = words_of(CameraPair(difference, judged))[-1]
+    assert "another camera or a moved lens" in words
+    assert ("times as much is found, but in a way of which both are surer than that (chance 0.001)" in words) == surer
