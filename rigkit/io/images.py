@@ -7,6 +7,7 @@ the file's own structure is walked before it is decoded.
 from __future__ import annotations
 
 import io
+import logging
 import re
 import struct
 import zlib
@@ -23,10 +24,32 @@ from rigkit.core.errors import InputError
 from rigkit.io.reading import read_bytes
 from rigkit.io.tiff import TIFF_STARTS, as_stored, page_sizes
 
+_log = logging.getLogger(__name__)
+
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) red green blue."""
 
 IMAGE_ENDINGS = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
+UNREAD_ENDINGS = (
+    *(
+        ".arw",
+        ".avif",
+        ".cr2",
+        ".cr3",
+        ".dng",
+        ".exr",
+        ".fits",
+        ".gif",
+        ".heic",
+        ".heif",
+        ".jp2",
+        ".jxl",
+        ".nef",
+        ".orf",
+    ),
+    *(".raf", ".rw2"),
+)
+"""What cameras and phones write besides."""
 MAX_PIXELS = 200_000_000
 """Of an image: the largest sensors have 150 million; with detection that is 4 GB."""
 JPEG_START = b"\xff\xd8"
@@ -133,6 +156,16 @@ def announced_sizes(data: bytes) -> list[tuple[int, int]]:
 def images_of_folder(folder: Path) -> list[Path]:
     """Return the images of a folder, by name."""
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+
+
+def name_unread(folder: Path) -> None:
+    """Say which files of a folder are pictures that are not read: of a raw picture beside its JPEG nothing is lost."""
+    read = {path.stem for path in images_of_folder(folder)}
+    others = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNREAD_ENDINGS)
+    lost = [name for name in others if Path(name).stem not in read]
+    if lost:
+        count = f"{len(lost)} pictures, '{lost[0]}' the first, are" if len(lost) > 1 else f"picture '{lost[0]}' is"
+        _log.warning("'%s': %s of a format that is not read, and left out: convert to PNG or JPEG", folder, count)
 
 
 def to_grey(image: Image) -> Image:

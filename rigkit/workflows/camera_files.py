@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
+from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.kalibr import read_kalibr
@@ -16,6 +19,8 @@ from rigkit.io.calibration_file import is_calibration, load_calibration, load_ca
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
 from rigkit.workflows.formats import READ_FORMATS
+
+_log = logging.getLogger(__name__)
 
 OURS = re.compile(r'\A\s*\{\s*["}]')
 """How our files begin, and py-OCamCalib's."""
@@ -38,7 +43,9 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     if kind not in READ_FORMATS:
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
     if kind == "rigkit":
-        return load_camera(source)
+        camera = load_camera(source)
+        warn_if_bad(source)
+        return camera
     return FOREIGN_FORMATS[kind].read(text, name, size_px)
 
 
@@ -52,6 +59,24 @@ def own_calibration(path: str | Path) -> Calibration | None:
     """Return a calibration of rigkit's, None for another file; raises InputError for one that cannot be read."""
     ours = camera_format(read_text(path, "camera file")) == "rigkit"
     return load_calibration(path) if ours and is_calibration(path) else None
+
+
+def called_bad(path: str | Path) -> Finding | None:
+    """Return why a calibration or a rig of ours is not to be trusted, where that was said of it; None else."""
+    if is_rig_file(path):
+        verdicts = load_saved_rig(path).verdicts
+    else:
+        known = own_calibration(path)
+        verdicts = () if known is None else known.verdicts
+    bad = next((finding for finding in verdicts if finding.severity is Severity.BAD), None)
+    return None if bad is None else replace(bad, message=f"the calibration was called bad: {bad.message}")
+
+
+def warn_if_bad(path: str | Path) -> None:
+    """Say where a file is used that is not to be trusted."""
+    bad = called_bad(path)
+    if bad is not None:
+        _log.warning("'%s': %s", path, bad.message)
 
 
 def is_rig(path: str | Path) -> bool:
@@ -104,5 +129,6 @@ def import_pair(
     missing = [name for name in chosen if name not in rig]
     if missing or len(chosen) != 2:
         raise InputError(f"'{path}': no camera '{', '.join(missing)}'; there are {', '.join(rig)}")
+    warn_if_bad(path)
     (camera1, cam1_from_rig), (camera2, cam2_from_rig) = (rig[name] for name in chosen)
     return (chosen[0], chosen[1]), (camera1, camera2), cam2_from_rig @ cam1_from_rig.inverse()

@@ -9,7 +9,6 @@ import numpy as np
 
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.core.errors import InputError
-from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
@@ -20,6 +19,7 @@ from rigkit.report.certificate_page import certificate_facts, certificate_page, 
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task, instrument_of_rig
+from rigkit.workflows.camera_files import called_bad
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
@@ -64,7 +64,8 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         raise InputError(f"certificate: the limit must be positive, got {options.limit}")
     with about(path):
         certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
-    certificate = replace(certificate, findings=(*_doubts(path), *certificate.findings))
+    if (bad := called_bad(path)) is not None:
+        certificate = replace(certificate, findings=(bad, *certificate.findings))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}
@@ -75,14 +76,6 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     write_together(files, force=options.force)
     words = certificate_facts(certificate, options.limit)
     return CertifiedFile(certificate=certificate, words=words, written=tuple(files))
-
-
-def _doubts(path: str | Path) -> list[Finding]:
-    """Return why a calibration is not to be trusted, where that was said of it: its sigmas hold for lenses and boards
-    that are as it takes them to be."""
-    verdicts = load_saved_rig(path).verdicts if is_rig_file(path) else load_calibration(path).verdicts
-    bad = [finding for finding in verdicts if finding.severity is Severity.BAD]
-    return [replace(bad[0], message=f"the calibration was called bad: {bad[0].message}")] if bad else []
 
 
 def load_instrument(

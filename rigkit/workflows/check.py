@@ -38,6 +38,7 @@ from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.next_views import goal_of, length_goal
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
@@ -92,6 +93,7 @@ def check_pictures(
     """
     options, source = options or CheckOptions(), Path(path)
     watched, known = load_watched(source)
+    warn_if_bad(source)
     frames = _frames(watched, [Path(image) for image in images])
     inputs = [source, *(image for frame in frames for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)

@@ -14,7 +14,7 @@ from rigkit.core.identifiers import check_identifier, natural_key
 from rigkit.core.progress import Progress, silent
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
-from rigkit.io.images import IMAGE_ENDINGS, images_of_folder
+from rigkit.io.images import IMAGE_ENDINGS, images_of_folder, name_unread
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
@@ -87,6 +87,8 @@ def session_of_folders(
     if not boards:
         raise InputError(_untold(folders))
     cameras = cameras_in(folders)
+    for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
+        name_unread(folder)
     place = path.parent
     files: dict[Path, str] = {}
     names = [_board_file(words, place, files) for words in boards]

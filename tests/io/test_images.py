@@ -11,6 +11,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.io.images import quiet_opencv, read_image, to_grey
+from rigkit.workflows.detect import images_in
 
 
 @pytest.fixture
@@ -187,3 +188,14 @@ def test_opencv_is_quiet_in_either_of_its_versions(monkeypatch: pytest.MonkeyPat
     with quiet_opencv():
         assert levels[-1] == 0
     assert levels[-1] == 3
+
+
+def test_pictures_of_a_format_that_is_not_read_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Half of a phone's pictures in another format would be missed without a word; of raw and JPEG nothing is."""
+    for name in ("1.jpg", "1.CR2", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    assert list(images_in([tmp_path])) == [tmp_path / "1.jpg"] and not caplog.records
+    for name in ("2.heic", "3.HEIC"):
+        (tmp_path / name).write_bytes(b"")
+    assert list(images_in([tmp_path])) == [tmp_path / "1.jpg"]
+    assert "2 pictures, '2.heic' the first, are of a format that is not read" in caplog.text
