@@ -67,8 +67,10 @@ WAYS = {
         "resized some",
     ),
     "shift": _Way(
-        "the picture is shifted on the sensor from image to image",
-        "switch image stabilisation off, and retake all, unless a program turned or cropped some",
+        # After its pose a board tells two numbers of what an image does to it at first order: a shear has no others.
+        "the picture is shifted on the sensor from image to image, or sheared while it was read row by row",
+        "switch image stabilisation off, hold camera and board still, and retake all, unless a program turned or "
+        "cropped some",
     ),
     "rows": _Way(
         "boards are sheared as if they moved while the image was read row by row (rolling shutter)",

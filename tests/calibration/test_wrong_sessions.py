@@ -303,6 +303,21 @@ def test_images_that_contradict_each_other_come_before_what_that_does_to_the_len
     assert any("the projection is uncertain by" in finding.message for finding in others)
 
 
+def test_a_sheared_picture_is_told_from_a_shifted_one_by_nobody(rng: np.random.Generator) -> None:
+    """As by a camera that is swung aside while rows are read: both are named (by shifts alone in 10 of 10 draws)."""
+    camera = Pinhole(SIZE, np.array([1364.0, 1364.0, 815.0, 617.0]))
+    views = []
+    for view in random_views(camera, 14, rng, reach_deg=30.0, noise_px=0.03)[0]:
+        pixels = view.pixels.copy()
+        pixels[:, 0] += 4.0 * rng.uniform(-1.0, 1.0) * (pixels[:, 1] / SIZE[1] - 0.5)
+        views.append(replace(view, pixels=np.clip(pixels, -0.5, np.array(SIZE) - 0.5)))
+    found = changing_in(calibrate(views, SIZE, model="brown", board="flat", folds=0))
+    assert [finding.message.split(":")[0] for finding in found] == [
+        "the picture is shifted on the sensor from image to image, or sheared while it was read row by row"
+    ]
+    assert found[0].remedy is not None and "still" in found[0].remedy
+
+
 @pytest.mark.parametrize("again", ["in half of the images", "in each image"])
 def test_a_zoom_is_not_taken_for_a_motion(again: str, rng: np.random.Generator) -> None:
     """Half of the images at a focal length 1 % longer, or each at its own, before a board that is bent a little."""
