@@ -30,6 +30,19 @@ EXPORT void fit_edges(
     ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
     ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
 
+/* correlation.c */
+
+/* The constants of detection.subpixel.correlation, under their names there. */
+typedef struct {
+    double light_share, lost_error, least_left, covered_times, least_factor, least_blur, radius_px;
+} factor_rules_t;
+
+EXPORT void sigma_factors(
+    ARRAY(const double, products, count, LAGS), ARRAY(const double, pairs, count, LAGS), ARRAY(const double, noise, count),
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
+    ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
+    int64_t boards, const factor_rules_t *rules, ARRAY(double, out, boards));
+
 /* bends.c */
 
 /* The constants of detection.subpixel.edge_curvature. */

@@ -1,10 +1,11 @@
-"""The kernels in edges.c and bends.c: the fit of the edge model to corners, and how the lines of a lattice bend."""
+"""The kernels in edges.c, correlation.c and bends.c: the fit of the edge model to corners, what their noise shares, and how
+the lines of a lattice bend."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, image_arguments, structure
 from rigkit.kernels.declarations import header
@@ -18,6 +19,11 @@ LAGS = tuple((-up, right) for up in range(LAG + 1) for right in range(-LAG, LAG 
 @structure("edge_rules_t")
 class Rules(Struct):
     """The constants of the edge model and its fit."""
+
+
+@structure("factor_rules_t")
+class FactorRules(Struct):
+    """The constants of `detection.subpixel.correlation`."""
 
 
 @structure("bend_rules_t")
@@ -54,6 +60,29 @@ def fit_corners(
         *image_arguments(image),
         len(pixels),
         *(*known, np.ascontiguousarray(ends, np.bool_), rules, scratch, out),
+    )
+    return out
+
+
+def sigma_factors(
+    products: FloatArray,
+    pairs: FloatArray,
+    noise: FloatArray,
+    pixels: FloatArray,
+    sides: FloatArray,
+    blur: FloatArray,
+    used: FloatArray,
+    good: BoolArray,
+    owner: IntArray,
+    boards: int,
+    rules: FactorRules,
+) -> FloatArray:
+    """Return what `detection.subpixel.correlation.sigma_factors` does."""
+    known = [np.ascontiguousarray(part, np.float64) for part in (products, pairs, noise, pixels, sides, blur, used)]
+    out = np.empty(boards)
+    kernels().sigma_factors(
+        *(*known, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64)),
+        *(len(pixels), boards, rules, out),
     )
     return out
 
