@@ -8,6 +8,16 @@ typedef struct {
     int64_t width, height;
 } image_t;
 
+/* looks.c */
+
+EXPORT int64_t square_ratios(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t step, double least,
+    ARRAY(double, scratch, 3 * (height / 2 / step) * (width / 2 / step) + 1), ARRAY(double, out, 4));
+
+EXPORT int64_t count_bad_pixels(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart,
+    double step, double share, ARRAY(double, span, 1));
+
 /* smoothing.c */
 
 EXPORT void shrink_floats(

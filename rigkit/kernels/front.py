@@ -1,4 +1,5 @@
-"""Calls of the kernels in smoothing.c, peaks.c, corners.c and links.c: plain arrays; tolerances are the callers'."""
+"""Calls of the kernels in looks.c, smoothing.c, peaks.c, corners.c and links.c: plain arrays; tolerances are the
+callers'."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.calls import Struct, image_arguments, structure
 from rigkit.kernels.declarations import header
 
 _CONSTANTS = header().constants
@@ -57,6 +58,24 @@ class ImageOf(Struct):
 @structure("corners_t")
 class _CornerArrays(Struct):
     """The corners that links are sought for."""
+
+
+def square_ratios(image: GreyImage, step: int, least: float) -> tuple[FloatArray, int]:
+    """Return the upper medians (4,) of how bright the pixels of squares of 2 x 2 are (row by row), beside the mean of
+    their square, and of how many squares: of every `step`-th both ways those brighter than the upper median of all, and
+    than `least`."""
+    grey, bytewise, width, height = image_arguments(image)
+    scratch, out = np.empty(3 * (height // 2 // step) * (width // 2 // step) + 1), np.empty(4)
+    return out, kernels().square_ratios(grey, bytewise, width, height, step, least, scratch, out)
+
+
+def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
+    """Return how many inner pixels of every `apart`-th row from the `first` on stand out of all of their neighbours by
+    more than `step` and by more than `share` of the range of brightness in these rows; and that range."""
+    span = np.empty(1)
+    grey, bytewise, width, height = image_arguments(image)
+    count = kernels().count_bad_pixels(grey, bytewise, width, height, first, apart, step, share, span)
+    return count, float(span[0])
 
 
 def shrunk(image: GreyImage, factor: int) -> Image:

@@ -11,6 +11,7 @@ import numpy as np
 
 from rigkit.core.arrays import IntArray
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.kernels import front
 
 LOOKED_AT = 6000
 """Pixels of the sparse look, in whole rows."""
@@ -48,23 +49,15 @@ def _evident(grey: GreyImage) -> float | None:
     height, width = grey.shape
     apart = max(3, width * height // LOOKED_AT)
     first = 1 + (height - 3) % apart // 2
-    above, here, below = (grey[first + k : height - 1 + k : apart] for k in (-1, 0, 1))
-    span = float(here.max()) - float(here.min())
-    # The pixels above and below, and the three on either side.
-    high, low = cv2.max(above, below), cv2.min(above, below)
-    side_high, side_low = cv2.max(high, here), cv2.min(low, here)
-    inner = here[:, 1:-1]
-    most = cv2.max(cv2.max(side_high[:, :-2], side_high[:, 2:]), high[:, 1:-1])
-    least = cv2.min(cv2.min(side_low[:, :-2], side_low[:, 2:]), low[:, 1:-1])
-    # Bytes stop at zero.
-    beyond = cv2.max(cv2.subtract(inner, most), cv2.subtract(least, inner))
-    if np.count_nonzero(beyond > SPAN_SHARE * span) < MIN_EVIDENT:
+    count, span = front.bad_pixels(grey, first, apart, 0.0, SPAN_SHARE)
+    if count < MIN_EVIDENT:
         return None
+    above, here, below = (grey[first + k : height - 1 + k : apart].astype(np.float64) for k in (-1, 0, 1))
     rough = np.abs(here - 0.5 * above - 0.5 * below).ravel()
     # The difference of a pixel and the mean of two has a median of 0.6745 sqrt(1.5) sigma.
     sigma = float(np.partition(rough, len(rough) // 2)[len(rough) // 2]) / 0.826
     step = max(BAD_PIXEL_SIGMAS * sigma, SPAN_SHARE * span)
-    return step if np.count_nonzero(beyond > step) >= MIN_EVIDENT else None
+    return step if front.bad_pixels(grey, first, apart, step, 0.0)[0] >= MIN_EVIDENT else None
 
 
 def _repair(image: GreyImage, step: float) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, upper_median
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import FloatImage, GreyImage
+from rigkit.kernels import front
 
 GLANCE, LOOK = 1500, 20000
 """Squares of 2 x 2 pixels that tell whether there is a mosaic, and those that tell its scales."""
@@ -28,14 +29,8 @@ MIN_LEVELS = 12.0
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
     """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
-    values = _squares(grey, GLANCE)
-    mean = values.mean(axis=0)
-    bright = mean > max(upper_median(mean), MIN_LEVELS)
-    if not bright.any():
-        return grey
-    ratio = values[:, bright] / mean[bright]
-    middle = ratio.shape[1] // 2
-    if float(np.abs(np.partition(ratio, middle, axis=1)[:, middle] - 1.0).max()) < MOSAIC_SHARE:
+    ratios, count = front.square_ratios(grey, _step(grey, GLANCE), MIN_LEVELS)
+    if count == 0 or float(np.abs(ratios - 1.0).max()) < MOSAIC_SHARE:
         return grey
     values = _squares(grey, LOOK)
     mean = values.mean(axis=0)
@@ -47,11 +42,16 @@ def without_mosaic(grey: GreyImage) -> GreyImage:
     return np.clip(out, 0.0, 255.0, out=out)
 
 
+def _step(grey: GreyImage, count: int) -> int:
+    """Return how many squares lie from one to the next where about `count` are looked at."""
+    height, width = (side // 2 for side in grey.shape)
+    return max(1, int(np.sqrt(height * width / count)))
+
+
 def _squares(grey: GreyImage, count: int) -> FloatArray:
     """Return the brightness at the four PLACES of about `count` squares, (4, N)."""
-    height, width = (side // 2 for side in grey.shape)
-    step = max(1, int(np.sqrt(height * width / count)))
-    down, across = height // step, width // step
+    step = _step(grey, count)
+    down, across = (side // 2 // step for side in grey.shape)
     cells = grey[: 2 * step * down, : 2 * step * across].reshape(down, 2 * step, across, 2 * step)
     return cells[:, :2, :, :2].transpose(1, 3, 0, 2).astype(np.float64).reshape(len(PLACES), -1)
 

@@ -1,0 +1,73 @@
+/* Sparse looks at an image that tell whether it is the mosaic of a colour camera, and whether it has bad pixels. The definitions in
+ * numpy are in tests/kernels/reference/looks.py. */
+#include "kernels.h"
+
+INLINE double level_at(const void *grey, int64_t bytes, int64_t at)
+{
+    return bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
+}
+
+/* Set `out` to the upper medians of the ratios of the four pixels of squares (0 0, 0 1, 1 0, 1 1: row, column) to the mean of
+ * their square, over those squares, every `step`-th both ways, whose mean is above the upper median of all, and above `least`.
+ * Return how many these are. */
+int64_t square_ratios(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t step, double least, double *scratch, double *out)
+{
+    const int64_t down = height / 2 / step, across = width / 2 / step, count = down * across;
+    double *mean = scratch, *ranked_mean = scratch + count, *ratio = scratch + 2 * count;
+    int64_t bright = 0;
+    for (int64_t row = 0, k = 0; row < down; row++)
+        for (int64_t column = 0; column < across; column++, k++) {
+            const int64_t at = 2 * step * (row * width + column);
+            const double upper = level_at(grey, bytes, at) + level_at(grey, bytes, at + 1);
+            const double lower = level_at(grey, bytes, at + width) + level_at(grey, bytes, at + width + 1);
+            mean[k] = ranked_mean[k] = (upper + lower) / 4.0;
+        }
+    const double middle = ranked(ranked_mean, count, count / 2), above = middle > least ? middle : least;
+    for (int64_t place = 0; place < 4; place++) {
+        bright = 0;
+        for (int64_t row = 0, k = 0; row < down; row++)
+            for (int64_t column = 0; column < across; column++, k++) {
+                const int64_t at = 2 * step * (row * width + column) + place / 2 * width + place % 2;
+                ratio[bright] = level_at(grey, bytes, at) / mean[k];
+                bright += mean[k] > above;
+            }
+        out[place] = bright > 0 ? ranked(ratio, bright, bright / 2) : 1.0;
+    }
+    return bright;
+}
+
+/* Return how many inner pixels of every `apart`-th row, from `first` on, are brighter than all of their eight neighbours, or darker,
+ * by more than `step`, or by `share` of the range of these rows if that is more, which goes into `span`. */
+int64_t count_bad_pixels(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart, double step, double share,
+    double *span)
+{
+    double low = INFINITY, high = -INFINITY;
+    for (int64_t v = first; v < height - 1; v += apart)
+        for (int64_t u = 0; u < width; u++) {
+            const double level = level_at(grey, bytes, v * width + u);
+            low = level < low ? level : low;
+            high = level > high ? level : high;
+        }
+    *span = high - low;
+    const double least = step > share * *span ? step : share * *span;
+    int64_t count = 0;
+    for (int64_t v = first; v < height - 1; v += apart)
+        for (int64_t u = 1; u < width - 1; u++) {
+            const int64_t at = v * width + u;
+            const double own = level_at(grey, bytes, at), left = level_at(grey, bytes, at - 1), above = level_at(grey, bytes, at - width);
+            /* Mostly it is like one of these two. */
+            if (fabs(own - left) <= least || fabs(own - above) <= least)
+                continue;
+            double most = left > above ? left : above, fewest = left < above ? left : above;
+            const int64_t others[6] = {1, width, 1 - width, 1 + width, -1 - width, width - 1};
+            for (int k = 0; k < 6; k++) {
+                const double level = level_at(grey, bytes, at + others[k]);
+                most = level > most ? level : most;
+                fewest = level < fewest ? level : fewest;
+            }
+            count += own - most > least || fewest - own > least;
+        }
+    return count;
+}

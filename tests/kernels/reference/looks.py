@@ -1,0 +1,27 @@
+"""What the detector asks the kernels of looks.c for, in numpy; arguments as those of `rigkit.kernels.front`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, GreyImage, upper_median
+
+
+def square_ratios(image: GreyImage, step: int, least: float) -> tuple[FloatArray, int]:
+    down, across = (side // 2 // step for side in image.shape)
+    places = [image[v::2, u::2][: down * step : step, : across * step : step] for v in (0, 1) for u in (0, 1)]
+    values = np.stack([part.astype(np.float64).ravel() for part in places])
+    mean = values.mean(axis=0)
+    bright = mean > max(upper_median(mean), least)
+    if not bright.any():
+        return np.ones(4), 0
+    return np.array([upper_median(own[bright] / mean[bright]) for own in values]), int(np.count_nonzero(bright))
+
+
+def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
+    values = image.astype(np.float64)
+    rows = np.arange(first, len(image) - 1, apart)
+    span = float(np.ptp(values[rows]))
+    moved = [np.roll(values, (v, u), axis=(0, 1)) for v in (-1, 0, 1) for u in (-1, 0, 1) if v or u]
+    beyond = np.maximum(values - np.max(moved, axis=0), np.min(moved, axis=0) - values)
+    return int(np.count_nonzero(beyond[rows, 1:-1] > max(step, share * span))), span

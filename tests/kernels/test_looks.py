@@ -1,0 +1,32 @@
+"""The sparse looks at an image of looks.c against numpy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from kernels.reference import looks as reference
+
+from rigkit.kernels import front
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize("step", [1, 3])
+def test_ratios_within_squares(step: int, dtype: type, rng: np.random.Generator) -> None:
+    image = rng.uniform(0.0, 255.0, (61, 84)).astype(dtype)
+    image[1::2, ::2] = 0.7 * image[1::2, ::2]
+    ours, theirs = front.square_ratios(image, step, 12.0), reference.square_ratios(image, step, 12.0)
+    assert ours[1] == theirs[1] > 60
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-12)
+    assert ours[0].argmin() == 2
+    assert front.square_ratios(np.minimum(image, dtype(9)), step, 12.0)[1] == 0
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_bad_pixels_are_counted(dtype: type, rng: np.random.Generator) -> None:
+    image = rng.uniform(100.0, 130.0, (70, 90)).astype(dtype)
+    image[rng.random(image.shape) < 0.03] = 250
+    image[rng.random(image.shape) < 0.03] = 0
+    for first, apart, step, share in ((1, 3, 0.0, 0.15), (2, 5, 60.0, 0.0), (1, 1, 200.0, 0.0)):
+        ours = front.bad_pixels(image, first, apart, step, share)
+        assert ours == reference.bad_pixels(image, first, apart, step, share)
+        assert (ours[0] > 20) == (step < 200.0)
