@@ -23,8 +23,8 @@ INLINE uint32_t order_of(float value)
 }
 
 /* Return what `at` of `count` values are smaller than or equal to: its bits from the highest downwards, by counting the
- * values that share those found so far. */
-static float value_at_rank(const float *values, int64_t count, int64_t at)
+ * values that share those found so far, which are moved to the front. */
+static float value_at_rank(float *values, int64_t count, int64_t at)
 {
     uint32_t found = 0;
     int32_t often[1 << RANK_BITS];
@@ -32,16 +32,20 @@ static float value_at_rank(const float *values, int64_t count, int64_t at)
         const int low = left > RANK_BITS ? left - RANK_BITS : 0;
         const uint32_t mask = (UINT32_C(1) << (left - low)) - 1;
         memset(often, 0, sizeof often);
-        for (int64_t k = 0; k < count; k++) {
-            const uint32_t order = order_of(values[k]);
-            /* A shift by 32 is undefined. */
-            if (((uint64_t)(order ^ found) >> left) == 0)
-                often[order >> low & mask]++;
-        }
+        for (int64_t k = 0; k < count; k++)
+            often[order_of(values[k]) >> low & mask]++;
         uint32_t bits = 0;
         for (; at >= often[bits] && bits < mask; bits++)
             at -= often[bits];
         found |= bits << low;
+        int64_t kept = 0;
+        for (int64_t k = 0; k < count; k++) {
+            const float value = values[k];
+            values[k] = values[kept];
+            values[kept] = value;
+            kept += (order_of(value) >> low & mask) == bits;
+        }
+        count = kept;
         left = low;
     }
     const uint32_t sign = found >> 31 ? UINT32_C(1) << 31 : UINT32_MAX, back = found ^ sign;

@@ -119,6 +119,8 @@ def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
 
 def joined(parts: Sequence[Corners]) -> Corners:
     """Return the corners of all `parts`."""
+    if len(parts) == 1:
+        return parts[0]
     return Corners(
         np.concatenate([p.pixels for p in parts]),
         np.concatenate([p.angles for p in parts]),
