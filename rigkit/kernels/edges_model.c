@@ -1,139 +1,6 @@
 /* The edge model along the two lines of a corner, with what lies beyond the outer squares: a block of pixels at a time, in
  * float32, which the compiler vectorises; and the normal equations of a Gauss-Newton step. */
-#include "edges.h"
-
-/* A line through the corner as float32 arithmetic wants it. A sharp edge is two of less `width`, `apart` to either side;
- * `stretch` is s / width (reference.edges._edge). */
-typedef struct {
-    float cosine, sine, curvature, before, after, tilt_before, tilt_after;
-    float blur, width, stretch, apart, kurtosis;
-    float paper_before, paper_after;
-    int tight, sharp, ends_before, ends_after;
-} line_t;
-
-/* The model along one line over a block of pixels: the step, its derivatives, -s dS/ds, and the pixel's place. */
-typedef struct {
-    float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
-} edge_t;
-
-/* What lies beyond the outer squares of one line over a block of pixels: how much of it a pixel sees, and that times how
- * bright it is; the derivatives of both, and -s d/ds. */
-typedef struct {
-    float seen[BLOCK], seen_slope[BLOCK], seen_grown[BLOCK], paper[BLOCK], slope[BLOCK], grown[BLOCK];
-} beyond_t;
-
-/* Beyond so many s an edge is flat to float32; the exponential below needs a limit. */
-#define FLAT_SIGMAS 12.0f
-
-INLINE line_t line_of(
-    double angle, double curvature, const double gaps[2], const double tilts[2], const double paper[2], double blur, const edge_rules_t *rules)
-{
-    const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
-    const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
-    const int sharp = blur < rules->sharp_blur;
-    const double apart = sharp ? sqrt(sqrt(-0.5 * flat)) : 0.0, width = sqrt(b2 - apart * apart);
-    const double nearest = gaps[0] < gaps[1] ? gaps[0] : gaps[1];
-    const int before = isfinite(paper[0]), after = isfinite(paper[1]);
-    return (line_t){
-        .cosine = (float)cosine, .sine = (float)sine, .curvature = (float)curvature,
-        .before = (float)gaps[0], .after = (float)gaps[1],
-        .tilt_before = (float)tilts[0], .tilt_after = (float)tilts[1],
-        .blur = (float)blur, .width = (float)width, .stretch = (float)(blur / width), .apart = (float)apart,
-        .kurtosis = sharp ? 0.0f : (float)(flat / (b2 * b2)),
-        .paper_before = before ? (float)paper[0] : 0.0f, .paper_after = after ? (float)paper[1] : 0.0f,
-        .tight = before || after || nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur, .sharp = sharp,
-        .ends_before = before, .ends_after = after};
-}
-
-/* Add a Gaussian edge, `shift` back from the line and turned by `tilt`, with weight `part`. The distances have a loop of their own: mixed
- * with what follows, their limits become branches that keep the compiler from vectorising. */
-INLINE void add_gaussian(const line_t line, float shift, float tilt, float part, edge_t *out)
-{
-    float x[BLOCK];
-    const float per_width = 1.0f / line.width;
-    for (int i = 0; i < BLOCK; i++) {
-        const float along = out->along[i];
-        const float bend = 0.5f * line.curvature * (along * along + line.blur * line.blur);
-        const float at = (out->aside[i] - bend - tilt * along + shift) * per_width;
-        const float most = at < FLAT_SIGMAS ? at : FLAT_SIGMAS;
-        x[i] = most > -FLAT_SIGMAS ? most : -FLAT_SIGMAS;
-    }
-    const float once = part * line.stretch, twice = once * line.stretch, thrice = twice * line.stretch;
-    for (int i = 0; i < BLOCK; i++) {
-        float edge[5];
-        blurred_edge(x[i], line.kurtosis, edge);
-        out->value[i] += part * edge[0];
-        out->slope[i] += once * edge[1];
-        out->bow[i] += twice * edge[2];
-        out->curl[i] += thrice * edge[3];
-        out->grown[i] += twice * edge[4];
-    }
-}
-
-/* reference.edges._edge, `shift` back from the line and turned by `tilt`. */
-INLINE void add_edge(const line_t line, float shift, float tilt, float part, edge_t *out)
-{
-    if (line.sharp) {
-        add_gaussian(line, shift - line.apart, tilt, 0.5f * part, out);
-        add_gaussian(line, shift + line.apart, tilt, 0.5f * part, out);
-    } else {
-        add_gaussian(line, shift, tilt, part, out);
-    }
-}
-
-/* Evaluate one line over a block of pixels at (u, v) from the window's centre (reference.edges._step). */
-INLINE void along_line(const line_t line, const float *u, const float *v, float x, float y, edge_t *out)
-{
-    for (int i = 0; i < BLOCK; i++) {
-        out->along[i] = line.cosine * (u[i] - x) + line.sine * (v[i] - y);
-        out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
-        out->value[i] = out->slope[i] = out->bow[i] = out->curl[i] = out->grown[i] = 0.0f;
-    }
-    add_edge(line, 0.0f, 0.0f, 1.0f, out);
-    if (line.tight) {
-        /* Squares go on beyond the next line the other way round; of paper the pattern is nothing. */
-        const float before = line.ends_before ? 0.5f : 1.0f, after = line.ends_after ? 0.5f : 1.0f;
-        add_edge(line, line.before, line.tilt_before, -before, out);
-        add_edge(line, -line.after, line.tilt_after, -after, out);
-        for (int i = 0; i < BLOCK; i++)
-            out->value[i] += before - after;
-    }
-    for (int i = 0; i < BLOCK; i++)
-        out->grown[i] += line.curvature * line.blur * out->slope[i];
-}
-
-/* Add what lies beyond the line `shift` back from `line`, turned by `tilt`, on the side where `way` times the distance grows. */
-INLINE void add_paper(const line_t line, float shift, float tilt, float way, float paper, const edge_t *at, beyond_t *out)
-{
-    edge_t edge;
-    for (int i = 0; i < BLOCK; i++) {
-        edge.along[i] = at->along[i];
-        edge.aside[i] = at->aside[i];
-        edge.value[i] = edge.slope[i] = edge.bow[i] = edge.curl[i] = edge.grown[i] = 0.0f;
-    }
-    add_edge(line, shift, tilt, 1.0f, &edge);
-    const float half = 0.5f * way;
-    for (int i = 0; i < BLOCK; i++) {
-        const float seen = 0.5f + half * edge.value[i], slope = half * edge.slope[i];
-        const float grown = half * (edge.grown[i] + line.curvature * line.blur * edge.slope[i]);
-        out->seen[i] += seen;
-        out->seen_slope[i] += slope;
-        out->seen_grown[i] += grown;
-        out->paper[i] += paper * seen;
-        out->slope[i] += paper * slope;
-        out->grown[i] += paper * grown;
-    }
-}
-
-/* Evaluate what lies beyond the ends of one line whose `at` is known (reference.edges._beyond). */
-INLINE void beyond_line(const line_t line, const edge_t *at, beyond_t *out)
-{
-    memset(out, 0, sizeof *out);
-    if (line.ends_before)
-        add_paper(line, line.before, line.tilt_before, -1.0f, line.paper_before, at, out);
-    if (line.ends_after)
-        add_paper(line, -line.after, line.tilt_after, 1.0f, line.paper_after, at, out);
-}
+#include "edges_lines.h"
 
 /* reference.edges._mixed. */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
@@ -187,21 +54,22 @@ INLINE void add_papered(
 /* Set `rows` of the block of pixels that begins with `start` to the first `parameters` of reference.edges.linearise, and the
  * last to the residuals. */
 INLINE void fill_rows(
-    const int parameters, const int papered, const model_t *m, const window_t *window, int64_t start, float (*restrict rows)[BLOCK])
+    const int parameters, const int papered, const int size, const model_t *m, const window_t *window, int64_t start,
+    float (*restrict rows)[BLOCK])
 {
     const float *restrict u = window->u + start, *restrict v = window->v + start;
     const float *restrict value = window->value + start;
     const line_t line1 = m->line1, line2 = m->line2;
     const float rho = m->rho, half_rho = 0.5f * rho, half = m->half, blur = m->blur, per_size = m->per_size;
     edge_t one, two;
-    along_line(line1, u, v, m->x, m->y, &one);
-    along_line(line2, u, v, m->x, m->y, &two);
+    along_line(size, line1, u, v, m->x, m->y, &one);
+    along_line(size, line2, u, v, m->x, m->y, &two);
     beyond_t past1, past2;
     if (papered) {
-        beyond_line(line1, &one, &past1);
-        beyond_line(line2, &two, &past2);
+        beyond_line(size, line1, &one, &past1);
+        beyond_line(size, line2, &two, &past2);
     }
-    for (int i = 0; i < BLOCK; i++) {
+    for (int i = 0; i < size; i++) {
         const float pattern = papered ? papered_pattern(m, &one, &two, &past1, &past2, i) : mixed(&one, &two, rho, i);
         const float plain = m->base + half * pattern;
         const float light = 1.0f + m->light_u * u[i] + m->light_v * v[i];
@@ -231,8 +99,9 @@ INLINE void fill_rows(
     }
 }
 
-/* Add the products of the first `parameters` rows of a block and the last to `sum`, the lower half row by row. */
-INLINE void add_block(const int parameters, float (*restrict rows)[BLOCK], lanes_t *sum)
+/* Add the products of the first `parameters` rows of `size` pixels, a block or half of it, and the last to `sum`, the lower half
+ * row by row. */
+INLINE void add_block(const int parameters, const int size, float (*restrict rows)[BLOCK], lanes_t *sum)
 {
     for (int i = 0; i <= parameters; i++) {
         const lanes_t *left = (const lanes_t *)rows[i];
@@ -240,10 +109,45 @@ INLINE void add_block(const int parameters, float (*restrict rows)[BLOCK], lanes
         const lanes_t l4 = left[4], l5 = left[5], l6 = left[6], l7 = left[7];
         for (int j = 0; j <= i; j++, sum++) {
             const lanes_t *right = (const lanes_t *)rows[j];
-            *sum += ((l0 * right[0] + l1 * right[1]) + (l2 * right[2] + l3 * right[3]))
-                + ((l4 * right[4] + l5 * right[5]) + (l6 * right[6] + l7 * right[7]));
+            /* Two chains of fused products. */
+            lanes_t even = *sum + l0 * right[0], odd = l1 * right[1];
+            even += l2 * right[2];
+            odd += l3 * right[3];
+            if (size == BLOCK) {
+                even += l4 * right[4];
+                odd += l5 * right[5];
+                even += l6 * right[6];
+                odd += l7 * right[7];
+            }
+            *sum = even + odd;
         }
     }
+}
+
+/* Clear a block of the first `parameters` rows and the last from pixel `used` on. */
+INLINE void clear_behind(const int parameters, int64_t used, float (*restrict rows)[BLOCK])
+{
+    const int group = (int)(used / LANES), left = (int)(used % LANES);
+    const mask_t numbers = {0, 1, 2, 3, 4, 5, 6, 7}, kept = numbers < left;
+    for (int row = 0; row <= parameters; row++) {
+        lanes_t *groups = (lanes_t *)rows[row];
+        groups[group] = (lanes_t)((mask_t)groups[group] & kept);
+        for (int k = 0; k < GROUPS; k++)
+            if (k > group)
+                groups[k] = (lanes_t){0.0f};
+    }
+}
+
+/* Set the rows of the block of pixels that begins with `start` (fill_rows), nothing behind the last of `used`, and add their
+ * products to `sums`. */
+INLINE void multiply_block(
+    const int parameters, const int papered, const int size, const model_t *model, const window_t *window, int64_t start, int64_t used,
+    float (*restrict rows)[BLOCK], lanes_t *sums)
+{
+    fill_rows(parameters, papered, size, model, window, start, rows);
+    if (used < BLOCK)
+        clear_behind(parameters, used, rows);
+    add_block(parameters, size, rows, sums);
 }
 
 /* Set the window's rows (fill_rows), and `products` (rows of ROWS, lower half) to those of these rows over all pixels. */
@@ -257,11 +161,12 @@ INLINE void multiply_rows(
     for (int64_t start = 0; start < window->count; start += BLOCK) {
         /* Where they are not asked for afterwards, in one place, which stays in the cache. */
         float(*restrict rows)[BLOCK] = rows_of(window, rules->mirrored ? start : 0);
-        fill_rows(parameters, papered, &model, window, start, rows);
         const int64_t used = window->count - start;
-        for (int row = 0; row <= parameters && used < BLOCK; row++)
-            memset(rows[row] + used, 0, (size_t)(BLOCK - used) * sizeof(float));
-        add_block(parameters, rows, sums);
+        if (used > BLOCK / 2) {
+            multiply_block(parameters, papered, BLOCK, &model, window, start, used, rows, sums);
+        } else {
+            multiply_block(parameters, papered, BLOCK / 2, &model, window, start, used, rows, sums);
+        }
     }
     for (int i = 0, k = 0; i <= parameters; i++)
         for (int j = 0; j <= i; j++, k++) {
@@ -310,8 +215,8 @@ void set_brightness(double *values, const window_t *window, const geometry_t at,
         float pattern[BLOCK], value[BLOCK];
         lanes_t p = {0.0f}, i = {0.0f}, pp = {0.0f}, pi = {0.0f};
         n += (double)(window->count - start < BLOCK ? window->count - start : BLOCK);
-        along_line(line1, window->u + start, window->v + start, x, y, &one);
-        along_line(line2, window->u + start, window->v + start, x, y, &two);
+        along_line(BLOCK, line1, window->u + start, window->v + start, x, y, &one);
+        along_line(BLOCK, line2, window->u + start, window->v + start, x, y, &two);
         for (int k = 0; k < BLOCK; k++) {
             const int used = start + k < window->count;
             pattern[k] = used ? (float)sign * mixed(&one, &two, rho, k) : 0.0f;

@@ -37,8 +37,13 @@ double unmirrored(const double *values, window_t *window, int parameters, const 
     const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
     float *square = window->square + middle * across + middle, *turned = window->turned + middle * across + middle;
     float *changes = window->change + middle * across + middle, *shown = window->paired + middle * across + middle;
-    memset(window->square, 0xff, (size_t)(across * across) * sizeof(float)); /* NaN */
-    memset(window->turned, 0xff, (size_t)(across * across) * sizeof(float));
+    const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
+    const int32_t first = (int32_t)window->v[0], last = (int32_t)window->v[window->count - 1];
+    /* Rows that are written to or read from. */
+    const int32_t low = -last < first - (int32_t)top - 1 ? -last : first - (int32_t)top - 1;
+    const int32_t high = -first > last - (int32_t)top ? -first : last - (int32_t)top;
+    memset(window->square + (middle + first) * across, 0xff, (size_t)((last - first + 1) * across) * sizeof(float)); /* NaN */
+    memset(window->turned + (middle + low) * across, 0xff, (size_t)((high - low + 1) * across) * sizeof(float));
     for (int64_t start = 0; start < window->count; start += BLOCK) {
         const int64_t used = window->count - start < BLOCK ? window->count - start : BLOCK;
         const float *u = window->u + start, *v = window->v + start, *rest = rows_of(window, start)[parameters];
@@ -47,14 +52,13 @@ double unmirrored(const double *values, window_t *window, int parameters, const 
             square[at] = turned[-at] = rest[i];
         }
     }
-    const double left = floor(2.0 * values[X]), top = floor(2.0 * values[Y]);
     const float right = (float)(2.0 * values[X] - left), below = (float)(2.0 * values[Y] - top);
     const float w00 = (1.0f - right) * (1.0f - below), w10 = right * (1.0f - below);
     const float w01 = (1.0f - right) * below, w11 = right * below;
     const lanes_t one = (lanes_t){0.0f} + 1.0f;
     lanes_t sums = {0.0f};
     mask_t pairs = {0};
-    for (int32_t v = (int32_t)window->v[0]; v <= (int32_t)window->v[window->count - 1]; v++) {
+    for (int32_t v = first; v <= last; v++) {
         const float *restrict here = square + v * across - radius;
         const float *restrict there = turned + (v - (int32_t)top) * across - (int32_t)left - radius;
         const float *restrict above = there - across;

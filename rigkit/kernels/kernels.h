@@ -332,22 +332,35 @@ INLINE float decay(float y)
     return series * power;
 }
 
-/* reference.edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7. */
-INLINE void blurred_edge(float x, float kurtosis, float out[5])
+/* reference.edge_model._blurred_edge, with the error function of Abramowitz and Stegun 7.1.26, right to 1.5e-7; `round` where
+ * the fourth cumulant is 0. */
+INLINE void any_edge(float x, const int round, float kurtosis, float out[5])
 {
     const float square = x * x, gauss = decay(-0.5f * square);
     const float t = 1.0f / (1.0f + (0.3275911f * 0.70710678f) * fabsf(x));
     const float tail =
         t * (0.254829592f + t * (-0.284496736f + t * (1.421413741f + t * (-1.453152027f + t * 1.061405429f)))) * gauss;
     const float error = copysignf(1.0f - tail, x);
-    const float density = 0.79788456f * gauss, part = kurtosis * (1.0f / 24.0f);
-    const float third = part * x * (square - 3.0f) * density;
+    const float density = 0.79788456f * gauss;
+    out[3] = density * (square - 1.0f);
+    if (round) {
+        out[0] = error;
+        out[1] = density;
+        out[2] = -density * x;
+        out[4] = x * density;
+        return;
+    }
+    const float part = kurtosis * (1.0f / 24.0f), third = part * x * (square - 3.0f) * density;
     const float slope = density * (1.0f + part * (square * (square - 6.0f) + 3.0f));
     out[0] = error - third;
     out[1] = slope;
     out[2] = -density * x * (1.0f + part * (square * (square - 10.0f) + 15.0f));
-    out[3] = density * (square - 1.0f);
     out[4] = x * slope - 4.0f * third;
+}
+
+INLINE void blurred_edge(float x, float kurtosis, float out[5])
+{
+    any_edge(x, 0, kurtosis, out);
 }
 
 /* Rows of corners are made so many at a time: they stay in the first cache. Of their products four rows by eight stay in
