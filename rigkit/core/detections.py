@@ -26,7 +26,9 @@ def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> In
     for _ in range(quarter_turns % 4):
         column, row = rows - 1 - row, column
         columns, rows = rows, columns
-    return np.stack([column, row], axis=-1)
+    out = np.empty(grid.shape, grid.dtype)
+    out[:, 0], out[:, 1] = column, row
+    return out
 
 
 def _check_corners(seen: BoardDetection | BoardView) -> None:

@@ -68,7 +68,7 @@ def detect_boards(
     sizes = search.chessboard_sizes
     if search.fewest < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
-    ordered = sorted(found, key=_rank)
+    ordered = sorted(found, key=_rank) if len(found) > 1 else found
     # Grids of circles are named where they are placed, and not where a larger board may be meant.
     plain = [board for board in search.boards if board.pattern.type == Chessboard.type]
     return tuple(_with_ids(_without_repeated(ordered), plain, (stored.shape[1], stored.shape[0])))

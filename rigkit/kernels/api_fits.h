@@ -30,6 +30,28 @@ EXPORT void fit_edges(
     ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
     ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
 
+/* What windows of the corners of tags go by: how wide a border is, in sides of a tag, how many s it is left by, and the distance
+ * of neighbouring lines where none are near, px. */
+typedef struct {
+    double border, blurs, nothing_near;
+} tag_window_t;
+
+EXPORT void fit_tag_edges(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t places,
+    ARRAY(const uint8_t, cells, places), ARRAY(const double, steps, places, 2, 2), ARRAY(const double, signs, places),
+    int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, surface, count, SURFACE_COLUMNS),
+    ARRAY(const double, single, count, 2), ARRAY(const double, contrast, count), ARRAY(const double, blur, count),
+    const tag_window_t *tag, const edge_rules_t *rules, ARRAY(float, scratch, edges_scratch(rules)),
+    ARRAY(double, out, count, OUTCOMES));
+
+EXPORT double blur_of_tags(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t places,
+    ARRAY(const uint8_t, cells, places), ARRAY(const double, steps, places, 2, 2), ARRAY(const double, signs, places),
+    int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, surface, count, SURFACE_COLUMNS),
+    ARRAY(const double, single, count, 2), ARRAY(const double, contrast, count), int64_t apart, double blur,
+    const tag_window_t *tag, const edge_rules_t *rules, ARRAY(float, scratch, edges_scratch(rules)),
+    ARRAY(double, found, count / apart + 1));
+
 /* correlation.c */
 
 /* The constants of detection.subpixel.correlation, under their names there. */
@@ -95,14 +117,28 @@ EXPORT int64_t fit_polynomials(
     double most_leverage, ARRAY(double, basis, terms, count), ARRAY(double, scratch, 5, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
     ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, off, count),
     ARRAY(double, gain, count), ARRAY(double, scatter, 1));
+EXPORT int64_t fit_map(
+    ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, int64_t terms,
+    double most_leverage, double nearest, ARRAY(double, rest, count, 2), ARRAY(double, basis, terms, count),
+    ARRAY(double, scratch, 5, count), ARRAY(double, homography, 3, 3), ARRAY(double, unit, 3),
+    ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1),
+    ARRAY(double, off, count), ARRAY(double, gain, count), ARRAY(double, scatter, 1));
 EXPORT void add_polynomial(
     ARRAY(const double, wanted, count, 2), int64_t count, ARRAY(const double, unit, 3), int64_t terms, int64_t degree,
     ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
     ARRAY(const double, misses, SURFACE_DEGREE + 1), int64_t surest, ARRAY(double, out, count, SURFACE_COLUMNS));
+/* codes.c */
+
+EXPORT void maps_of_quads(ARRAY(const double, quads, count, 4, 2), int64_t count, ARRAY(double, out, count, 3, 3));
 EXPORT void read_modules(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
-    ARRAY(const double, maps, count, 3, 3), int64_t count, int64_t side,
+    ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side,
     ARRAY(double, bright, count, side * side), ARRAY(double, spread, count));
+EXPORT void read_codes(
+    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
+    ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side, ARRAY(const double, patterns, codes, side * side),
+    int64_t codes, double least, ARRAY(double, bright, count, side * side), ARRAY(int64_t, best, count),
+    ARRAY(double, likeness, count));
 
 /* tags.c */
 

@@ -8,6 +8,9 @@
 
 enum { CACHE_LINE = 64 };
 
+/* Of what comes out of a corner. */
+enum { BLUR = 3, CONTRAST = 4, VALID = 7 };
+
 /* Start from the contrast 2 b and a mean brightness: the first step finds the latter, in which the model is linear. */
 static void level(double *values, const window_t *window, double half)
 {
@@ -29,18 +32,17 @@ static void level(double *values, const window_t *window, double half)
 static int factor(double *matrix, int n)
 {
     for (int j = 0; j < n; j++) {
-        double *row = matrix + j * ROWS, rest = row[j];
-        for (int k = 0; k < j; k++)
-            rest -= row[k] * row[k];
-        if (!(rest > 0.0))
+        const double pivot = matrix[j * ROWS + j];
+        if (!(pivot > 0.0))
             return 0;
-        row[j] = 1.0 / sqrt(rest);
-        for (int i = j + 1; i < n; i++) {
-            double *below = matrix + i * ROWS, sum = below[j];
-            for (int k = 0; k < j; k++)
-                sum -= below[k] * row[k];
-            below[j] = sum * row[j];
-        }
+        const double scale = matrix[j * ROWS + j] = 1.0 / sqrt(pivot);
+        double column[PARAMETERS];
+        for (int i = j + 1; i < n; i++)
+            column[i] = matrix[i * ROWS + j] *= scale;
+        /* What later columns have left: sums that do not wait for each other. */
+        for (int i = j + 1; i < n; i++)
+            for (int k = j + 1; k <= i; k++)
+                matrix[i * ROWS + k] -= column[i] * column[k];
     }
     return 1;
 }
@@ -164,7 +166,7 @@ static void descend(
 
 /* Fit one corner, of a `contrast` that may be unknown (NaN); `out` is u, v, sigma, s, 2 b, RMS residual, RMS noise, valid,
  * pixels, sums and numbers of `lag_products`, none where the noise is not known or is that of rounding. */
-static void fit_corner(
+FOR_EACH_PROCESSOR static void fit_corner(
     window_t *window, const double pixel[2], const geometry_t at, double sign, double blur, double contrast,
     const edge_rules_t *rules, double *out)
 {
@@ -224,9 +226,26 @@ int64_t edges_scratch(const edge_rules_t *rules)
     return (3 + ROWS) * room_of_window(rules->radius_px) + 4 * across * across + CACHE_LINE / (int64_t)sizeof(float);
 }
 
+/* Return the window in `scratch`, as large as `edges_scratch` says. */
+static window_t window_in(float *scratch, const edge_rules_t *rules)
+{
+    const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
+    /* Vectors that lie across two lines of the cache take twice the time. */
+    scratch += (CACHE_LINE - (uintptr_t)scratch % CACHE_LINE) % CACHE_LINE / sizeof(float);
+    float *pictures = scratch + (3 + ROWS) * room;
+    /* Around what mirroring changes there is nothing. */
+    if (rules->mirrored)
+        memset(pictures + 2 * across * across, 0, 2 * (size_t)(across * across) * sizeof(float));
+    return (window_t){
+        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rows = scratch + 3 * room,
+        .square = pictures, .turned = pictures + across * across, .change = pictures + 2 * across * across,
+        .paired = pictures + 3 * across * across, .across = across,
+        .radius = (int64_t)floor(rules->radius_px)};
+}
+
 /* Fit the edge model around `count` corners (reference.edges.fit_corners). pixels (N, 2), sides (N, 2, 2), curvature and its sigma
  * and single (N, 2), gaps, tilts, reach, paper and ends (N, 2, 2), sign, blur, that of its window and contrast (N), out (N, OUTCOMES);
- * scratch as `edges_scratch` says, zeroed; `grey` is of uint8_t if `bytes`, else of float. */
+ * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
     const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper, const double *single,
@@ -234,15 +253,7 @@ void fit_edges(
     float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
-    const int64_t room = room_of_window(rules->radius_px), across = across_square(rules);
-    /* Vectors that lie across two lines of the cache take twice the time. */
-    scratch += (CACHE_LINE - (uintptr_t)scratch % CACHE_LINE) % CACHE_LINE / sizeof(float);
-    float *pictures = scratch + (3 + ROWS) * room;
-    window_t window = {
-        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rows = scratch + 3 * room,
-        .square = pictures, .turned = pictures + across * across, .change = pictures + 2 * across * across,
-        .paired = pictures + 3 * across * across, .across = across,
-        .radius = (int64_t)floor(rules->radius_px)};
+    window_t window = window_in(scratch, rules);
     for (int64_t n = 0; n < count; n++) {
         const geometry_t at = {
             sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n, single + 2 * n,
@@ -250,4 +261,67 @@ void fit_edges(
         collect_window(&window, image, pixels + 2 * n, at, window_blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }
+}
+
+/* Fit the corner of a tag from `pixel`, where the board lies as `seen` says (a row of a surface) and neighbours are `step` sides
+ * of a tag away. Its window reaches half way to these, and is so narrow that it ends before the code, beyond the tag's border. */
+static void fit_tag_corner(
+    window_t *window, const picture_t image, const double pixel[2], const double *seen, const double step[4], const double single[2],
+    double sign, double blur, double contrast, const tag_window_t *tag, const edge_rules_t *rules, double *out)
+{
+    static const double none[4] = {0.0}, unknown[4] = {NAN, NAN, NAN, NAN};
+    static const uint8_t inside[4] = {0};
+    const double *high = seen + HEIGHTS, border = tag->border * (high[0] < high[1] ? high[0] : high[1]);
+    const double expected = clipped(blur, rules->least_blur, rules->most_blur);
+    const double narrow = (border - tag->blurs * blur - rules->near_px) / rules->near_sigmas;
+    double gaps[4], reach[4];
+    for (int k = 0; k < 4; k++) {
+        gaps[k] = single[0] != 0.0 ? tag->nothing_near : step[k] * high[k / 2];
+        reach[k] = 0.5 * step[k] < rules->reach ? 0.5 * step[k] : rules->reach;
+    }
+    const geometry_t at = {seen + SIDES, seen + CURVATURE, none, gaps, none, reach, unknown, single, inside};
+    collect_window(window, image, pixel, at, clipped(narrow, rules->least_blur, expected), rules);
+    fit_corner(window, pixel, at, sign, expected, contrast, rules, out);
+}
+
+/* Fit the corners of tags (reference.edges.fit_tag_corners): those of the board's `places` that `cells` marks, `count` of them. */
+void fit_tag_edges(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
+    const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
+    const double *blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *out)
+{
+    const picture_t image = {grey, width, height, bytes};
+    window_t window = window_in(scratch, rules);
+    for (int64_t place = 0, n = 0; place < places && n < count; place++)
+        if (cells[place]) {
+            fit_tag_corner(
+                &window, image, pixels + 2 * n, surface + SURFACE_COLUMNS * n, steps + 4 * place, single + 2 * n, signs[place],
+                blur[n], contrast[n], tag, rules, out + OUTCOMES * n);
+            n++;
+        }
+}
+
+/* Return the median of s of every `apart`-th of these corners, fitted from `blur`; NaN where none could be. `found` is scratch. */
+double blur_of_tags(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
+    const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
+    int64_t apart, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found)
+{
+    const picture_t image = {grey, width, height, bytes};
+    window_t window = window_in(scratch, rules);
+    int64_t seen = 0;
+    for (int64_t place = 0, n = 0; place < places && n < count; place++) {
+        if (!cells[place])
+            continue;
+        if (n % apart == 0) {
+            double fitted[OUTCOMES];
+            fit_tag_corner(
+                &window, image, pixels + 2 * n, surface + SURFACE_COLUMNS * n, steps + 4 * place, single + 2 * n, signs[place],
+                blur, contrast[n], tag, rules, fitted);
+            found[seen] = fitted[BLUR];
+            seen += fitted[VALID] > 0.5 && fitted[CONTRAST] > 0.0;
+        }
+        n++;
+    }
+    return seen > 0 ? quick_median(found, seen) : NAN;
 }

@@ -1,5 +1,4 @@
-/* The smooth map from a board's plane to an image: a perspective, and polynomials for what that leaves; and the
- * brightness of the modules of tags.
+/* The smooth map from a board's plane to an image: a perspective, and polynomials for what that leaves.
  *
  * The definitions in numpy are in tests/kernels/reference/surface.py, the numbers in rigkit.detection.tags. */
 #include "kernels.h"
@@ -244,6 +243,25 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
     return best;
 }
 
+/* Fit the perspective that takes `places` nearest to `pixels`, and polynomials through what it leaves; return as
+ * `fit_polynomials`, or -1 where a place is nearer than `nearest` in it. `rest` (count, 2) is scratch. */
+int64_t fit_map(
+    const double *places, const double *pixels, int64_t count, int64_t terms, double most_leverage, double nearest, double *rest,
+    double *basis, double *scratch, double *homography, double *unit, double *triangle, double *told, double *misses, double *off,
+    double *gain, double *scatter)
+{
+    const double *h = homography;
+    if (!(fit_perspective(places, pixels, count, homography) > nearest))
+        return -1;
+    for (int64_t i = 0; i < count; i++) {
+        const double x = places[2 * i], y = places[2 * i + 1], per_depth = 1.0 / (h[6] * x + h[7] * y + h[8]);
+        for (int64_t k = 0; k < 2; k++)
+            rest[2 * i + k] = pixels[2 * i + k] - (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
+    }
+    return fit_polynomials(
+        places, rest, count, terms, most_leverage, basis, scratch, unit, triangle, told, misses, off, gain, scatter);
+}
+
 /* Set `out` to the values at a place whose terms are `row`, by the degree that is surest there, and to their gain. */
 static void surest_values(
     const double *row, int64_t terms, const double *triangle, const double *told, const double *misses, double out[3])
@@ -330,31 +348,5 @@ void add_polynomial(
             out[2 * s + 1] += sum[s][1];
         }
         line_shapes(out);
-    }
-}
-
-FOR_EACH_PROCESSOR void read_modules(
-    const void *grey, int64_t bytes, int64_t width, int64_t height, const double *maps, int64_t count, int64_t side,
-    double *bright, double *spread)
-{
-    const int64_t modules = side * side;
-    for (int64_t n = 0; n < count; n++, bright += modules) {
-        const double *h = maps + 9 * n;
-        double mean = 0.0, square = 0.0;
-        for (int64_t k = 0; k < modules; k++) {
-            const double x = ((double)(k % side) + 0.5) / (double)side, y = ((double)(k / side) + 0.5) / (double)side;
-            const double depth = h[6] * x + h[7] * y + h[8];
-            const double u = (h[0] * x + h[1] * y + h[2]) / depth, v = (h[3] * x + h[4] * y + h[5]) / depth;
-            bright[k] = grey_level_at(grey, bytes, width, height, u, v);
-            mean += bright[k] / (double)modules;
-        }
-        for (int64_t k = 0; k < modules; k++) {
-            bright[k] -= mean;
-            square += bright[k] * bright[k];
-        }
-        spread[n] = sqrt(square / (double)modules);
-        const double scale = square > 1e-18 ? 1.0 / sqrt(square) : 0.0;
-        for (int64_t k = 0; k < modules; k++)
-            bright[k] *= scale;
     }
 }

@@ -1,12 +1,13 @@
-"""The kernels in surface.c: the map from a board's plane to an image, and the brightness of the modules of tags."""
+"""The kernels in surface.c and codes.c: the map from a board's plane to an image, and the modules of tags."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
+from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import image_arguments
 from rigkit.kernels.declarations import header
@@ -85,6 +86,22 @@ class TagSurface:
         """(M, 2) how far a unit of the board lies from the line along x, and from that along y, px."""
         return self.rows[:, HEIGHTS:]
 
+    @property
+    def seen(self) -> BoolArray:
+        """(M,) whether the place is seen, and how the board lies there is known."""
+        # A sum is a number where all of them are; all(axis=1) takes eight times as long.
+        return np.isfinite(self.rows[:, :SECOND] @ np.ones(SECOND))
+
+    @property
+    def lengths(self) -> FloatArray:
+        """(M, 2) of the sides."""
+        return np.hypot(self.rows[:, SIDES:SECOND:2], self.rows[:, SIDES + 1 : SECOND : 2])
+
+    @property
+    def height(self) -> FloatArray:
+        """(M,) the lesser of the heights; min(axis=1) takes ten times as long."""
+        return np.minimum(self.rows[:, HEIGHTS], self.rows[:, HEIGHTS + 1])
+
     def of(self, which: BoolArray) -> TagSurface:
         """Return the places `which` (M,)."""
         return TagSurface(self.rows[which])
@@ -96,6 +113,18 @@ def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     places, homography = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(homography, np.float64)
     kernels().project_places(places, len(places), homography, out)
     return TagSurface(out)
+
+
+class _Room:
+    """The arrays that polynomials of `most` terms at most through `count` points are worked out in."""
+
+    def __init__(self, count: int, most: int) -> None:
+        terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, most) - 1]
+        self.sizes = (count, terms)
+        self.scratch = np.empty((terms, count)), np.empty((5, count))
+        off, gain = np.empty((2, count))
+        shape = (np.empty(3), np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1))
+        self.results = (*shape, off, gain, np.empty(1))
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -127,20 +156,35 @@ class Polynomials:
     @classmethod
     def through(cls, places: FloatArray, values: FloatArray, most: int, most_leverage: float) -> Polynomials:
         """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
-        terms, count = max(end for end in TERMS_OF_DEGREE if end <= most), len(places)
-        triangle, told, misses = np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1)
-        unit, (off, gain), scatter = np.empty(3), np.empty((2, count)), np.empty(1)
-        best = kernels().fit_polynomials(
-            *(np.ascontiguousarray(part, np.float64) for part in (places, values)),
-            *(count, terms, most_leverage, np.empty((terms, count)), np.empty((5, count))),
-            *(unit, triangle, told, misses, off, gain, scatter),
+        room = _Room(len(places), most)
+        known = (np.ascontiguousarray(part, np.float64) for part in (places, values))
+        best = kernels().fit_polynomials(*known, *room.sizes, most_leverage, *room.scratch, *room.results)
+        return cls._of(room, best)
+
+    @classmethod
+    def beside_perspective(
+        cls, places: FloatArray, pixels: FloatArray, most: int, most_leverage: float, nearest: float
+    ) -> tuple[FloatArray, Polynomials] | None:
+        """Return the `perspective` that takes `places` (N, 2) nearest to `pixels` (N, 2), and polynomials through what
+        it leaves; None where a place is nearer than `nearest` in it."""
+        room, homography = _Room(len(places), most), np.empty((3, 3))
+        known = (np.ascontiguousarray(part, np.float64) for part in (places, pixels))
+        best = kernels().fit_map(
+            *(*known, *room.sizes, most_leverage, nearest, np.empty((len(places), 2))),
+            *(*room.scratch, homography, *room.results),
         )
+        return None if best < 0 else (homography, cls._of(room, best))
+
+    @classmethod
+    def _of(cls, room: _Room, best: int) -> Polynomials:
+        unit, triangle, told, misses, off, gain, scatter = room.results
+        plain = int((misses <= HARDLY_MORE * misses[best]).argmax())
         return cls(
             unit=unit,
             triangle=triangle,
             told=told,
             misses=misses,
-            plain=int(np.argmax(misses <= HARDLY_MORE * misses[best])),
+            plain=plain,
             off=off,
             gain=gain,
             scatter=float(scatter[0]),
@@ -161,16 +205,43 @@ class Polynomials:
         return TagSurface(out)
 
 
-def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
+def maps_of_quads(quads: FloatArray) -> FloatArray:
+    """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2)."""
+    out = np.empty((len(quads), 3, 3))
+    kernels().maps_of_quads(np.ascontiguousarray(quads, np.float64), len(quads), out)
+    return out
+
+
+def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
     """Return the brightness of the modules of N tags, of mean 0 and length 1, (N, side * side), and its standard
     deviation before, (N,).
 
-    `maps` (N, 3, 3) take the unit square to each tag; brightness is bilinear at the middles of `side` x `side` modules,
+    `quads` (N, 4, 2) are the corners of each tag; brightness is bilinear at the middles of `side` x `side` modules,
     that of the border beyond it.
     """
-    spread, bright = np.empty(len(maps)), np.empty((len(maps), side * side))
+    spread, bright = np.empty(len(quads)), np.empty((len(quads), side * side))
     kernels().read_modules(
-        *(*image_arguments(image), np.ascontiguousarray(maps, np.float64), len(maps), side),
+        *(*image_arguments(image), np.ascontiguousarray(quads, np.float64), len(quads), side),
         *(bright, spread),
     )
     return bright, spread
+
+
+def read_codes(
+    image: GreyImage, quads: FloatArray, side: int, patterns: FloatArray, least: float
+) -> tuple[IntArray, FloatArray]:
+    """Return which of the `patterns` (C, side * side) the modules of N tags are most like, (N,), and the correlation,
+    (N,); 0 and 0 where their brightness has a standard deviation below `least`. Else as `read_modules`."""
+    best, likeness = np.empty(len(quads), np.int64), np.empty(len(quads))
+    kernels().read_codes(
+        *(*image_arguments(image), np.ascontiguousarray(quads, np.float64), len(quads), side),
+        *(
+            np.ascontiguousarray(patterns, np.float64),
+            len(patterns),
+            least,
+            np.empty((len(quads), side * side)),
+            best,
+            likeness,
+        ),
+    )
+    return best, likeness

@@ -8,9 +8,17 @@ from kernels.reference import surface as reference
 
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import homographies
 from rigkit.detection.tags.surface import MAX_LEVERAGE, SmoothMap
-from rigkit.kernels.surface import HARDLY_MORE, TERMS_OF_DEGREE, Polynomials, perspective, projected, read_modules
+from rigkit.kernels.surface import (
+    HARDLY_MORE,
+    TERMS_OF_DEGREE,
+    Polynomials,
+    maps_of_quads,
+    perspective,
+    projected,
+    read_codes,
+    read_modules,
+)
 
 SAME = 1e-7
 """px: two ways to solve for 45 powers of numbers up to 1 agree so well."""
@@ -95,16 +103,41 @@ def test_points_on_two_lines_leave_what_they_do_not_say_out(rng: np.random.Gener
     assert np.abs(surface.sides).max() < 60.0
 
 
+QUADS = np.array(
+    [
+        [[10.0, 12.0], [40.0, 9.0], [45.0, 44.0], [7.0, 39.0]],
+        [[60.0, 40.0], [85.0, 38.0], [88.0, 66.0], [61.0, 59.0]],
+        [[5.0, 5.0], [5.0, 5.0], [5.0, 5.0], [5.0, 5.0]],
+    ]
+)
+"""One within an image of 80 x 60 pixels, one that ends beyond it, and one that is a point."""
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_modules(dtype: type, rng: np.random.Generator) -> None:
     image: GreyImage = rng.uniform(0.0, 255.0, (60, 80)).astype(dtype)
-    quads = np.array(
-        [
-            [[10.0, 12.0], [40.0, 9.0], [45.0, 44.0], [7.0, 39.0]],
-            [[60.0, 40.0], [85.0, 38.0], [88.0, 66.0], [61.0, 59.0]],
-        ]
-    )
-    maps = homographies(quads)
-    for one, two in zip(read_modules(image, maps, 6), reference.read_modules(image, maps, 6), strict=True):
+    for one, two in zip(read_modules(image, QUADS, 6), reference.read_modules(image, QUADS, 6), strict=True):
         # OpenCV's remap has places to 1/32 px.
         np.testing.assert_allclose(one, two, atol=2.0 if one.ndim == 1 else 0.03)
+
+
+def test_maps_of_quads(rng: np.random.Generator) -> None:
+    quads = np.concatenate([QUADS, rng.uniform(0.0, 100.0, (20, 4, 2))])
+    np.testing.assert_allclose(maps_of_quads(quads), reference.maps_of_quads(quads), rtol=1e-12)
+    corners = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [1.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
+    there = corners @ maps_of_quads(QUADS[:2]).transpose(0, 2, 1)
+    np.testing.assert_allclose(there[..., :2] / there[..., 2:], QUADS[:2], atol=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_codes(dtype: type, rng: np.random.Generator) -> None:
+    """Of an image of noise: the most like by far is the same, and a tag without contrast is none."""
+    image: GreyImage = rng.uniform(0.0, 255.0, (60, 80)).astype(dtype)
+    bright, _ = read_modules(image, QUADS[:2], 6)
+    patterns = np.concatenate([rng.normal(0.0, 0.1, (30, 36)), bright[::-1], rng.normal(0.0, 0.1, (7, 36))])
+    best, likeness = read_codes(image, QUADS, 6, patterns, 1.5)
+    again, theirs = reference.read_codes(image, QUADS, 6, patterns, 1.5)
+    assert best.tolist() == again.tolist() == [31, 30, 0]
+    np.testing.assert_allclose(likeness, theirs, atol=0.03)
+    assert likeness[2] == 0.0
+    assert read_codes(image, QUADS, 6, patterns, 1e3)[1].tolist() == [0.0, 0.0, 0.0]

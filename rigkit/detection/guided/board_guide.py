@@ -96,12 +96,18 @@ class BoardState:
 
     def with_fit(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
         """Return the state with the `good` of the corners fitted at `cells` put in."""
-        where = cells.copy()
-        where[cells] = good
-        fitted = (getattr(fit, name) for name in FITTED)
-        values = [old.copy() for old in self._values()]
-        for value, new in zip(values, fitted, strict=True):
-            value[where] = new[good]
+        return self._filled([old.copy() for old in self._values()], cells, fit, good)
+
+    def fitted_anew(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
+        """Return the state with nothing but the `good` of the corners fitted at `cells`."""
+        return self._filled([np.full(old.shape, np.nan) for old in self._values()], cells, fit, good)
+
+    def _filled(self, values: list[FloatArray], cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
+        mine = good.nonzero()[0]
+        where = cells.reshape(-1).nonzero()[0][mine]
+        for value, name in zip(values, FITTED, strict=True):
+            new = getattr(fit, name)
+            value.reshape(-1, *new.shape[1:])[where] = new[mine]
         return BoardState(*values, signs=self.signs, together=self.together)
 
     def without(self, drop: BoolArray) -> BoardState:

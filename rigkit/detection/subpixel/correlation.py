@@ -43,6 +43,7 @@ boards under noise alone two have both (RENDERED); at edges of shadows, fingers 
 MIN_SIGMA_FACTOR = 0.5
 """Of sigma: noise that cancels over a few pixels never does so altogether."""
 
+
 def sigma_factors(
     fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
 ) -> FloatArray:

@@ -91,6 +91,23 @@ class EdgeFit:
     pairs: FloatArray
     valid: BoolArray
 
+    @classmethod
+    def of_outcomes(cls, fitted: FloatArray) -> EdgeFit:
+        """Return the corners of `kernels.edges`' OUTCOMES (N, 35)."""
+        _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
+        return cls(
+            pixels=fitted[:, :2],
+            sigma_px=sigma_px,
+            blur=width,
+            contrast=contrast,
+            residual=residual,
+            noise=noise,
+            used=used,
+            products=fitted[:, -2 * len(LAGS) : -len(LAGS)],
+            pairs=fitted[:, -len(LAGS) :],
+            valid=valid > 0.5,
+        )
+
     def of(self, which: BoolArray) -> EdgeFit:
         """Return the corners `which` (N,)."""
         return EdgeFit(**{field.name: getattr(self, field.name)[which] for field in fields(self)})
@@ -148,25 +165,13 @@ def fit_edges(
         blur,
         blur if geometry.window_blur is None else geometry.window_blur,
         expected,
-        _rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8),
+        edge_rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8),
     )
-    _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
-    return EdgeFit(
-        pixels=fitted[:, :2],
-        sigma_px=sigma_px,
-        blur=width,
-        contrast=contrast,
-        residual=residual,
-        noise=noise,
-        used=used,
-        products=fitted[:, -2 * len(LAGS) : -len(LAGS)],
-        pairs=fitted[:, -len(LAGS) :],
-        valid=valid > 0.5,
-    )
+    return EdgeFit.of_outcomes(fitted)
 
 
 @functools.cache
-def _rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, rounded: bool) -> Rules:
+def edge_rules(radius_px: float, iterations: int, converged_px: float, mirrored: bool, rounded: bool) -> Rules:
     return Rules(
         reach=WINDOW_REACH,
         end_sigmas=END_SIGMAS,

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.kernels.surface import read_modules
+from rigkit.kernels.surface import read_codes, read_modules
 
 MIN_LIKENESS = 0.7
 """Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
@@ -90,39 +90,18 @@ def read_tags(image: GreyImage, quads: FloatArray, codes: Codes) -> TagCode:
     """Return the codes in the quadrilaterals (N, 4, 2), corners in order of growing angle from u to v."""
     if not len(quads):
         return TagCode(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
-    bright, spread = read_modules(image, homographies(quads), codes.modules)
-    best, most = np.zeros(len(quads), np.int64), np.zeros(len(quads))
-    marked = np.flatnonzero(spread >= MIN_CODE_CONTRAST)
-    likeness = bright[marked] @ codes.patterns.T
-    best[marked], most[marked] = likeness.argmax(axis=1), likeness.max(axis=1)
+    best, most = read_codes(image, quads, codes.modules, codes.patterns, MIN_CODE_CONTRAST)
     return TagCode(codes.numbers[best], codes.turns[best], most)
 
 
 def excess_likeness(image: GreyImage, quads: FloatArray, codes: Codes) -> FloatArray:
     """Return how much more each code is like a quadrilateral (N, 4, 2) than codes are on average, in their scatter: (N,
     4 T) for each code of `codes`; 0 where there is nothing to read."""
-    bright, spread = read_modules(image, homographies(quads), codes.modules)
+    bright, spread = read_modules(image, quads, codes.modules)
     likeness = bright @ codes.patterns.T
     excess = likeness - likeness.mean(axis=1, keepdims=True)
     scatter = np.maximum(excess.std(axis=1, keepdims=True), MIN_SCATTER)
     return np.asarray(np.where(spread[:, None] < MIN_CODE_CONTRAST, 0.0, excess / scatter))
-
-
-def homographies(quads: FloatArray) -> FloatArray:
-    """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2).
-
-    Heckbert, Fundamentals of Texture Mapping and Image Warping, 1989, section 2.2.3.
-    """
-    p0, p1, p2, p3 = quads.transpose(1, 0, 2)
-    total, d1, d2 = p0 - p1 + p2 - p3, p1 - p2, p3 - p2
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
-    g = (total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area
-    h = (d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area
-    out = np.ones((len(quads), 3, 3))
-    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0
-    out[:, 2, 0], out[:, 2, 1] = g, h
-    return out
 
 
 def transferred(homography: FloatArray, points: FloatArray) -> FloatArray:

@@ -11,13 +11,14 @@ small for that are fitted whole (`rigkit.detection.tags.whole`).
 
 from __future__ import annotations
 
+import functools
 from functools import partial
 
 import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, known_median
+from rigkit.core.arrays import BoolArray, FloatArray, known_median, rows_where
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, BoardState, Guide
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
@@ -31,14 +32,15 @@ from rigkit.detection.guided.guided import (
 )
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.correlation import sigma_factors
-from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
-from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
+from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
+from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap, seen_surface
 from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
+from rigkit.kernels.edges import Rules, TagWindow, blur_of_tags, fit_tag_corners
 from rigkit.kernels.surface import TagSurface
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -106,12 +108,19 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
     )
 
 
+@functools.cache
+def _window(border: float) -> TagWindow:
+    return TagWindow.of(border=border, blurs=MARKER_BLURS, nothing_near=NOTHING_NEAR_PX)
+
+
 class _Fitter:
     """The fit of one board's corners in one image."""
 
     def __init__(self, image: GreyImage, tags: TagBoard, camera: Camera | None) -> None:
         self.image, self.tags, self.camera = image, tags, camera
         self.places, self.steps, self.signs = tags.places, tags.steps, tags.signs
+        self.reach = np.minimum(0.5 * np.maximum(self.steps[..., 0], self.steps[..., 1]), WINDOW_REACH)
+        self.window = _window(tags.pattern.border / tags.codes.modules)
         self._mapped: tuple[BoardState, SmoothMap] | None = None
         self._fitted: tuple[EdgeFit, FloatArray, float] | None = None
         self._vain, self._waiting = np.zeros((2, *self.signs.shape), np.bool_)
@@ -125,7 +134,8 @@ class _Fitter:
                 pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
                 if pose is not None:
                     base = partial(seen_surface, self.camera, pose, np.array(self.tags.board.squares_mm))
-            self._mapped = state, SmoothMap(self.places[state.known], state.pixels[state.known], base)
+            known = state.known
+            self._mapped = state, SmoothMap(rows_where(self.places, known), rows_where(state.pixels, known), base)
         return self._mapped[1]
 
     def fit(
@@ -139,44 +149,34 @@ class _Fitter:
         mirrored: bool = True,
     ) -> EdgeFit:
         """Fit the edge model at the `cells`; arguments else as of `fit_edges`."""
-        heights, steps = surface.heights, self.steps[cells]
-        self.curvature[cells] = curvature = surface.curvature
-        gaps = steps * heights[:, :, None]
-        pattern, side = self.tags.pattern, self.tags.codes.modules
-        single = contrast = None
-        if not pattern.corner_squares:
-            gaps = np.full(gaps.shape, NOTHING_NEAR_PX)
+        self.curvature.reshape(-1, 2)[cells.reshape(-1).nonzero()[0]] = surface.curvature
+        fitted = fit_tag_corners(
+            *self._corners(cells, surface, start), np.full(len(start), blur), self.window, self._rules(stage, mirrored)
+        )
+        return EdgeFit.of_outcomes(fitted)
+
+    def _rules(self, stage: tuple[float, int, float], mirrored: bool) -> Rules:
+        return edge_rules(*stage, mirrored and self.tags.pattern.corner_squares, self.image.dtype == np.uint8)
+
+    def _corners(self, cells: BoolArray, surface: TagSurface, start: FloatArray) -> tuple[FloatArray | BoolArray, ...]:
+        """Return what `kernels.edges.fit_tag_corners` is told of the corners at `cells`."""
+        if self.tags.pattern.corner_squares:
+            single, contrast = np.zeros((len(start), 2)), np.full(len(start), np.nan)
+        else:
             row, column = (np.where(part % 2 == 0, 1.0, -1.0) for part in np.nonzero(cells))
             # Line 1 runs along the row; +90 degrees from it are down, and from line 2 to the left.
             single = np.stack([row, -column], axis=1)
-            inwards = (np.stack([column, row], axis=1)[:, None] @ surface.sides)[:, 0]
-            ink, paper = start + 0.5 * pattern.border / side * inwards, start - 0.25 * pattern.spacing * inwards
-            contrast = 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST)
-        narrow = (self.borders(surface) - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS
-        # np.clip of a number takes ten times as long.
-        expected = np.full(narrow.shape, np.minimum(np.maximum(blur, BLUR_RANGE[0]), BLUR_RANGE[1]))
-        geometry = Geometry(
-            surface.sides,
-            curvature,
-            gaps,
-            np.zeros(gaps.shape, np.bool_),
-            reach=np.minimum(0.5 * steps, WINDOW_REACH),
-            single=single,
-            window_blur=np.minimum(np.maximum(narrow, BLUR_RANGE[0]), expected),
-        )
-        radius_px, iterations, converged_px = stage
-        return fit_edges(
-            self.image,
-            start,
-            geometry,
-            self.signs[cells],
-            expected,
-            radius_px=radius_px,
-            iterations=iterations,
-            converged_px=converged_px,
-            mirrored=mirrored and pattern.corner_squares,
-            contrast=contrast,
-        )
+            contrast = self._contrast(np.stack([column, row], axis=1), surface, start)
+        return self.image, cells, self.steps, self.signs, start, surface.rows, single, contrast
+
+    def _contrast(self, inside: FloatArray, surface: TagSurface, start: FloatArray) -> FloatArray:
+        """Return the contrast (M,) of the corners of lone tags that lie on the sides `inside` (M, 2) of them, +1 or -1
+        along the columns and rows."""
+        pattern = self.tags.pattern
+        inwards = (inside[:, None] @ surface.sides)[:, 0]
+        ink = start + 0.5 * pattern.border / self.tags.codes.modules * inwards
+        paper = start - 0.25 * pattern.spacing * inwards
+        return 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST)
 
     def first(self, pixels: FloatArray) -> BoardState:
         """Return the rough corners fitted, those that failed left out, and those missing that they foretell."""
@@ -187,13 +187,10 @@ class _Fitter:
 
     def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
         """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
-        few = np.zeros(len(pixels), np.bool_)
-        few[:: max(len(few) // FEW_CORNERS, 1)] = True
-        some = cells.copy()
-        some[cells] = few
-        fit = self.fit(some, surface.of(few), pixels[few], FIRST_BLUR, FIRST_PASS, mirrored=False)
-        good = fit.valid & (fit.contrast > 0.0)
-        return known_median(fit.blur[good]) if good.any() else FIRST_BLUR
+        apart = max(len(pixels) // FEW_CORNERS, 1)
+        corners = self._corners(cells, surface, pixels)
+        blur = blur_of_tags(*corners, apart, FIRST_BLUR, self.window, self._rules(FIRST_PASS, False))
+        return blur if np.isfinite(blur) else FIRST_BLUR
 
     def completed(self, state: BoardState) -> BoardState:
         """Return the state with the missing corners that are seen, each round of them foretold by those before."""
@@ -209,17 +206,17 @@ class _Fitter:
         that failed; the fit is kept. Where `blur` is not known, a quick fit tells it."""
         cells = state.known
         smooth = self.map_of(state)
-        surface = smooth.at(self.places[cells])
-        seen = np.isfinite(surface.pixels[:, 0]) & np.isfinite(surface.sides).all(axis=(1, 2))
-        cells = cells.copy()
-        cells[cells] = seen
-        surface = surface.of(seen)
-        start = state.pixels[cells]
+        surface = smooth.at(rows_where(self.places, cells))
+        seen = surface.seen
+        if not seen.all():
+            cells[cells] = seen
+            surface = surface.of(seen)
+        start = rows_where(state.pixels, cells)
         blur = self._blur(cells, surface, start) if blur is None else blur
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
         self._fitted = fit, surface.sides, smooth.scatter()
         self._vain[:] = self._waiting[:] = False
-        return state.without(np.ones_like(cells)).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
+        return state.fitted_anew(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def again(self, state: BoardState) -> BoardState:
         """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted, if
@@ -231,11 +228,12 @@ class _Fitter:
             return state
         self._vain[:] = self._waiting[:] = False
         cells = state.known
-        surface = smooth.at(self.places[cells])
-        steps = np.minimum(0.5 * self.steps[cells].max(axis=2), WINDOW_REACH)
-        half = np.minimum(steps * np.linalg.norm(surface.sides, axis=2), LAST_PASS[0])
+        surface = smooth.at(rows_where(self.places, cells))
+        half = np.minimum(rows_where(self.reach, cells) * surface.lengths, LAST_PASS[0])
         # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
-        off = np.abs(surface.curvature - self.curvature[cells]).max(axis=1) * half.max(axis=1) ** 2 / 6.0
+        bends = np.abs(surface.curvature - rows_where(self.curvature, cells))
+        # Of two columns; max(axis=1) takes ten times as long.
+        off = np.maximum(bends[:, 0], bends[:, 1]) * np.maximum(half[:, 0], half[:, 1]) ** 2 / 6.0
         bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
         if not bent.any():
             return state
@@ -243,7 +241,7 @@ class _Fitter:
         if 2 * np.count_nonzero(bent) > len(bent):
             return self.fitted(state, blur)
         cells[cells] = bent
-        fit = self.fit(cells, surface.of(bent), state.pixels[cells], blur, LAST_PASS)
+        fit = self.fit(cells, surface.of(bent), rows_where(state.pixels, cells), blur, LAST_PASS)
         return state.without(cells).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def added(self, state: BoardState, smooth: SmoothMap | None = None) -> BoardState | None:
@@ -253,11 +251,11 @@ class _Fitter:
         if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
             return None
         smooth = smooth or self.map_of(state)
-        surface = smooth.beyond(self.places[missing])
+        surface = smooth.beyond(rows_where(self.places, missing))
         height, width = self.image.shape
-        with np.errstate(invalid="ignore"):
-            inside = (surface.pixels > MARGIN_PX) & (surface.pixels < np.array([width, height]) - 1.0 - MARGIN_PX)
-            usable = inside.all(axis=1) & (surface.gain < MAX_PREDICTED_GAIN)
+        u, v = surface.pixels.T
+        usable = (surface.gain < MAX_PREDICTED_GAIN) & (u > MARGIN_PX) & (u < width - 1.0 - MARGIN_PX)
+        usable &= (v > MARGIN_PX) & (v < height - 1.0 - MARGIN_PX)
         if not usable.any():
             return None
         cells = missing.copy()
@@ -266,7 +264,7 @@ class _Fitter:
         blur = known_median(state.blur)
         start = surface.pixels
         if (smooth.scatter() * surface.gain > blur).any():
-            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.heights.min(axis=1))
+            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.height)
             rough = self.fit(cells, surface, start, wide, LAST_PASS, mirrored=False)
             start = np.where(rough.valid[:, None], rough.pixels, start)
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
@@ -281,8 +279,8 @@ class _Fitter:
 
     def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
         """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
-        gap = self.tags.pattern.spacing * surface.heights.min(axis=1)
-        moved = np.linalg.norm(fit.pixels - surface.pixels, axis=1)
+        gap = self.tags.pattern.spacing * surface.height
+        moved = np.hypot(*(fit.pixels - surface.pixels).T)
         contrast, residual = known_median(state.contrast), known_median(state.residual)
         seen = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
         seen &= fit.contrast > MIN_ADDED_CONTRAST * contrast
@@ -298,7 +296,7 @@ class _Fitter:
 
     def borders(self, surface: TagSurface) -> FloatArray:
         """Return how wide the borders of tags are at places of the map, (M,) px."""
-        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.heights.min(axis=1))
+        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.height)
 
     def read(self, pixels: FloatArray) -> BoolArray:
         """Return the corners (R, C) of tags whose codes are read in their places, by all corners (R, C, 2)."""
@@ -324,7 +322,7 @@ class _Fitter:
             allowed = TAG_OUTLIER * np.hypot(usual, sigma)
             if not ((gain < JUDGING_GAIN) & (off > allowed)).any():
                 return state
-            gap = self.tags.pattern.spacing * smooth.at(self.places[cells]).heights.min(axis=1)
+            gap = self.tags.pattern.spacing * smooth.at(rows_where(self.places, cells)).height
             excess = np.where(gain < JUDGING_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
             # Those that contradict the most go first: they may be all that speaks against their neighbours.
             worst = excess > max(1.0, 0.5 * float(excess.max()))

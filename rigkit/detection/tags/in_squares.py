@@ -15,9 +15,10 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import foretold
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, homographies, read_tags, transferred
+from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, read_tags, transferred
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.placing import squares_of, voted_place
+from rigkit.kernels.surface import maps_of_quads
 
 MIN_MARKERS, AGREEING_MARKERS = 3, 0.7
 """Markers, and which part of those read, that give a lattice the same place: of a board of the other pattern, or with
@@ -135,4 +136,4 @@ def _within(squares: FloatArray, board: Board) -> FloatArray:
     """Return the outlines of the markers in squares (N, 4, 2)."""
     margin = 0.5 * (1.0 - _pattern(board).marker_mm / np.array(board.squares_mm))
     unit = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    return transferred(homographies(squares), margin + unit * (1.0 - 2.0 * margin))
+    return transferred(maps_of_quads(squares), margin + unit * (1.0 - 2.0 * margin))

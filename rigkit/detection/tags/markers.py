@@ -12,7 +12,7 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.aruco import marker_count
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, Codes, homographies
+from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, Codes
 from rigkit.detection.tags.quads import quadrilaterals
 from rigkit.kernels.surface import read_modules
 
@@ -64,7 +64,7 @@ def _framed(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray,
     mean 0 and length 1."""
     if not len(quads):
         return quads, np.zeros((0, side * side))
-    bright, spread = read_modules(image, homographies(quads), side)
+    bright, spread = read_modules(image, quads, side)
     edge = np.ones((side, side), np.bool_)
     edge[1:-1, 1:-1] = False
     middle = 0.5 * (bright.min(axis=1) + bright.max(axis=1))

@@ -15,7 +15,8 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.tags.codes import homographies, transferred
+from rigkit.detection.tags.codes import transferred
+from rigkit.kernels.surface import maps_of_quads
 
 SAMPLES, STRIDE = 8, 2
 """Parts of a module along each of its sides by which edges are moved, and from one to the next of those that are looked
@@ -60,7 +61,7 @@ def module_size(image: GreyImage, upright: FloatArray, bits: BoolArray, step: fl
     """
     some = slice(None, None, -(-len(upright) // ENOUGH_TAGS))
     upright, bits, count = upright[some], bits[some], bits.shape[1]
-    maps = homographies(upright)
+    maps = maps_of_quads(upright)
     outlines = np.arange(count + 1.0, count + 6.0, OUTLINE_STEP)
     # From the middle of the first bit to that of the last: beyond, edges move to one side only.
     along = (np.arange(0, SAMPLES * (count - 1), STRIDE) + 0.5) / SAMPLES - 0.5 * (count - 1)

@@ -35,6 +35,10 @@ MIN_TAGS_OF_PLACE = 4
 """Fewer tags are read one by one, or not at all."""
 
 
+CORNERS_OF_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+"""(column, row) of the corners of a square from its first, in the order of growing angle from u to v."""
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TagBoard:
     """A board of tags and what is needed to read it and to place its corners (R, C).
@@ -101,12 +105,13 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
     used = set()
     # What most tags vouch for comes first; two lattices of one board do not overlap.
     for _, n, cells, own in sorted(found, key=lambda item: -item[0]):
-        inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
-        cells, own = cells[inside], own[inside]
-        free = np.isnan(pixels[cells[:, 1], cells[:, 0], 0])
+        column, row = cells.T
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        column, row, own = column[inside], row[inside], own[inside]
+        free = np.isnan(pixels[row, column, 0])
         if 2 * np.count_nonzero(free) <= len(free):
             continue
-        pixels[cells[free, 1], cells[free, 0]] = own[free]
+        pixels[row[free], column[free]] = own[free]
         used.add(n)
     return pixels, used
 
@@ -125,8 +130,9 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     votes, turn, shift = voted_place(lattice, cells[sure], tags.turns[sure], board.firsts[tags.number[sure]])
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
     columns, rows = lattice.size
-    every = grid_turned(cells, (columns - 1, rows - 1), turn) + shift
-    own = ((every % 2 == 0) & (every >= 0) & (every < board.board.size)).all(axis=1)
+    column, row = (grid_turned(cells, (columns - 1, rows - 1), turn) + shift).T
+    own = ((column | row) & 1 == 0) & (column >= 0) & (row >= 0)
+    own &= (column < board.board.columns) & (row < board.board.rows)
     if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
         return _place_together(image, lattice.size, quads, cells, board)
     return votes, turn, shift
@@ -181,12 +187,13 @@ def _place_together(
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
     """Return the dark or the bright squares of a lattice: corners (N, 4, 2) in order of growing angle from u to v, and
     the (column, row) of their first corners (N, 2)."""
-    corners = lattice.pixels
-    quads = np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2)
+    known, corners = lattice.known, lattice.pixels
     # Brightness falls with the angle across the edge from a dark square's first corner along the row.
-    wanted = np.isfinite(quads).all(axis=(2, 3)) & ((lattice.signs()[:-1, :-1] < 0.0) == dark)
-    row, column = np.nonzero(wanted)
-    return quads[row, column], np.stack([column, row], axis=-1)
+    row, column = np.nonzero(known[:-1, :-1] & known[:-1, 1:] & known[1:, 1:] & known[1:, :-1])
+    dark_ones = (row + column) % 2 == (1 if lattice.rising else 0)
+    row, column = row[dark_ones == dark], column[dark_ones == dark]
+    quads = corners[row[:, None] + CORNERS_OF_SQUARE[:, 1], column[:, None] + CORNERS_OF_SQUARE[:, 0]]
+    return quads, np.stack([column, row], axis=-1)
 
 
 def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntArray) -> tuple[int, int, IntArray]:
@@ -198,10 +205,10 @@ def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntA
     columns, rows = lattice.size
     # A tag that stands upright in the lattice turned back stands on the board.
     back = -turns % 4
-    shift = np.empty_like(places)
+    turned, square = cells, (columns - 1, rows - 1)
     for turn in set(back.tolist()):
-        mine = back == turn
-        shift[mine] = places[mine] - grid_turned(cells[mine], (columns - 1, rows - 1), turn)
+        turned = np.where((back == turn)[:, None], grid_turned(cells, square, turn), turned)
+    shift = places - turned
     # Numbered, to be counted.
     low = shift.min(axis=0)
     width, height = (shift.max(axis=0) - low + 1).tolist()

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import homographies, read_tags, transferred
+from rigkit.detection.tags.codes import read_tags, transferred
 from rigkit.detection.tags.placing import MIN_BITS, TagBoard
+from rigkit.kernels.surface import maps_of_quads
 
 MIN_PERIMETER, MIN_OUTLINE_PX = 0.015, 12
 """Of a quadrilateral, in widths of the image: tags of 8 px in 2000; and pixels of its outline."""
@@ -111,7 +112,7 @@ def _agreeing(corners: FloatArray, place: IntArray, step: float) -> BoolArray:
     """
     tag = 0.5 * step * place + 0.5
     middle = corners.mean(axis=1)
-    inverse = np.asarray(np.linalg.inv(homographies(corners)), np.float64)
+    inverse = np.asarray(np.linalg.inv(maps_of_quads(corners)), np.float64)
     # Where each tag (first index) has the others, in its own sides from its own first corner, and where it should.
     has = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(middle))])
     should = tag - tag[:, None] + 0.5

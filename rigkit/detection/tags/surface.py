@@ -48,13 +48,19 @@ class SmoothMap:
     def __init__(
         self, places: FloatArray, pixels: FloatArray, base: Callable[[FloatArray], TagSurface] | None = None
     ) -> None:
-        self._base = base or _perspective(places, pixels)
-        rest, fewest = pixels, min(3, len(places))
-        if self._base is not None:
-            rest, fewest = pixels - self._base(places).pixels, 1
+        terms = int(len(places) / POINTS_A_TERM)
+        self._base = base
+        if base is not None:
+            rest = pixels - base(places).pixels
             rest = np.where(np.isfinite(rest[:, :1]), rest, 0.0)
-        terms = max(int(len(places) / POINTS_A_TERM), fewest)
-        self._polynomial = Polynomials.through(places, rest, terms, MAX_LEVERAGE)
+            self._polynomial = Polynomials.through(places, rest, max(terms, 1), MAX_LEVERAGE)
+            return
+        fitted = Polynomials.beside_perspective(places, pixels, max(terms, 1), MAX_LEVERAGE, NEAREST_DEPTH)
+        if fitted is None:
+            fewest = min(3, len(places))
+            self._polynomial = Polynomials.through(places, pixels, max(terms, fewest), MAX_LEVERAGE)
+        else:
+            self._base, self._polynomial = partial(projected, fitted[0]), fitted[1]
 
     def at(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), NaN where the base has none."""
@@ -113,12 +119,6 @@ def _surface_of(seen: Callable[[FloatArray], FloatArray], places: FloatArray) ->
     """Return a map and its derivatives at places (M, 2) by differences."""
     pixels = np.array([seen(places + DIFFERENCE * at) for at in STENCIL])
     return TagSurface.made_of(*by_differences(pixels, DIFFERENCE))
-
-
-def _perspective(places: FloatArray, pixels: FloatArray) -> Callable[[FloatArray], TagSurface] | None:
-    """Return the perspective that fits the points best; None where none with all of them in front does."""
-    matrix, nearest = perspective(places, pixels)
-    return partial(projected, matrix) if nearest > NEAREST_DEPTH else None
 
 
 def seen_surface(camera: Camera, cam_from_board: Rigid3, unit_mm: FloatArray, wanted: FloatArray) -> TagSurface:

@@ -14,8 +14,8 @@ from rigkit.core.boards import Board
 from rigkit.core.patterns.aruco import marker_count, smallest_dictionary
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import homographies
 from rigkit.detection.tags.markers import ReadMarkers, read_markers
+from rigkit.kernels.surface import maps_of_quads
 
 DICTIONARIES = (
     *(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)),
@@ -92,7 +92,7 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
     if len(numbers) < MIN_MARKERS_READ:
         return None
     middle = quads.mean(axis=1)
-    inverse = np.linalg.inv(homographies(quads))
+    inverse = np.linalg.inv(maps_of_quads(quads))
     seen = np.concatenate([middle, np.ones((len(middle), 1))], axis=1) @ np.swapaxes(inverse, 1, 2)
     # Where each marker (first index) has the others, in its own sides from its own middle.
     offset = seen[..., :2] / seen[..., 2:] - 0.5

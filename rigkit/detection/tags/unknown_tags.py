@@ -22,11 +22,12 @@ from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
 from rigkit.detection.lattices import Seen
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.tags.codes import Codes, TagCode, homographies, read_tags, transferred
+from rigkit.detection.tags.codes import Codes, TagCode, read_tags, transferred
 from rigkit.detection.tags.module_size import module_size
 from rigkit.detection.tags.placing import squares_of
 from rigkit.detection.tags.quads import quadrilaterals
 from rigkit.detection.tags.unknown_charuco import DICTIONARIES, laid_out
+from rigkit.kernels.surface import maps_of_quads
 
 WIDEST_RATIO = 8.0
 """A tag's side over the gap, or the other way round, at most."""
@@ -255,7 +256,7 @@ def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
 def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield groups of upright tags with corners (N, 4, 2) that stand in rows and columns: which (M,), and their places
     (M, 2) in steps."""
-    inverse = np.asarray(np.linalg.inv(homographies(quads)), np.float64)
+    inverse = np.asarray(np.linalg.inv(maps_of_quads(quads)), np.float64)
     middle = quads.mean(axis=1)
     offset = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(quads))]) - 0.5
     # As two tags have each other: perspective beyond the homography of either cancels.

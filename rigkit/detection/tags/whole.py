@@ -84,11 +84,13 @@ def with_whole_tags(
 
     `places` (R, C, 2) of the corners, in sides of a tag; `smooth` is the map through the corners of the state.
     """
-    row, column = (2 * part for part in np.nonzero(_four(state.known).all(axis=2)))
+    known = state.known
+    left, right = known[:, ::2], known[:, 1::2]
+    row, column = (2 * part for part in np.nonzero(left[::2] & right[::2] & left[1::2] & right[1::2]))
     mine = row[:, None] + TAG_CORNERS[:, 1], column[:, None] + TAG_CORNERS[:, 0]
     corners = state.pixels[mine]
     along, down = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    longer = np.maximum(np.linalg.norm(along, axis=1), np.linalg.norm(down, axis=1))
+    longer = np.maximum(np.hypot(along[:, 0], along[:, 1]), np.hypot(down[:, 0], down[:, 1]))
     height = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0]) / longer
     # What single corners have for blur is not to be relied on where the code is in their windows.
     blur = known_median(state.blur) if len(row) else np.nan
@@ -115,12 +117,6 @@ def with_whole_tags(
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
     blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
-
-
-def _four(known: BoolArray) -> BoolArray:
-    """Return what belongs to the four corners of each tag: (R, C) as (R / 2, C / 2, 4)."""
-    rows, columns = known.shape
-    return known.reshape(rows // 2, 2, columns // 2, 2).transpose(0, 2, 1, 3).reshape(rows // 2, columns // 2, 4)
 
 
 def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[FloatArray, FloatArray, FloatArray]:

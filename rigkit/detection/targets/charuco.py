@@ -33,10 +33,11 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
-from rigkit.detection.tags.codes import homographies, transferred
+from rigkit.detection.tags.codes import transferred
 from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
+from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
 """A marker's corner and a corner of a lattice are one within so many sides of a cell."""
@@ -163,7 +164,7 @@ def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tupl
         return np.zeros((0, 2), np.int64), np.zeros((0, 2))
     beyond = 0.5 * (np.array(board.squares_mm) / pattern.marker_mm - 1.0)
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    pixels = transferred(homographies(quads[own]), np.where(unit > 0, 1.0 + beyond, -beyond))
+    pixels = transferred(maps_of_quads(quads[own]), np.where(unit > 0, 1.0 + beyond, -beyond))
     grid = places[number[own]][:, None] - 1 + unit
     inside = ((grid >= 0) & (grid < board.size)).all(axis=2)
     place, told = board.index(grid[inside]), pixels[inside]

@@ -27,6 +27,7 @@ from kernels.reference.edge_model import (
 )
 
 from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_curvature import BENT_RAD, DECAY, FREE, LINE_REACH, MIN_CORNER_SIGMA_PX
 from rigkit.detection.subpixel.edge_fit import (
@@ -45,10 +46,10 @@ from rigkit.detection.subpixel.edge_fit import (
     VALID_MOVE_CELLS,
     VALID_MOVE_PX,
 )
-from rigkit.detection.subpixel.edge_model import (
-    Geometry,
-)
-from rigkit.kernels.edges import LAGS, BendRules, Rules
+from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
+from rigkit.detection.tags.corners import NOTHING_NEAR_PX
+from rigkit.kernels.edges import LAGS, BendRules, Rules, TagWindow
+from rigkit.kernels.surface import TagSurface
 
 MIN_DETERMINED_PIXELS = K1
 """So many parameters only the pixels determine; the curvatures of the lines are mostly the lattice's."""
@@ -322,3 +323,54 @@ def _most_probable(normal: FloatArray, right: FloatArray, expected: FloatArray) 
     inverse = np.linalg.inv(normal * expected[:, :, None] * expected[:, None, :] + prior)
     found = expected[..., None] * (inverse @ (expected[..., None] * right))
     return found, expected[:, 2] * np.sqrt(inverse[:, 2, 2])
+
+
+def fit_tag_corners(
+    image: GreyImage,
+    cells: BoolArray,
+    steps: FloatArray,
+    signs: FloatArray,
+    pixels: FloatArray,
+    surface: FloatArray,
+    single: FloatArray,
+    contrast: FloatArray,
+    blur: FloatArray,
+    window: TagWindow,
+    rules: Rules,
+) -> FloatArray:
+    assert (window.blurs, window.nothing_near) == (MARKER_BLURS, NOTHING_NEAR_PX)
+    shape, own = TagSurface(surface), steps[cells]
+    expected = np.clip(blur, *BLUR_RANGE)
+    narrow = (window.border * shape.heights.min(axis=1) - MARKER_BLURS * blur - NEAR_PX) / NEAR_SIGMAS
+    gaps = np.where(single[:, :1, None] == 0.0, own * shape.heights[:, :, None], NOTHING_NEAR_PX)
+    none = np.zeros(gaps.shape)
+    return fit_corners(
+        *(image, pixels, shape.sides, shape.curvature, np.zeros((len(pixels), 2)), gaps, none),
+        *(np.minimum(0.5 * own, WINDOW_REACH), np.full(gaps.shape, np.nan), single, none > 0.0, signs[cells], expected),
+        *(np.minimum(np.maximum(narrow, BLUR_RANGE[0]), expected), contrast, rules),
+    )
+
+
+def blur_of_tags(
+    image: GreyImage,
+    cells: BoolArray,
+    steps: FloatArray,
+    signs: FloatArray,
+    pixels: FloatArray,
+    surface: FloatArray,
+    single: FloatArray,
+    contrast: FloatArray,
+    apart: int,
+    blur: float,
+    window: TagWindow,
+    rules: Rules,
+) -> float:
+    few = np.arange(len(pixels)) % apart == 0
+    some = cells.copy()
+    some[cells] = few
+    fitted = fit_tag_corners(
+        *(image, some, steps, signs, pixels[few], surface[few], single[few], contrast[few]),
+        *(np.full(np.count_nonzero(few), blur), window, rules),
+    )
+    good = (fitted[:, 7] > 0.5) & (fitted[:, 4] > 0.0)
+    return float(np.median(fitted[good, 3])) if good.any() else float("nan")

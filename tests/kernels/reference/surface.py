@@ -80,11 +80,36 @@ def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)
     return out
 
 
-def read_modules(image: GreyImage, maps: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
+def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
     """Return the modules' brightness of mean 0 and length 1 (N, side * side), and its standard deviation (N,)."""
     middle = (np.arange(side) + 0.5) / side
     places = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
-    bright = sample(image, transferred(maps, places)).astype(np.float64)
+    bright = sample(image, transferred(maps_of_quads(quads), places)).astype(np.float64)
     bright -= bright.mean(axis=1, keepdims=True)
     length = np.linalg.norm(bright, axis=1, keepdims=True)
     return bright / np.maximum(length, 1e-9), length[:, 0] / side
+
+
+def read_codes(
+    image: GreyImage, quads: FloatArray, side: int, patterns: FloatArray, least: float
+) -> tuple[IntArray, FloatArray]:
+    bright, spread = read_modules(image, quads, side)
+    likeness = np.where(spread[:, None] >= least, bright @ patterns.T, 0.0)
+    return likeness.argmax(axis=1), likeness[np.arange(len(quads)), likeness.argmax(axis=1)]
+
+
+def maps_of_quads(quads: FloatArray) -> FloatArray:
+    """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2).
+
+    Heckbert, Fundamentals of Texture Mapping and Image Warping, 1989, section 2.2.3.
+    """
+    p0, p1, p2, p3 = quads.transpose(1, 0, 2)
+    total, d1, d2 = p0 - p1 + p2 - p3, p1 - p2, p3 - p2
+    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    area = np.where(np.abs(area) < 1e-12, 1e-12, area)
+    g = (total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area
+    h = (d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area
+    out = np.ones((len(quads), 3, 3))
+    out[:, :2, 0], out[:, :2, 1], out[:, :2, 2] = p1 - p0 + g[:, None] * p1, p3 - p0 + h[:, None] * p3, p0
+    out[:, 2, 0], out[:, 2, 1] = g, h
+    return out
