@@ -59,6 +59,9 @@ WIDE_BLUR = 0.15
 MAX_TAG_ROUNDS = 12
 """Rounds in which missing corners are added, each foretold by those of the one before."""
 
+TagCorners = tuple[GreyImage, BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""The first arguments of `kernels.edges.fit_tag_corners`."""
+
 NOTHING_NEAR_PX, MIN_EDGE_CONTRAST = 1e4, 10.0
 """Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
 starts from at least."""
@@ -158,7 +161,7 @@ class _Fitter:
     def _rules(self, stage: tuple[float, int, float], mirrored: bool) -> Rules:
         return edge_rules(*stage, mirrored and self.tags.pattern.corner_squares, self.image.dtype == np.uint8)
 
-    def _corners(self, cells: BoolArray, surface: TagSurface, start: FloatArray) -> tuple[FloatArray | BoolArray, ...]:
+    def _corners(self, cells: BoolArray, surface: TagSurface, start: FloatArray) -> TagCorners:
         """Return what `kernels.edges.fit_tag_corners` is told of the corners at `cells`."""
         if self.tags.pattern.corner_squares:
             single, contrast = np.zeros((len(start), 2)), np.full(len(start), np.nan)
@@ -176,7 +179,7 @@ class _Fitter:
         inwards = (inside[:, None] @ surface.sides)[:, 0]
         ink = start + 0.5 * pattern.border / self.tags.codes.modules * inwards
         paper = start - 0.25 * pattern.spacing * inwards
-        return 0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST)
+        return np.asarray(0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST))
 
     def first(self, pixels: FloatArray) -> BoardState:
         """Return the rough corners fitted, those that failed left out, and those missing that they foretell."""
