@@ -186,8 +186,9 @@ def test_tags_that_cannot_be_are_refused(pattern: dict[str, object]) -> None:
 
 @pytest.mark.parametrize("squares", [True, False])
 def test_white_tags_are_found_where_black_ones_are_in_the_negative(squares: bool, rng: np.random.Generator) -> None:
-    black = Board("b", 8, 6, 60.0, 60.0, pattern=AprilGrid(0.3, corner_squares=squares))
-    white = replace(black, pattern=replace(black.pattern, inverted=True))
+    pattern = AprilGrid(0.3, corner_squares=squares)
+    black = Board("b", 8, 6, 60.0, 60.0, pattern=pattern)
+    white = replace(black, pattern=replace(pattern, inverted=True))
     scene = facing(white)
     image = np.asarray(scene.render(optics=Optics(0.5), noise_levels=2.0, rng=rng), np.uint8)
     (found,) = detect_boards(image, [white])

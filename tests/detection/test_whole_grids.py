@@ -78,5 +78,6 @@ def test_a_grid_goes_on_where_squares_are_seen_beyond_its_last_corners(rows: int
     image += np.random.default_rng(1).normal(0.0, 2.0, image.shape)
     row, column = np.indices((6, 8)).reshape(2, -1)
     grid = np.stack([column, row], axis=1)
-    board = BoardDetection(None, 8, 6, grid, 60.0 + 40.0 * grid, np.full(len(grid), 0.1))
+    pixels = (60.0 + 40.0 * grid).astype(np.float64)
+    board = BoardDetection(None, 8, 6, grid, pixels, np.full(len(grid), 0.1))
     assert grid_seen(board, np.clip(image, 0, 255).astype(np.uint8)) == GridSeen((8, 6), (True, rows == 6))

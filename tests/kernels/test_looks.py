@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from kernels.reference import looks as reference
+from numpy.typing import NDArray
 
 from rigkit.kernels import front
 
@@ -12,7 +15,7 @@ from rigkit.kernels import front
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 @pytest.mark.parametrize("step", [1, 3])
 def test_ratios_within_squares(step: int, dtype: type, rng: np.random.Generator) -> None:
-    image = rng.uniform(0.0, 255.0, (61, 84)).astype(dtype)
+    image: NDArray[Any] = rng.uniform(0.0, 255.0, (61, 84)).astype(dtype)
     image[1::2, ::2] = 0.7 * image[1::2, ::2]
     ours, theirs = front.square_ratios(image, step, 12.0), reference.square_ratios(image, step, 12.0)
     assert ours[1] == theirs[1] > 60
@@ -23,7 +26,7 @@ def test_ratios_within_squares(step: int, dtype: type, rng: np.random.Generator)
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_bad_pixels_are_counted(dtype: type, rng: np.random.Generator) -> None:
-    image = rng.uniform(100.0, 130.0, (70, 90)).astype(dtype)
+    image: NDArray[Any] = rng.uniform(100.0, 130.0, (70, 90)).astype(dtype)
     image[rng.random(image.shape) < 0.03] = 250
     image[rng.random(image.shape) < 0.03] = 0
     for first, apart, step, share in ((1, 3, 0.0, 0.15), (2, 5, 60.0, 0.0), (1, 1, 200.0, 0.0)):

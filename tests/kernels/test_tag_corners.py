@@ -14,6 +14,8 @@ from kernels.reference import edges as reference
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.subpixel.edge_fit import edge_rules
+from rigkit.detection.subpixel.subpixel import LAST_PASS
 from rigkit.detection.tags import corners
 from rigkit.kernels.edges import blur_of_tags, fit_corners, fit_tag_corners
 
@@ -68,5 +70,5 @@ def test_corners_that_no_cell_has_are_refused() -> None:
         fit_tag_corners(
             *(np.zeros((20, 20), np.uint8), np.array([[True, True]]), np.zeros((1, 2, 2, 2)), np.ones((1, 2)), none),
             *(np.zeros((3, 15)), none, none[:, 0], none[:, 0], corners._window(0.1)),
-            corners.edge_rules(*corners.LAST_PASS, False, True),
+            edge_rules(*LAST_PASS, False, True),
         )

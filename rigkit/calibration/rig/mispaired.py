@@ -45,6 +45,10 @@ NAMED = 3
 """So many frames are named."""
 
 
+def _all(frames: int) -> str:
+    return "their only frame" if frames == 1 else f"all {frames} frames"
+
+
 def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
     """Return a finding for every two cameras that have the same pictures in some frames, of (frame, view) by camera.
 
@@ -60,7 +64,7 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
         total = len({frame for frame, _ in shared})
         if len(frames) == total:
             raise InputError(
-                f"rig: cameras '{a}' and '{b}' have the same pictures in all {total} frames; give each camera its own"
+                f"rig: cameras '{a}' and '{b}' have the same pictures in {_all(total)}; give each camera its own"
             )
         out.append(
             Finding.bad(

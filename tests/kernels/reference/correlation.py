@@ -72,7 +72,7 @@ def sigma_factors(
     # Every corner says as much as its pixels do.
     alike = products / (noise**2)[:, None]
     known = (alike, pairs, sides.reshape(-1, 4), blur[:, None], used[:, None], blend, both)
-    mean = (member / count) @ np.concatenate(known, axis=1)[seen]
+    mean: FloatArray = (member / count) @ np.concatenate(known, axis=1)[seen]
     return np.where(member.any(axis=1), factors(mean, count, rules.radius_px), 1.0)
 
 
@@ -82,7 +82,7 @@ def factors(mean: FloatArray, count: FloatArray, radius_px: float) -> FloatArray
     change = mean[:, : len(LAGS)] / pairs
     weight, lost = influence(shape[:, :4].reshape(-1, 2, 2), np.maximum(shape[:, 4], BLUR_RANGE[0]), radius_px)
     blended = _WHOLE + (shape[:, 6:] @ _BETWEEN).reshape(-1, len(LAGS), len(LAGS))
-    weight = np.linalg.solve(np.swapaxes(blended, 1, 2), (_TIMES * weight)[..., None])[..., 0]
+    weight = np.asarray(np.linalg.solve(np.swapaxes(blended, 1, 2), (_TIMES * weight)[..., None])[..., 0], np.float64)
     share = lost / np.maximum(shape[:, 5], 1.0)
     left = np.maximum(1.0 - share, MIN_LEFT)
     excess = (weight * change).sum(axis=1) / left - 1.0
