@@ -24,30 +24,9 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
 INLINE int may_be_corner(
     const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
 {
-    enum { PAIRS = HALF / 4, SAMPLES = 2 * PAIRS };
-    float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f, right[SAMPLES], below[SAMPLES], seen[SAMPLES];
-    int32_t at[SAMPLES];
-    const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
-    const float most_u = (float)(width - 1), most_v = (float)(height - 1);
-    /* As brightness_at, but first all places, which vectorises, then all reads. */
-    for (int64_t k = 0; k < SAMPLES; k++) {
-        float sample_u = u + radius * rules->circle[8 * k], sample_v = v + radius * rules->circle[8 * k + 1];
-        sample_u = sample_u > 0.0f ? sample_u : 0.0f;
-        sample_v = sample_v > 0.0f ? sample_v : 0.0f;
-        sample_u = sample_u < most_u ? sample_u : most_u;
-        sample_v = sample_v < most_v ? sample_v : most_v;
-        int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
-        left = left < width - 2 ? left : width - 2;
-        top = top < height - 2 ? top : height - 2;
-        right[k] = sample_u - (float)left;
-        below[k] = sample_v - (float)top;
-        at[k] = top * width + left;
-    }
-    for (int64_t k = 0; k < SAMPLES; k++) {
-        const float *upper = image.brightness + at[k], *lower = upper + width;
-        const float above = upper[0] + right[k] * (upper[1] - upper[0]);
-        seen[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
-    }
+    enum { EVERY = 4, PAIRS = HALF / EVERY, SAMPLES = 2 * PAIRS };
+    float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f, seen[SAMPLES];
+    sample_ring(image, rules->circle, EVERY, u, v, radius, seen);
     for (int64_t k = 0; k < PAIRS; k++) {
         even[k] = 0.5f * (seen[k] + seen[PAIRS + k]);
         mean += even[k];

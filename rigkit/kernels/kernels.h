@@ -114,19 +114,17 @@ INLINE void ring_angles(
     angles[1] = angles[0] + quadrant;
 }
 
-/* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
- * its contrast (reference.front.read_rings); 2 where only motion explains how bright its middle is. */
-INLINE int read_ring(
-    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
-    double *contrast)
+/* Sample the ring around (u, v) at every `apart`-th place of the circle. As brightness_at, but first all places, which
+ * vectorises, then all reads. */
+INLINE void sample_ring(
+    const image_t image, const float *circle, int64_t apart, float u, float v, float radius, float *samples)
 {
-    float ring[TURN], even[HALF], right[TURN], below[TURN];
+    float right[TURN], below[TURN];
     int32_t at[TURN];
     const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
     const float most_u = (float)(width - 1), most_v = (float)(height - 1);
-    /* As brightness_at, but first all places, which vectorises, then all reads. */
-    for (int64_t k = 0; k < TURN; k++) {
-        float sample_u = u + radius * rules.circle[2 * k], sample_v = v + radius * rules.circle[2 * k + 1];
+    for (int64_t k = 0; k < TURN / apart; k++) {
+        float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
         sample_v = sample_v > 0.0f ? sample_v : 0.0f;
         sample_u = sample_u < most_u ? sample_u : most_u;
@@ -138,11 +136,21 @@ INLINE int read_ring(
         below[k] = sample_v - (float)top;
         at[k] = top * width + left;
     }
-    for (int64_t k = 0; k < TURN; k++) {
+    for (int64_t k = 0; k < TURN / apart; k++) {
         const float *upper = image.brightness + at[k], *lower = upper + width;
         const float above = upper[0] + right[k] * (upper[1] - upper[0]);
-        ring[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
+        samples[k] = above + below[k] * (lower[0] + right[k] * (lower[1] - lower[0]) - above);
     }
+}
+
+/* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
+ * its contrast (reference.front.read_rings); 2 where only motion explains how bright its middle is. */
+INLINE int read_ring(
+    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
+    double *contrast)
+{
+    float ring[TURN], even[HALF];
+    sample_ring(image, rules.circle, 1, u, v, radius, ring);
     float low = 1e30f, high = -1e30f, mean = 0.0f, odd_energy = 0.0f, energy = 0.0f;
     for (int64_t k = 0; k < HALF; k++)
         even[k] = 0.5f * (ring[k] + ring[HALF + k]);
