@@ -114,15 +114,14 @@ INLINE void ring_angles(
     angles[1] = angles[0] + quadrant;
 }
 
-/* Sample the ring around (u, v) at every `apart`-th place of the circle. As brightness_at, but first all places, which
- * vectorises, then all reads. */
+/* Sample every `apart`-th place of a ring. As brightness_at, but first all places, which vectorises, then all reads. */
 INLINE void sample_ring(
     const image_t image, const float *circle, int64_t apart, float u, float v, float radius, float *samples)
 {
     float right[TURN], below[TURN];
     int32_t at[TURN];
-    const int32_t width = (int32_t)image.width, height = (int32_t)image.height;
-    const float most_u = (float)(width - 1), most_v = (float)(height - 1);
+    const int32_t width = (int32_t)image.width, right_most = width - 2, low_most = (int32_t)image.height - 2;
+    const float most_u = (float)(width - 1), most_v = (float)(image.height - 1);
     for (int64_t k = 0; k < TURN / apart; k++) {
         float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
@@ -130,10 +129,8 @@ INLINE void sample_ring(
         sample_u = sample_u < most_u ? sample_u : most_u;
         sample_v = sample_v < most_v ? sample_v : most_v;
         int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
-        left = left < width - 2 ? left : width - 2;
-        top = top < height - 2 ? top : height - 2;
-        right[k] = sample_u - (float)left;
-        below[k] = sample_v - (float)top;
+        left = left < right_most ? left : right_most, top = top < low_most ? top : low_most;
+        right[k] = sample_u - (float)left, below[k] = sample_v - (float)top;
         at[k] = top * width + left;
     }
     for (int64_t k = 0; k < TURN / apart; k++) {
