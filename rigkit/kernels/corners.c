@@ -1,6 +1,6 @@
 /* Which peaks of the saddle response are corners of a chessboard: their saddle points, the rings around them. 
  * The definitions in numpy are in tests/kernels/reference/front.py, the numbers in rigkit.detection.saddles. */
-#include "kernels.h"
+#include "rings.h"
 
 /* reference.front.saddle_step for one pixel; whether it is a saddle and near. */
 INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])

@@ -1,7 +1,7 @@
 /* Lattices of corners: local polynomial fits, growth ring by ring. components.c makes the first ones from links.
  *
  * The definitions in numpy are in tests/kernels/reference/growth.py, the numbers in rigkit.detection.lattice. */
-#include "kernels.h"
+#include "rings.h"
 
 enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
 
