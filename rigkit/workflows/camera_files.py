@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,13 +69,18 @@ def called_bad(path: str | Path) -> Finding | None:
     else:
         known = own_calibration(path)
         verdicts = () if known is None else known.verdicts
+    return bad_of(verdicts)
+
+
+def bad_of(verdicts: Iterable[Finding]) -> Finding | None:
+    """Return the first verdict on a calibration that says that it is not to be trusted; None where none does."""
     bad = next((finding for finding in verdicts if finding.severity is Severity.BAD), None)
     return None if bad is None else replace(bad, message=f"the calibration was called bad: {bad.message}")
 
 
-def warn_if_bad(path: str | Path) -> None:
-    """Say where a file is used that is not to be trusted."""
-    bad = called_bad(path)
+def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> None:
+    """Say where a file is used that is not to be trusted; `verdicts` are its own, None: they are read."""
+    bad = called_bad(path) if verdicts is None else bad_of(verdicts)
     if bad is not None:
         _log.warning("'%s': %s", path, bad.message)
 

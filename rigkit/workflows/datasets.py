@@ -29,6 +29,7 @@ from rigkit.io.calibration_file import calibration_text, is_calibration, load_ca
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
+from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
@@ -161,11 +162,15 @@ def load_cameras(dataset: Dataset, *, recalibrate: bool = False, progress: Progr
         try:
             if entry.calibration.is_file() and (name not in used or not recalibrate):
                 known[name], sources[name] = _load(entry.calibration), entry.calibration
+                whole = known[name].calibration
+                if whole is not None and name in used:
+                    warn_if_bad(entry.calibration, whole.verdicts)
             elif name in used:
                 with about(dataset.manifest):
                     calibration = _calibrate(dataset, entry, progress)
                 known[name] = LoadedCamera(calibration.camera, calibration)
                 sources[name] = files[_file_of(name, index)] = calibration_text(calibration)
+                warn_if_bad(name, calibration.verdicts)
                 _log.info(
                     f"camera '{name}' was calibrated from '{entry.session}', for these results alone; "
                     "`rigkit calibrate` keeps a calibration beside its session"

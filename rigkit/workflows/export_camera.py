@@ -20,7 +20,7 @@ from rigkit.io.calibration_file import save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
-from rigkit.workflows.camera_files import import_camera, import_rig, own_calibration
+from rigkit.workflows.camera_files import import_camera, import_rig, own_calibration, warn_if_bad
 from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 RIG_ENDINGS = {"colmap": ".json"}
@@ -101,6 +101,7 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
     if kind is None:
         raise InputError(f"export: say the rig's format with --to, one of {', '.join(RIG_FORMATS)}")
     rig = import_rig(source)
+    warn_if_bad(source)
     missing = [name for name in names if name not in rig]
     if missing or len(set(names)) != len(names):
         raise InputError(

@@ -23,6 +23,7 @@ from rigkit.report.history_page import history_page, overwritten
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
 RECALIBRATION_GRID = (40, 30)
@@ -77,6 +78,8 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
     """
     ensure_register(register, [new, reference], temperature_c)
     now, before = load_calibration(new), load_calibration(reference)
+    warn_if_bad(new, now.verdicts)
+    warn_if_bad(reference, before.verdicts)
     if (now.camera.model, now.camera.parameters.size) != (before.camera.model, before.camera.parameters.size):
         raise InputError(
             f"history: '{new}' is a {now.camera.model} camera, '{reference}' a {before.camera.model}; calibrate with "

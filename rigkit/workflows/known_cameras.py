@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.rig_file import SavedRig, is_rig_file
 from rigkit.io.rig_session import RigSession
-from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig
+from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
 from rigkit.workflows.folder_session import Known
 
 _log = logging.getLogger(__name__)
@@ -63,6 +63,8 @@ def known_cameras(session: RigSession) -> KnownCameras | None:
         return None
     names = list(session.cameras)
     rig = SavedRig(cameras={}, covariance=None) if session.known_rig is None else _saved(session.known_rig, names)
+    if session.known_rig is not None:
+        warn_if_bad(session.known_rig, rig.verdicts)
     mounted = [name for name in rig.cameras if name in names]
     if rig.cameras:
         first = next(iter(rig.cameras))
@@ -129,8 +131,10 @@ def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArr
         rig = _saved(path, names)
         if name not in rig.cameras:
             raise InputError(f"'{path}' has no camera '{name}'; there are {', '.join(rig.cameras)}")
+        warn_if_bad(path, rig.verdicts)
         own = _places_in(rig.cameras, [name])
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
     if (calibration := own_calibration(path)) is not None:
+        warn_if_bad(path, calibration.verdicts)
         return calibration.camera, np.asarray(calibration.covariance)
     return import_camera(path), None

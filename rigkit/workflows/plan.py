@@ -28,6 +28,7 @@ from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
+from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
@@ -100,6 +101,8 @@ def plan_session(
             "rig-CAMERA.json, or ask for pictures to check the rig with: --check"
         )
     ensure_writable(options.report, force=options.force, inputs=[source])
+    if source.suffix != ".toml":
+        warn_if_bad(source)
     if rig:
         watched, boards = load_watched(source)
         if not boards:
@@ -110,6 +113,7 @@ def plan_session(
         calibrating = CalibrateOptions(cache=Cache.UPDATE)
         ensure_writable(options.report, force=options.force, inputs=[source, *session_inputs(session, calibrating)])
         calibration = calibrate_session(session, calibrating, progress=progress).calibration
+        warn_if_bad(source, calibration.verdicts)
         boards = session.boards
     else:
         calibration = load_calibration(source)

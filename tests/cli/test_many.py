@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
+from rigkit.io.manifest import load_dataset
+from rigkit.workflows.datasets import load_cameras
 
 LAB = REPOSITORY / "datasets" / "lab-a"
 QUICK = ["--no-pictures", "--no-crosscheck"]
@@ -106,3 +109,21 @@ def _pictures_of_one(pictures: Path, tmp_path: Path) -> Path:
     for path in pictures.glob("left*.jpg"):
         shutil.copy(path, folder / path.name)
     return folder
+
+
+def test_a_bad_calibration_of_a_data_set_is_warned_of(captures: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """What it says of angles and baselines rests on it; cameras that no pair uses do not matter."""
+    folder = Path(shutil.copytree(captures / "one", captures / "called-bad"))
+    manifest = folder / "dataset.toml"
+    text = manifest.read_text(encoding="utf-8")
+    said = {"severity": "bad", "message": "two cameras are mixed", "remedy": "calibrate each"}
+    for name in ("mvca020_r61", "mvca020_fe185"):
+        source = REPOSITORY / "calib" / "cameras" / name / "calibration.json"
+        own = folder / f"{name}.json"
+        own.write_text(json.dumps(json.loads(source.read_text()) | {"verdicts": [said]}))
+        text = text.replace(str(source), str(own))
+    manifest.write_text(text, encoding="utf-8")
+    load_cameras(load_dataset(manifest))
+    called = "the calibration was called bad: two cameras are mixed"
+    warned = [record.getMessage() for record in caplog.records if called in record.getMessage()]
+    assert len(warned) == 1 and "fe185" in warned[0]
