@@ -18,6 +18,7 @@ from rigkit.calibration.fit import Fit
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solver import solve
+from rigkit.calibration.turned import turned_pictures
 from rigkit.calibration.two_kinds import two_kinds
 from rigkit.calibration.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.core.arrays import IntArray
@@ -118,6 +119,10 @@ def changing(
     changes = evidence.changes() if evidence is not None else {}
     if evidence is None or not changes:
         return []
+    if solved is not None and changes["shift"].ratio >= MIN_VARIANCE_RATIO:
+        turned = turned_pictures(calibration, evidence, *solved, clusters)
+        if turned is not None:
+            return [turned]
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
         return [kinds]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:

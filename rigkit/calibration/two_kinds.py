@@ -44,7 +44,7 @@ MIN_APART_PX = 1.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Kinds:
+class Kinds:
     """Two kinds of images.
 
     Attributes
@@ -75,7 +75,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     ways = columns_of(evidence.own.shape[1])
     lenses = {"focus": ways["focus"], "shift": ways["shift"], "lens": ways["lens"], "camera": _camera_rows(evidence)}
     known = evidence.common_covariance()
-    found = {name: kinds for name, rows in lenses.items() if (kinds := _split(evidence, rows, known)) is not None}
+    found = {name: kinds for name, rows in lenses.items() if (kinds := split_in_two(evidence, rows, known)) is not None}
     name = min(found, key=lambda name: found[name].cost, default=None)
     if name is None or (best := found[name]).cost > -MIN_LEAD:
         return None
@@ -92,7 +92,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     )
 
 
-def _split(evidence: ViewEvidence, rows: slice, known: FloatArray) -> _Kinds | None:
+def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kinds | None:
     """Return the two kinds of images whose lenses differ in these rows; None where there are no two. `known` (C, C) is
     how well what is common to all images is known.
 
@@ -125,7 +125,7 @@ def _split(evidence: ViewEvidence, rows: slice, known: FloatArray) -> _Kinds | N
     entropy = -2.0 * len(chosen) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
     cost = entropy + len(step[best]) * np.log(len(chosen)) + OF_UNIFORM * len(chosen)
     cost += _explained(amount, weight, chosen[None].astype(float))[0]
-    return _Kinds(chosen, amount, weight, step[best], float(cost))
+    return Kinds(chosen, amount, weight, step[best], float(cost))
 
 
 def _best_steps(
@@ -155,7 +155,7 @@ def _explained(amount: FloatArray, weight: FloatArray, causes: FloatArray) -> Fl
     return np.asarray((len(amount) - 2) * np.log(np.maximum(left, np.finfo(float).eps)))
 
 
-def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: _Kinds) -> float:
+def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -> float:
     """Return the criterion of the best other cause of the amounts: where the boards were, how far away, how tilted,
     which board it was; a line along it, or a step between two sides of it."""
     at = np.array(evidence.views)

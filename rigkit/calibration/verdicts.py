@@ -99,17 +99,20 @@ def judge(
     effects = _unsure(calibration, far)
     # Images that contradict each other make a lens unsure, however many there are.
     contradicting = worst(effects) is Severity.BAD
+    change = [] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS, clusters)
+    # Pictures of two kinds are why the second half of them is of another lens than the first.
+    named = bool(mixed) or worst(change) is Severity.BAD
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
         *_of_another_kind(calibration),
-        *([] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS, clusters)),
+        *change,
         *unlike,
         *judge_capture(calibration, clusters),
         *(pattern if contradicting else []),
         *extrapolated(calibration, extent, far),
-        *(finding for finding in also if finding.severity is Severity.BAD and not mixed),
+        *(finding for finding in also if finding.severity is Severity.BAD and not named),
     ]
     found = [
         *(finding for finding in also if finding.severity is not Severity.BAD),

@@ -37,8 +37,12 @@ def without_distortion(view: BoardView, camera: Camera) -> BoardView:
     """Return the view as a program leaves it that undistorts images."""
     rays, _ = camera.unproject(view.pixels)
     pixels = camera.parameters[:2] * rays[:, :2] / rays[:, 2:] + camera.parameters[2:4]
-    inside = camera.on_image(pixels)
-    return replace(view, pixels=pixels[inside], grid=view.grid[inside], sigma_px=view.sigma_px[inside])
+    return on_image(replace(view, pixels=pixels), camera)
+
+
+def on_image(view: BoardView, camera: Camera) -> BoardView:
+    inside = camera.on_image(view.pixels)
+    return replace(view, pixels=view.pixels[inside], grid=view.grid[inside], sigma_px=view.sigma_px[inside])
 
 
 def turned(view: BoardView) -> BoardView:
@@ -61,15 +65,36 @@ def test_some_images_without_their_distortion(rng: np.random.Generator) -> None:
     assert "undistorted" in first and "as if some were" not in first
 
 
-@pytest.mark.parametrize(
-    ("change", "words"), [(turned, "as if some were turned by half a turn"), (mirrored, "as if some were mirrored")]
-)
-def test_some_pictures_turned_or_mirrored(change: object, words: str, rng: np.random.Generator) -> None:
-    assert callable(change)
-    views = [change(v) if k % 2 else v for k, v in enumerate(seen(off_the_middle(), 20, rng))]
+def test_some_pictures_mirrored(rng: np.random.Generator) -> None:
+    views = [mirrored(v) if k % 2 else v for k, v in enumerate(seen(off_the_middle(), 20, rng))]
     first, every = told(views, rng)
-    assert KINDS in first and words in first
+    assert KINDS in first and "as if some were mirrored" in first
     assert not any("stabilisation" in verdict or "rolling shutter" in verdict for verdict in every)
+
+
+@pytest.mark.parametrize("later", [False, True])
+@pytest.mark.parametrize("count", [8, 20])
+def test_some_pictures_turned(later: bool, count: int, rng: np.random.Generator) -> None:
+    """In turns or one half after the other, and from few images, whose principal points are no two clusters."""
+    views = seen(off_the_middle(), count, rng)
+    half = [turned(v) if (k >= count // 2 if later else k % 2) else v for k, v in enumerate(views)]
+    every = [str(verdict) for verdict in calibrate(half, SIZE, model="brown", board="flat").verdicts]
+    assert f"{count // 2} of {count} images are turned by half a turn" in every[0]
+    assert not any(
+        words in verdict for verdict in every for words in (KINDS, "stabilisation", "second half", "rolling shutter")
+    )
+
+
+@pytest.mark.parametrize("spread", ["normal", "even"])
+def test_a_stabilised_picture_is_not_turned(spread: str, rng: np.random.Generator) -> None:
+    """Shifts of one direction, of any size: those of one side, turned, would leave a third of the squares and more."""
+    camera = lens("reg", 0.5 * (np.array(SIZE) - 1.0))
+    for _ in range(3):
+        amounts = 20.0 * (rng.normal(size=16) if spread == "normal" else rng.uniform(-1.7, 1.7, size=16))
+        views = seen(camera, 16, rng)
+        moved = [replace(v, pixels=v.pixels + [far, -far]) for v, far in zip(views, amounts, strict=True)]
+        _, every = told([on_image(v, camera) for v in moved], rng)
+        assert not any("half a turn" in verdict for verdict in every)
 
 
 @pytest.mark.parametrize("spread", ["normal", "even"])
