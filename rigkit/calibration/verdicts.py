@@ -90,16 +90,13 @@ def judge(
         views = calibration.views
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
-    mixed = two_cameras(calibration, clusters)
-    # Where it was another lens later on, residuals of one for both are of no motion and of no board.
-    steady = not any(finding.severity is Severity.BAD for finding in also)
+    mixed, change = _between_images(calibration, correlation, also, clusters, solved)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else _pattern(calibration, correlation, in_force)
     effects = _unsure(calibration, far)
     # Images that contradict each other make a lens unsure, however many there are.
     contradicting = worst(effects) is Severity.BAD
-    change = [] if mixed else changing(calibration, correlation, solved, () if steady else NOT_OF_LENS, clusters)
     # Pictures of two kinds are why the second half of them is of another lens than the first.
     named = bool(mixed) or worst(change) is Severity.BAD
     # What says that nobody knows how good the rest is: then it is not good.
@@ -130,6 +127,22 @@ def judge(
     share = extent.share
     where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
     return (*with_headline(calibration, causes, effects, where), *found)
+
+
+def _between_images(
+    c: Calibration,
+    correlation: float,
+    also: Sequence[Finding],
+    clusters: IntArray,
+    solved: tuple[Observations, Fit] | None,
+) -> tuple[list[Finding], list[Finding]]:
+    """Return findings on two cameras that are mixed, and on what else differs from image to image."""
+    mixed = two_cameras(c, clusters)
+    if mixed:
+        return mixed, []
+    # Where it was another lens later on, residuals of one for both are of no motion and of no board.
+    but = NOT_OF_LENS if worst(also) is Severity.BAD else ()
+    return [], changing(c, correlation, solved, but, clusters)
 
 
 def judge_session(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.dataset_arguments import add_planes_argument
 from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
 from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", metavar="WxH", help="of the images, px: py-OCamCalib's files do not say it")
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
+    add_planes_argument(parser, "points and normals of a pair")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
@@ -68,10 +70,13 @@ def _export_cloud(args: argparse.Namespace) -> int:
     if kind not in known:
         what = "a PLY" if is_ply else "a cloud"
         raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
-    unused = {"--names": args.names, "--size": args.size, "--from": args.source_format, "--pair": is_ply and args.pair}
+    unused = {"--names": args.names, "--size": args.size, "--from": args.source_format}
+    unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
         raise InputError(f"export: {option} says nothing of {'a PLY' if is_ply else 'a cloud'}; leave it out")
-    options = ExportCloudOptions(output=args.output, kind=kind, pair=args.pair, method=args.method, force=args.force)
+    options = ExportCloudOptions(
+        output=args.output, kind=kind, pair=args.pair, method=args.method, planes=args.planes, force=args.force
+    )
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")
         return 0

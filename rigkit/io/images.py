@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.reading import read_bytes
+from rigkit.io.reading import is_file_or_lost_link, read_bytes
 from rigkit.io.tiff import TIFF_STARTS, as_stored, page_sizes
 
 _log = logging.getLogger(__name__)
@@ -155,7 +155,7 @@ def announced_sizes(data: bytes) -> list[tuple[int, int]]:
 
 def images_of_folder(folder: Path) -> list[Path]:
     """Return the images of a folder, by name."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and is_file_or_lost_link(p))
 
 
 def name_unread(folder: Path) -> None:

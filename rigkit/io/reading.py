@@ -28,6 +28,11 @@ MIN_POSITIVE = 1e-9
 """A picometre in mm; a measurement with a smaller sigma would outweigh all else."""
 
 
+def is_file_or_lost_link(path: Path) -> bool:
+    """Say whether a folder's entry is a file, or a link to one that is not there: what reads it says so."""
+    return path.is_file() or (path.is_symlink() and not path.exists())
+
+
 def usable_path(path: str | Path) -> Path:
     """Return the path; raises InputError where no system could open it: a NUL character, names too long, links that
     lead to each other."""
@@ -65,6 +70,8 @@ def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_
             raise InputError(f"{name} has {status.st_size} bytes, more than {max_bytes}; is it the right one?")
         return source.read_bytes()
     except FileNotFoundError as error:
+        if source.is_symlink():
+            raise InputError(f"{name} is a link to '{source.readlink()}', which is not there; fetch that") from error
         raise InputError(f"{name} does not exist; check the path") from error
     except OSError as error:
         raise InputError(f"{name} cannot be read: {error.strerror}; check the path and permissions") from error

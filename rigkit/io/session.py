@@ -26,6 +26,7 @@ from rigkit.core.boards import Board
 from rigkit.core.printing import brief
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.board_file import load_board
+from rigkit.io.reading import is_file_or_lost_link
 from rigkit.io.schema_words import ANY_OF, COUNT, NAME, TEXT, Schema, array, choice, file, rows, said, table, texts
 from rigkit.io.toml_reader import TomlTable, named_path, read_toml
 from rigkit.io.truth_file import TRUTH_KEYS, between
@@ -164,7 +165,7 @@ def images_of(table: TomlTable) -> tuple[Path, ...]:
         matches = [root / m for m in sorted(glob.glob(pattern, root_dir=root))]
         if not matches and (root / pattern).is_file():
             matches = [root / pattern]
-        for match in filter(Path.is_file, matches):
+        for match in filter(is_file_or_lost_link, matches):
             # The same file twice is one image, under the name by which it was found first.
             found.setdefault(match.resolve(), named_path(match))
         absent += [pattern] if not matches else []

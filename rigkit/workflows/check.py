@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.usable import views_of_image, without_lookalikes
+from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.boards import Board
@@ -88,8 +88,8 @@ def check_pictures(
     together in the order of their names; or the images themselves, moment by moment, each in the rig's order. An image
     that cannot be read does not end the rest; its error is raised where there is no other.
 
-    Raises InputError: no covariance, no images, none with a board, images of two cameras exchanged, or a file that
-    cannot be written; DegenerateError: pictures that say nothing of the camera.
+    Raises InputError: no covariance, no images, none with a board, boards of another size, images of two cameras
+    exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
     watched, known = load_watched(source)
@@ -226,6 +226,9 @@ def _views(
             if image is not None:
                 seen[c][str(path)] = detect_boards(image, boards, camera=watched.cameras[c])
     progress("corners", total, total)
+    wrong = other_size({name: found for own in seen for name, found in own.items()}, boards)
+    if wrong is not None:
+        raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
     own = [without_lookalikes(found, boards) for found in seen]
     for k, frame in enumerate(frames):
         name = f"{k:04d}"

@@ -127,7 +127,7 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     if not session.images:
         return _kept_alone(session, kept)
     paths = named_images(session)
-    hashes = {name: image_hash(path) for name, path in paths.items()}
+    hashes = {name: _hash(path) for name, path in paths.items()}
     first = {name: item for name, digest in hashes.items() if (item := kept.get(name, digest)) is not None}
     fresh = [name for name in paths if name not in first]
     unreadable: dict[str, str] = {}
@@ -176,6 +176,14 @@ def session_corners(session: Session, *, cache: Cache = Cache.READ, progress: Pr
     old = len(first) - len([name for name in fresh if name in first])
     source = f"found in {len(first) - old} images" + (f", kept in {session.corners_path.name} of {old}" if old else "")
     return SessionCorners(found=first | through, unreadable=unreadable, source=source)
+
+
+def _hash(path: Path) -> str:
+    """Return the hash of an image; of none for one that cannot be opened, which looking for corners says."""
+    try:
+        return image_hash(path)
+    except InputError:
+        return ""
 
 
 def _lens_of(session: Session, hashes: Mapping[str, str]) -> str:

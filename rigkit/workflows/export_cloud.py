@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
+from rigkit.core.planes import Planes
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.colmap_model import colmap_model
 from rigkit.interop.las import las_bytes
@@ -38,6 +39,8 @@ class ExportCloudOptions:
     """Name of the pair; None: the only one."""
     method: str = "3SDIR"
     """Affine estimator of the normals."""
+    planes: Planes | None = None
+    """Points and normals, as `ReconstructOptions` has it; None: as the manifest says of the pair."""
     force: bool = False
     """Replace files that exist; what was read is never replaced."""
 
@@ -47,7 +50,7 @@ def export_cloud(
 ) -> Reconstruction:
     """Reconstruct one pair of a data set, write its cloud, and return the reconstruction.
 
-    The cloud is that of `reconstruct_dataset`: on the planes that the manifest names, the calibrations in its sigmas.
+    The cloud is that of `reconstruct_dataset` with the same options: the calibrations are in its sigmas.
 
     Raises InputError: no such pair, or none named of several; a file that cannot be read or written; DegenerateError:
     the corners do not determine the pose.
@@ -61,7 +64,8 @@ def export_cloud(
     pair.require_images()
     camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
     matched, image1, _ = match_images(pair, camera1.camera, camera2.camera, "raw")
-    r = with_whole_sigmas(reconstruct_with(matched, pair, options.method, image1), pair.planes, camera1, camera2)
+    r = reconstruct_with(matched, pair, options.method, image1)
+    r = with_whole_sigmas(r, options.planes or pair.planes, camera1, camera2)
     folder, files = options.output, dict[str, str | bytes]()
     if options.kind == "colmap":
         model, notes = colmap_model(

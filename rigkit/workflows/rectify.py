@@ -118,6 +118,9 @@ def rectify_image(
         jobs = _outputs(sources, options.output) if _is_folder(options.output) else [(sources[0], options.output)]
         _ensure_all([out for _, out in jobs], options, (*map(_file, sources), camera))
         source = import_camera(camera)
+        if not np.isfinite(options.angles_deg).all():
+            yaw, pitch, roll = options.angles_deg
+            raise InputError(f"rectify: yaw {yaw:g}, pitch {pitch:g}, roll {roll:g}: three finite numbers are needed")
         hfov_rad = None if options.hfov_deg is None else np.radians(options.hfov_deg)
         _require_sizes(sources, source.size_px, camera)
         with about(camera):

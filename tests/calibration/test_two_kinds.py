@@ -92,7 +92,7 @@ def test_a_stabilised_picture_is_not_turned(spread: str, rng: np.random.Generato
     for _ in range(3):
         amounts = 20.0 * (rng.normal(size=16) if spread == "normal" else rng.uniform(-1.7, 1.7, size=16))
         views = seen(camera, 16, rng)
-        moved = [replace(v, pixels=v.pixels + [far, -far]) for v, far in zip(views, amounts, strict=True)]
+        moved = [replace(v, pixels=v.pixels + np.array([far, -far])) for v, far in zip(views, amounts, strict=True)]
         _, every = told([on_image(v, camera) for v in moved], rng)
         assert not any("half a turn" in verdict for verdict in every)
 

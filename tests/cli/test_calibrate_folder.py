@@ -56,6 +56,15 @@ def worst_px(camera: Camera) -> float:
     return float(np.abs(projected - pixels).max())
 
 
+def test_a_link_to_no_image_is_told(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A store of data links images that were not fetched to nothing: the others are used, and these are named."""
+    folder = of_one_camera(pictures, tmp_path / "photos")
+    (folder / "DSC_9999.JPG").symlink_to(tmp_path / "store" / "abc.jpg")
+    command = ["calibrate", str(folder), "--board", "9x6x30", "--model", "brown", "-o", str(tmp_path / "out.json")]
+    assert main(command) == 0
+    assert "image 'DSC_9999.JPG' is left out" in "".join(capsys.readouterr())
+
+
 def test_from_pictures_to_a_page_and_two_formats_in_one_command(
     pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

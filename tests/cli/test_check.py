@@ -162,6 +162,7 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
         (["{cam}", "{same}", "--scene"], "of a rig only"),
         (["{cam}", "{same}", "--length", "3"], "belong together"),
         (["{cam}", "{home}/nothing.png"], "does not exist"),
+        (["{cam}", "{same}", "--board", "8x5x25"], "9 x 6 inner corners are seen in 3 of 3 images, 8 x 5 are declared"),
         (["{cam}", "{same}", "--fix", "{cam}", "--force"], "cam.json"),
     ],
 )

@@ -327,3 +327,13 @@ def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "folder").mkdir()
     assert main(["rectify", both[0], str(tmp_path / "folder"), "--rig", str(rig), "-o", str(tmp_path / "more")]) == 2
     assert "two images, two folders or two videos" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("angle", ["nan", "inf"])
+def test_a_view_that_is_no_number_is_no_fault_of_the_camera(
+    angle: str, files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / "out.png"), "--yaw-deg", angle]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert f"rectify: yaw {angle}, pitch 0, roll 0: three finite numbers are needed" in said and files[1] not in said
