@@ -61,7 +61,8 @@ def test_a_link_to_no_image_is_told(pictures: Path, tmp_path: Path, capsys: pyte
     folder = of_one_camera(pictures, tmp_path / "photos")
     (folder / "DSC_9999.JPG").symlink_to(tmp_path / "store" / "abc.jpg")
     command = ["calibrate", str(folder), "--board", "9x6x30", "--model", "brown", "-o", str(tmp_path / "out.json")]
-    assert main(command) == 0
+    assert main(command) == 2
+    assert load_calibration(tmp_path / "out.json").heldout_rms_px is not None
     assert "image 'DSC_9999.JPG' is left out" in "".join(capsys.readouterr())
 
 
