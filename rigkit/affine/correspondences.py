@@ -58,6 +58,17 @@ class Correspondences:
         A21, sigma_px, sigma_A = (None if v is None else v[which] for v in (self.A21, self.sigma_px, self.sigma_A))
         return Correspondences(self.pixels1[which], self.pixels2[which], A21, d, sigma_px, sigma_A)
 
+    def exchanged(self) -> Correspondences:
+        """Return the points with the two images exchanged, without directions; sigmas of entries of A21 are those of
+        its inverse at first order."""
+        if self.A21 is None:
+            return Correspondences(self.pixels2, self.pixels1, sigma_px=self.sigma_px)
+        a, b, c, d = np.moveaxis(self.A21.reshape(-1, 4), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            A12 = np.stack([d, -b, -c, a], axis=-1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
+            sigma_A = None if self.sigma_A is None else self.sigma_A / np.abs(a * d - b * c)
+        return Correspondences(self.pixels2, self.pixels1, A12, sigma_px=self.sigma_px, sigma_A=sigma_A)
+
     def matches(self, camera1: Camera, camera2: Camera) -> tuple[Matches, BoolArray]:
         """Return matches with rays and Jacobians, and which of the N points they are: those that both cameras see."""
         seen = camera1.unproject(self.pixels1)[1] & camera2.unproject(self.pixels2)[1]

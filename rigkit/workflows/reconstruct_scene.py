@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -283,9 +283,16 @@ def _sparse(
         progress("matching affine features", 1, 1)
         try:
             return scene_of(found), found
-        except DegenerateError:
-            if k:
-                raise
+        except DegenerateError as error:
+            if not k:
+                continue
+            if options.rig is not None and _fits(scene_of, found.exchanged()):
+                one, other = options.images or ("", "")
+                raise DegenerateError(
+                    f"'{options.name}': images '{one}' and '{other}' are exchanged: the other way round they fit the "
+                    "rig; give them in the order of its cameras, or name these with --names"
+                ) from error
+            raise
     raise AssertionError("one of two attempts returns or raises")
 
 
@@ -327,3 +334,11 @@ def _files(
         files["epipolar.png"] = as_png(epipolar_figure(r, *images, every=max(1, len(r.cloud) // 40)))
         files["normals.png"] = normals_png(scene, found, *images)
     return files
+
+
+def _fits(scene_of: Callable[[Correspondences], SceneReconstruction], found: Correspondences) -> bool:
+    try:
+        scene_of(found)
+    except DegenerateError:
+        return False
+    return True

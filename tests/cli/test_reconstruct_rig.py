@@ -103,3 +103,13 @@ def test_views_are_paired_with_their_neighbours_that_look_the_same_way() -> None
     assert all(i < j for i, j in pairs)
     # Two places are one: no baseline.
     assert near_pairs([at(0.0, 0.0), at(0.0, 0.0), at(100.0, 0.0)]) == [(0, 2), (1, 2)]
+
+
+def test_images_of_a_rig_that_are_exchanged_are_told(
+    files: tuple[Path, list[str], Corner], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, images, _ = files
+    monkeypatch.setattr("rigkit.affine.features.ENOUGH_PLAIN", 50)
+    assert run(folder, "--images", images[1], images[0], "--sparse") == 3
+    said = capsys.readouterr().err
+    assert f"images '{images[1]}' and '{images[0]}' are exchanged" in said and "--names" in said
