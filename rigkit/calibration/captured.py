@@ -63,6 +63,13 @@ class Extent:
         """Part of the image that is asked for in which boards were."""
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
+    @property
+    def where(self) -> str:
+        """In words, of which part of the image an error is that boards show; nothing for nearly all of it."""
+        return (
+            "" if self.share >= NEARLY_ALL else f" over the {100.0 * self.share:.0f} % of the image where boards were"
+        )
+
 
 def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
@@ -75,7 +82,6 @@ def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]
         *_tilts(calibration),
         *_parallel(calibration),
         *_distances(calibration),
-        *_upright(calibration),
     ]
 
 
@@ -114,8 +120,9 @@ def _parallel(c: Calibration) -> list[Finding]:
     ]
 
 
-def _upright(c: Calibration) -> list[Finding]:
-    """Pixels that are longer one way, and squares that are longer one way, look alike until the board is turned."""
+def same_way_up(c: Calibration) -> list[Finding]:
+    """Return a finding where no board was turned: pixels that are longer one way, and squares that are longer one way,
+    look alike but for what tilted boards show."""
     # Half a turn changes nothing: angles are doubled.
     along = _axes(c, 0) @ np.array([1.0, 1.0j, 0.0])
     doubled = (along / np.maximum(np.abs(along), np.finfo(float).tiny)) ** 2

@@ -12,7 +12,14 @@ from typing import Protocol
 
 import numpy as np
 
-from rigkit.calibration.captured import ASKED_DEG, NEARLY_ALL, SMALL_PX, Extent, extrapolated, judge_capture
+from rigkit.calibration.captured import (
+    ASKED_DEG,
+    SMALL_PX,
+    Extent,
+    extrapolated,
+    judge_capture,
+    same_way_up,
+)
 from rigkit.calibration.changing import MOTION, changing
 from rigkit.calibration.fit import Fit
 from rigkit.calibration.mixed import two_cameras
@@ -89,6 +96,7 @@ def judge(
     if clusters is None:
         views = calibration.views
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
+    upright = same_way_up(calibration)
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _between_images(calibration, correlation, also, clusters, solved)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
@@ -108,6 +116,7 @@ def judge(
         *unlike,
         *judge_capture(calibration, clusters),
         *(pattern if contradicting else []),
+        *upright,
         *extrapolated(calibration, extent, far),
         *(finding for finding in also if finding.severity is Severity.BAD and not named),
     ]
@@ -121,12 +130,10 @@ def judge(
             *unclear,
             *([] if contradicting else pattern),
             *_overfit(calibration),
-            *_boards(calibration),
+            *_boards(calibration, " if pixels are square" if upright else ""),
             *_outliers(calibration),
         ]
-    share = extent.share
-    where = "" if share >= NEARLY_ALL else f" over the {100.0 * share:.0f} % of the image where boards were"
-    return (*with_headline(calibration, causes, effects, where), *found)
+    return (*with_headline(calibration, causes, effects, extent.where), *found)
 
 
 def _between_images(
@@ -352,8 +359,8 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     return [Finding.bad(what, "take more views there, with the board tilted")]
 
 
-def _boards(c: Calibration) -> list[Finding]:
-    """What the solved shapes say: a bow, or squares longer one way than the other."""
+def _boards(c: Calibration, provided: str = "") -> list[Finding]:
+    """What the solved shapes say: a bow, or squares longer one way than the other, `provided` that it is told."""
     out = []
     for board in c.boards:
         if board.kind == "flat":
@@ -371,7 +378,7 @@ def _boards(c: Calibration) -> list[Finding]:
             out.append(
                 Finding.look(
                     f"board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
-                    f"stated, compared with {other}",
+                    f"stated, compared with {other}{provided}",
                     "measure square_x_mm and square_y_mm again",
                 )
             )
