@@ -148,6 +148,7 @@ def _rig_figures(pair: RigPair) -> dict[str, Any]:
     return {
         "mounts": [asdict(m) for m in pair.mounts.mounts],
         "chance": pair.mounts.chance,
+        "scale": pair.mounts.scale,
         "cameras": {name: _camera_figures(own) for name, own in pair.cameras.items()},
         "same": pair.same,
     }
@@ -181,4 +182,12 @@ def _rigs_in_words(pair: RigPair, figures: dict[str, Any]) -> list[str]:
         return [*(line.removesuffix(f"; {NO_VERDICT}") for line in lines), NO_VERDICT]
     chance = "" if figures["chance"] is None else f" (mounts together: chance {figures['chance']:.3g})"
     verdict = "the same rig" if figures["same"] else "NOT the same rig: a camera or a lens moved"
+    scale, lenses = pair.mounts.scale, all(own.same is not False for own in pair.cameras.values())
+    if scale is not None and lenses:
+        # Of two cameras only the distance between them tells.
+        how = ", or one camera moved along the line between both" if len(figures["cameras"]) == 2 else ""
+        verdict = (
+            f"NOT the same rig: lengths of the second are {scale:.5g} times those of the first, and nothing else "
+            f"differs: boards were described with squares of another size{how}"
+        )
     return [*lines, f"{verdict}{chance}"]

@@ -44,6 +44,18 @@ def moved(rig: Mounted, name: str, by: Rigid3) -> Mounted:
     return Mounted(cameras, rig.covariance, rig.freedom)
 
 
+def test_a_rig_of_boards_of_another_size_is_told_from_one_that_moved(rigs: list[Mounted]) -> None:
+    """All lengths are longer by one factor; a camera that moved otherwise leaves no such factor."""
+    first, second = rigs[:2]
+    scaled = {n: (c, Rigid3(m.rotation, 1.2 * m.translation_mm)) for n, (c, m) in second.cameras.items()}
+    found = compare_mounts(first, Mounted(scaled, second.covariance, second.freedom))
+    assert found.same is False and found.scale == pytest.approx(1.2, rel=0.01)
+    turned = Rigid3(exp_so3(np.array([0.0, 0.02, 0.0])), [5.0, 3.0, 0.0])
+    other = compare_mounts(first, moved(second, "wide", turned))
+    assert other.same is False and other.scale is None
+    assert compare_mounts(first, second).scale is None
+
+
 def test_rigs_that_did_not_change_are_the_same(rigs: list[Mounted]) -> None:
     """Chances of one and the same rig are uniform, and what was moved is found."""
     found = [compare_mounts(a, b).chance for a, b in zip(rigs[::2], rigs[1::2], strict=True)]

@@ -12,8 +12,8 @@ whose covariance is that of intrinsics and mounts together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,10 @@ from rigkit.geometry.rotation import skew
 
 LENS_GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
+SCALE_ROUNDS, SCALE_STEP = 8, 1e-4
+"""Newton's steps to the scale between two rigs, and the relative step of its derivative."""
+MAX_SCALE = 100.0
+"""Lengths of one rig in another's: metres for centimetres at most."""
 WEIGHT_FLOOR_PX = 1e-6
 """No projection is surer than this: weights stay finite without noise."""
 
@@ -65,10 +69,12 @@ class MountDifference:
 
 @dataclass(frozen=True, slots=True)
 class RigDifference:
-    """Of every camera (or board) but the first, and the chance of as much in all of them if nothing moved."""
+    """Of every camera (or board) but the first, and the chance of as much in all of them if nothing moved; `scale` are
+    lengths of the second rig over those of the first, where they differ and nothing else does."""
 
     mounts: tuple[MountDifference, ...]
     chance: float | None
+    scale: float | None = None
 
     @property
     def same(self) -> bool | None:
@@ -91,16 +97,33 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
     for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
         turns.append(compare_cameras(first, second, grid=LENS_GRID, weights=weight).b_from_a)
     sits, sat = ([mount for _, mount in rig.cameras.values()] for rig in (a, b))
-    off = [np.zeros(0)]
-    for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
-        # As the axes of the first rig's lenses have it.
-        moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm)
-        off.append(here.step_from(moved))
+
+    def off(scale: float) -> FloatArray:
+        out = [np.zeros(0)]
+        for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
+            # As the axes of the first rig's lenses have it.
+            moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm / scale)
+            out.append(here.step_from(moved))
+        return np.concatenate(out)
+
     known = None
     if a.covariance is not None and b.covariance is not None:
         parts = _moved(a, a.covariance, weights), _moved(b, b.covariance, weights)
         known = _known(parts, (a.freedom, b.freedom), seed)
-    return _difference(list(a.cameras)[1:], np.concatenate(off), known)
+    found = _difference(list(a.cameras)[1:], off(1.0), known)
+    return replace(found, scale=_scale(off, known)) if known is not None and found.same is False else found
+
+
+def _scale(off: Callable[[float], FloatArray], known: Known) -> float | None:
+    """Return by what factor lengths differ, where nothing else does; None where something does."""
+    scale, weight = 1.0, scaled_pinv(known[0])
+    for _ in range(SCALE_ROUNDS):
+        here = off(scale)
+        slope = (off(scale * (1.0 + SCALE_STEP)) - here) / (scale * SCALE_STEP)
+        scale -= float(slope @ weight @ here / max(float(slope @ weight @ slope), np.finfo(float).tiny))
+        if not 1.0 / MAX_SCALE < scale < MAX_SCALE:
+            return None
+    return scale if _chance(off(scale), *known) >= SAME_CHANCE else None
 
 
 def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDifference:
