@@ -72,16 +72,17 @@ def turned_pictures(
             views=view_results(back.observations, back.state, back.residuals, fit.kept),
             boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
         )
-        left = view_evidence(solved, clusters)
-        if left is None:
+        now = view_evidence(solved, clusters)
+        if now is None:
             return None
+        evidence = now
         # A picture on the wrong side has its principal point where the turned one has it.
         off = np.array(calibration.camera.size_px) - 1.0 - 2.0 * back.state.camera.axis_px
-        wrong = left.along[:, shift] @ off > 0.5 * (left.own[:, shift, shift] @ off) @ off
+        wrong = evidence.along[:, shift] @ off > 0.5 * (evidence.own[:, shift, shift] @ off) @ off
         if not wrong.any():
             break
-        at[np.array(left.views)[wrong]] ^= True
-    return _judged(back, before, left)
+        at[np.array(evidence.views)[wrong]] ^= True
+    return _judged(back, before, evidence)
 
 
 def _judged(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
