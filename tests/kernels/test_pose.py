@@ -85,11 +85,13 @@ def test_five_equations(rng, camera, affine, in_numpy):
     ours, theirs = five_rows(rows), reference_minimal.essential_from_five_rows(rows)
     real = [np.isfinite(found).all(axis=(2, 3)) for found in (ours, theirs)]
     assert real[0].sum() > 3 * len(rows)
-    assert np.mean(real[0].sum(axis=1) == real[1].sum(axis=1)) >= 1.0 - 1.5 / len(rows)
-    off = np.asarray(_off(ours[:, :, None], theirs[:, None]))
-    both = np.asarray(real[0])[:, :, None] & np.asarray(real[1])[:, None]
-    off = np.where(both, off, np.inf)
-    for nearest in (off.min(axis=2)[real[0]], off.min(axis=1)[real[1]]):
+    # Two solutions that all but coincide are real or not as the processor rounds.
+    same = np.equal(*(found.sum(axis=1) for found in real))
+    assert np.mean(same) >= 1.0 - 1.5 / len(rows)
+    off = np.asarray(_off(ours[same, :, None], theirs[same, None]))
+    mine, others = (np.asarray(found)[same] for found in real)
+    off = np.where(mine[:, :, None] & others[:, None], off, np.inf)
+    for nearest in (off.min(axis=2)[mine], off.min(axis=1)[others]):
         assert np.mean(nearest < SOLUTION) >= SAME_SHARE
         assert np.median(nearest) < 1e-12
 
