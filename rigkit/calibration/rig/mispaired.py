@@ -95,31 +95,22 @@ def put_together_wrongly(
     cameras = [c.camera for c in single]
     own = [_of_frames(one, frames) for one in seen]
     now = _by_frame(_off(own, mounts, cameras, places))
-    out = []
+    tried: list[tuple[list[FrameObservations], str, str, str]] = []
     for i, j in combinations(range(len(seen)), 2):
         trial = list(own)
         trial[i], trial[j] = own[j], own[i]
-        right = _put_right(now, _by_frame(_off(trial, mounts, cameras, places)))
-        if right:
-            out.append(
-                Finding.bad(
-                    f"the images of '{names[i]}' and '{names[j]}' are exchanged in {_named(right)}: put right, the "
-                    "cameras agree there on where the boards are",
-                    "give them their own names, and calibrate again",
-                )
-            )
+        tried.append((trial, f"'{names[i]}' and '{names[j]}' are exchanged", "put right", "give them their own names"))
     for k, camera in enumerate(cameras):
         trial = list(own)
         trial[k] = _turned(own[k], camera)
-        right = _put_right(now, _by_frame(_off(trial, mounts, cameras, places)))
-        if right:
-            out.append(
-                Finding.bad(
-                    f"the images of '{names[k]}' are turned by half a turn in {_named(right)}: turned back, the "
-                    "cameras agree there on where the boards are",
-                    "take them as the camera wrote them, and calibrate again",
-                )
-            )
+        remedy = "take them as the camera wrote them"
+        tried.append((trial, f"'{names[k]}' are turned by half a turn", "turned back", remedy))
+    out = []
+    for trial, what, mended, remedy in tried:
+        if right := _put_right(now, _by_frame(_off(trial, mounts, cameras, places))):
+            agree = "the cameras agree there on where the boards are"
+            message = f"the images of {what} in {_named(right)}: {mended}, {agree}"
+            out.append(Finding.bad(message, f"{remedy}, and calibrate again"))
     return [*out, *_miscounted(names, seen, mounts, cameras, places, now)]
 
 
