@@ -36,22 +36,6 @@ typedef struct {
     double border, blurs, nothing_near;
 } tag_window_t;
 
-EXPORT void fit_tag_edges(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t places,
-    ARRAY(const uint8_t, cells, places), ARRAY(const double, steps, places, 2, 2), ARRAY(const double, signs, places),
-    int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, surface, count, SURFACE_COLUMNS),
-    ARRAY(const double, single, count, 2), ARRAY(const double, contrast, count), ARRAY(const double, blur, count),
-    const tag_window_t *tag, const edge_rules_t *rules, ARRAY(float, scratch, edges_scratch(rules)),
-    ARRAY(double, out, count, OUTCOMES));
-
-EXPORT double blur_of_tags(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t places,
-    ARRAY(const uint8_t, cells, places), ARRAY(const double, steps, places, 2, 2), ARRAY(const double, signs, places),
-    int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, surface, count, SURFACE_COLUMNS),
-    ARRAY(const double, single, count, 2), ARRAY(const double, contrast, count), int64_t apart, double blur,
-    const tag_window_t *tag, const edge_rules_t *rules, ARRAY(float, scratch, edges_scratch(rules)),
-    ARRAY(double, found, count / apart + 1));
-
 /* correlation.c */
 
 /* The constants of detection.subpixel.correlation, under their names there. */
@@ -107,6 +91,9 @@ enum { SURFACE_DEGREE = 8, SURFACE_TERMS = (SURFACE_DEGREE + 1) * (SURFACE_DEGRE
  * the board lies from these. */
 enum { SEEN = 0, SIDES = 2, SECOND = 6, GAIN = 10, CURVATURE = 11, HEIGHTS = 13, SURFACE_COLUMNS = 15 };
 
+/* Numbers of scratch for each point of `fit_polynomials`: five, and the powers of x and y. */
+enum { FIT_SCRATCH = 5 + 2 * (SURFACE_DEGREE + 1) };
+
 EXPORT void project_places(
     ARRAY(const double, places, count, 2), int64_t count, ARRAY(const double, homography, 3, 3),
     ARRAY(double, out, count, SURFACE_COLUMNS));
@@ -114,19 +101,105 @@ EXPORT double fit_perspective(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(
     ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
-    double most_leverage, ARRAY(double, basis, terms, count), ARRAY(double, scratch, 5, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
+    double most_leverage, ARRAY(double, basis, terms, count), ARRAY(double, scratch, FIT_SCRATCH, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
     ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, off, count),
     ARRAY(double, gain, count), ARRAY(double, scatter, 1));
 EXPORT int64_t fit_map(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, int64_t terms,
     double most_leverage, double nearest, ARRAY(double, rest, count, 2), ARRAY(double, basis, terms, count),
-    ARRAY(double, scratch, 5, count), ARRAY(double, homography, 3, 3), ARRAY(double, unit, 3),
+    ARRAY(double, scratch, FIT_SCRATCH, count), ARRAY(double, homography, 3, 3), ARRAY(double, unit, 3),
     ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1),
     ARRAY(double, off, count), ARRAY(double, gain, count), ARRAY(double, scatter, 1));
 EXPORT void add_polynomial(
     ARRAY(const double, wanted, count, 2), int64_t count, ARRAY(const double, unit, 3), int64_t terms, int64_t degree,
     ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
     ARRAY(const double, misses, SURFACE_DEGREE + 1), int64_t surest, ARRAY(double, out, count, SURFACE_COLUMNS));
+
+/* tag_board.c and tag_rounds.c */
+
+/* What is known of a corner of a board (detection.guided.board_guide.FITTED): u, v, contrast, RMS residual, RMS noise, sigma, s; NaN
+ * where it is missing. Marks of corners: not there, sought in vain until others near it are found, those of the last fit of all, those
+ * that something is done with. Numbers of a board: whether the map is that of its corners, whether it begins with a camera's map or a
+ * perspective, terms and plain degree of its polynomial, its scatter, that when all corners were fitted, and how many these were. */
+enum {
+    CORNER_CONTRAST = 2, CORNER_RESIDUAL = 3, CORNER_NOISE = 4, CORNER_SIGMA = 5, CORNER_BLUR = 6, CORNER_COLUMNS = 7,
+    MARK_VAIN = 0, MARK_WAITING = 1, MARK_FITTED = 2, MARK_CELLS = 3, TAG_MARKS = 4,
+    MAP_KNOWN = 0, MAP_BY_CAMERA = 1, MAP_BY_PERSPECTIVE = 2, MAP_TERMS = 3, MAP_PLAIN_DEGREE = 4, MAP_SCATTER = 5,
+    FITTED_SCATTER = 6, FITTED_COUNT = 7, TAG_NUMBERS = 8
+};
+
+/* Doubles of room for each corner of a board of tags, with those of the codes' modules beside them, and for its map. */
+enum {
+    ROOM_OF_CORNER = SURFACE_TERMS + SURFACE_COLUMNS + OUTCOMES + FIT_SCRATCH + 15,
+    ROOM_OF_MAP = SURFACE_TERMS * SURFACE_TERMS + 2 * SURFACE_TERMS + SURFACE_DEGREE + 1 + 13
+};
+
+/* The constants of detection.tags.corners and of what it takes from others, under their names there; `first` and `last` are the rules
+ * of a quick fit and of the last, `rough` of the last without noise told from other residuals. */
+typedef struct {
+    const edge_rules_t *first, *last, *rough;
+    const tag_window_t *window;
+    double points_a_term, most_leverage, nearest_depth, hardly_more, median_of_rayleigh;
+    double first_blur, few_corners, least_contrast, rough_px, better_known, bent_sigmas, wide_blur, most_gain, margin_px;
+    double moved_cells, added_contrast, added_residual, most_sigma_cells, narrow_blurs, code_contrast, likeness;
+    double scatter_floor, outlier, judging_gain, displaced_cells;
+    int64_t fewest_foretelling, fewest_guiding;
+} tag_corner_rules_t;
+
+/* detection.tags.placing.TagBoard, its corners row by row; whether squares join its tags; the border in sides of a tag. */
+typedef struct {
+    ARRAY(const double, places, count, 2);
+    ARRAY(const double, steps, count, 2, 2);
+    ARRAY(const double, signs, count);
+    ARRAY(const int64_t, numbers, count / 4);
+    ARRAY(const double, patterns, codes, modules * modules);
+    ARRAY(const int64_t, code_numbers, codes);
+    ARRAY(const int64_t, code_turns, codes);
+    int64_t rows, columns, count, codes, modules, joined;
+    double spacing, border;
+} tag_board_t;
+
+/* The fit of a board of tags in an image. `base` is a camera's map of its corners, `fitted` (outcomes) and `sides` are of the corners
+ * marked FITTED, `curvature` is what lines were fitted with last; `windows`, `map` and `room` are scratch. */
+typedef struct {
+    const tag_board_t *board;
+    const tag_corner_rules_t *rules;
+    ARRAY(const void, grey, height, width);
+    int64_t bytes, width, height;
+    ARRAY(double, corners, board.count, CORNER_COLUMNS);
+    ARRAY(uint8_t, marks, TAG_MARKS, board.count);
+    ARRAY(double, base, board.count, SURFACE_COLUMNS);
+    ARRAY(double, fitted, board.count, OUTCOMES);
+    ARRAY(double, sides, board.count, 2, 2);
+    ARRAY(double, curvature, board.count, 2);
+    ARRAY(double, numbers, TAG_NUMBERS);
+    ARRAY(double, off, 2, board.count);
+    ARRAY(double, map, ROOM_OF_MAP);
+    ARRAY(double, room, board.count, ROOM_OF_CORNER);
+    ARRAY(double, modules, board.count / 4, board.modules * board.modules);
+    ARRAY(float, windows, edges_scratch(rules.last.contents));
+} tag_fit_t;
+
+EXPORT void map_tag_board(const tag_fit_t *fit);
+EXPORT double tag_sigma_factor(const tag_fit_t *fit, const factor_rules_t *rules);
+EXPORT double tag_scatter(const tag_fit_t *fit, double factor);
+EXPORT void tag_heights(
+    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, ARRAY(double, longer, rows / 2, columns / 2),
+    ARRAY(double, height, rows / 2, columns / 2));
+EXPORT void fit_tag_board(const tag_fit_t *fit, double blur);
+EXPORT void refit_tag_corners(const tag_fit_t *fit);
+EXPORT int64_t add_tag_corners(const tag_fit_t *fit, int64_t rounds, int64_t by_this_map);
+EXPORT int64_t drop_tag_corners(const tag_fit_t *fit, int64_t rounds);
+
+/* tag_places.c */
+
+EXPORT int64_t squares_of_lattice(
+    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, int64_t odd,
+    ARRAY(double, quads, rows * columns, 4, 2), ARRAY(int64_t, cells, rows * columns, 2));
+EXPORT int64_t vote_place(
+    ARRAY(const int64_t, cells, count, 2), ARRAY(const int64_t, turns, count), ARRAY(const int64_t, places, count, 2), int64_t count,
+    int64_t columns, int64_t rows, ARRAY(int64_t, scratch, count, 3), ARRAY(int64_t, place, 3));
+
 /* codes.c */
 
 EXPORT void maps_of_quads(ARRAY(const double, quads, count, 4, 2), int64_t count, ARRAY(double, out, count, 3, 3));

@@ -8,9 +8,6 @@
 
 enum { CACHE_LINE = 64 };
 
-/* Of what comes out of a corner. */
-enum { BLUR = 3, CONTRAST = 4, VALID = 7 };
-
 /* Start from the contrast 2 b and a mean brightness: the first step finds the latter, in which the model is linear. */
 static void level(double *values, const window_t *window, double half)
 {
@@ -125,7 +122,7 @@ typedef struct {
 } minimum_t;
 
 /* Move `values` to the most probable ones. */
-static void descend(
+FOR_EACH_PROCESSOR static void descend(
     double *values, const window_t *window, const geometry_t at, const prior_t *prior, const edge_rules_t *rules, minimum_t *out)
 {
     const int n = prior->count;

@@ -5,6 +5,9 @@
 
 #include "kernels.h"
 
+/* Of what comes out of a corner. */
+enum { SIGMA = 2, BLUR, CONTRAST, RESIDUAL, NOISE, VALID, PIXELS };
+
 enum { X, Y, T1, T2, S, A, B, GX, GY, K1, K2, PARAMETERS };
 enum { FEWER = K1, ROWS = PARAMETERS + 1, LANES = 8, GROUPS = 8, BLOCK = LANES * GROUPS };
 
@@ -64,5 +67,16 @@ void papered_equations(
 double leave_residuals(window_t *window, const double *step, int parameters);
 double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules);
 void lag_products(const window_t *window, double y, double *out);
+
+/* edges.c */
+
+void fit_tag_edges(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
+    const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
+    const double *blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *out);
+double blur_of_tags(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t places, const uint8_t *cells, const double *steps,
+    const double *signs, int64_t count, const double *pixels, const double *surface, const double *single, const double *contrast,
+    int64_t apart, double blur, const tag_window_t *tag, const edge_rules_t *rules, float *scratch, double *found);
 
 #endif

@@ -64,76 +64,13 @@ def fit_corners(
     library.fit_edges(
         *image_arguments(image),
         len(pixels),
-        *(*known, np.ascontiguousarray(ends, np.bool_), rules, _scratch(rules), out),
+        *(*known, np.ascontiguousarray(ends, np.bool_), rules, scratch_of(rules), out),
     )
     return out
 
 
-def fit_tag_corners(
-    image: GreyImage,
-    cells: BoolArray,
-    steps: FloatArray,
-    signs: FloatArray,
-    pixels: FloatArray,
-    surface: FloatArray,
-    single: FloatArray,
-    contrast: FloatArray,
-    blur: FloatArray,
-    window: TagWindow,
-    rules: Rules,
-) -> FloatArray:
-    """Return the `OUTCOMES` of the N corners of a board of tags (R, C) that are at the `cells` (R, C), (N, 35).
-
-    Parameters
-    ----------
-    steps, signs : (R, C, 2, 2) and (R, C), as of `detection.tags.placing.TagBoard`.
-    pixels : (N, 2) where to start.
-    surface : (N, SURFACE_COLUMNS) how the board lies there, the rows of a `TagSurface`.
-    single, contrast, blur : (N, 2), (N,) and (N,), as of `detection.subpixel.edge_fit.fit_edges`.
-    """
-    out = np.empty((len(pixels), OUTCOMES))
-    blurs = np.ascontiguousarray(blur, np.float64)
-    corners = _tag_corners(image, cells, steps, signs, pixels, surface, single, contrast)
-    kernels().fit_tag_edges(*corners, blurs, window, rules, _scratch(rules), out)
-    return out
-
-
-def blur_of_tags(
-    image: GreyImage,
-    cells: BoolArray,
-    steps: FloatArray,
-    signs: FloatArray,
-    pixels: FloatArray,
-    surface: FloatArray,
-    single: FloatArray,
-    contrast: FloatArray,
-    apart: int,
-    blur: float,
-    window: TagWindow,
-    rules: Rules,
-) -> float:
-    """Return the median s of every `apart`-th of these corners, fitted from `blur`; NaN where none could be fitted.
-
-    Arguments else as of `fit_tag_corners`.
-    """
-    corners = _tag_corners(image, cells, steps, signs, pixels, surface, single, contrast)
-    found = np.empty(len(pixels) // apart + 1)
-    return float(kernels().blur_of_tags(*corners, apart, blur, window, rules, _scratch(rules), found))
-
-
-def _tag_corners(
-    image: GreyImage, cells: BoolArray, steps: FloatArray, signs: FloatArray, pixels: FloatArray, *known: FloatArray
-) -> tuple[object, ...]:
-    """Return the arguments that kernels of the corners of tags begin with."""
-    count = len(pixels)
-    if np.count_nonzero(cells) != count:
-        raise ValueError(f"{count} corners of tags for {np.count_nonzero(cells)} cells")
-    board = (np.ascontiguousarray(steps, np.float64).reshape(-1, 2, 2), np.ascontiguousarray(signs, np.float64).ravel())
-    corners = [np.ascontiguousarray(part, np.float64) for part in (pixels, *known)]
-    return (*image_arguments(image), cells.size, np.ascontiguousarray(cells).reshape(-1), *board, count, *corners)
-
-
-def _scratch(rules: Rules) -> NDArray[np.float32]:
+def scratch_of(rules: Rules) -> NDArray[np.float32]:
+    """Return the room that the windows of a fit take."""
     return np.empty(kernels().edges_scratch(rules), np.float32)
 
 

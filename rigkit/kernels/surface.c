@@ -83,7 +83,7 @@ void project_places(const double *places, int64_t count, const double *homograph
     }
 }
 
-double fit_perspective(const double *places, const double *pixels, int64_t count, double *out)
+FOR_EACH_PROCESSOR double fit_perspective(const double *places, const double *pixels, int64_t count, double *out)
 {
     double from[2], to[2], from_size, to_size, A[ENTRIES][ENTRIES] = {{0.0}}, own[ENTRIES];
     centred(places, count, from, &from_size);
@@ -187,6 +187,24 @@ FOR_EACH_PROCESSOR static void add_column(
     }
 }
 
+/* Set `columns` to the terms of a degree at all places; `powers` of x, then of y, hold those of the degrees before. */
+INLINE void terms_of_degree(
+    const double *places, int64_t count, const double unit[3], int64_t degree, double *powers, double *columns)
+{
+    double *px = powers + degree * count, *py = px + (SURFACE_DEGREE + 1) * count;
+    for (int64_t i = 0; i < count; i++) {
+        px[i] = degree > 0 ? px[i - count] * ((places[2 * i] - unit[0]) / unit[2]) : 1.0;
+        py[i] = degree > 0 ? py[i - count] * ((places[2 * i + 1] - unit[1]) / unit[2]) : 1.0;
+    }
+    for (int64_t j = 0; j <= degree; j++) {
+        const double *across = px - j * count, *down = py - (degree - j) * count;
+        double *column = columns + j * count;
+#pragma omp simd
+        for (int64_t i = 0; i < count; i++)
+            column[i] = across[i] * down[i];
+    }
+}
+
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
     const double *places, const double *values, int64_t count, int64_t terms, double most_leverage, double *basis, double *scratch, double *unit,
     double *triangle, double *told, double *misses, double *off, double *gain, double *scatter)
@@ -204,25 +222,19 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
         }
     }
     const double across = high[0] - low[0], down = high[1] - low[1], wide = 0.5 * (across > down ? across : down);
-    const double middle_x = 0.5 * (low[0] + high[0]), middle_y = 0.5 * (low[1] + high[1]), size = wide > 1e-9 ? wide : 1e-9;
-    unit[0] = middle_x;
-    unit[1] = middle_y;
-    unit[2] = size;
+    unit[0] = 0.5 * (low[0] + high[0]);
+    unit[1] = 0.5 * (low[1] + high[1]);
+    unit[2] = wide > 1e-9 ? wide : 1e-9;
     int64_t best = 0;
     for (int64_t degree = 0, k = 0; degree <= SURFACE_DEGREE; degree++) {
         misses[degree] = INFINITY;
         /* What a perspective leaves of a lens begins with degree 3; one that is the same all around has odd terms alone. */
         if (TERMS_TO(degree) > terms || degree > (best > 3 ? best + 2 : 5))
             continue;
-        for (int64_t i = 0; i < count; i++) {
-            double px[SURFACE_DEGREE + 1], py[SURFACE_DEGREE + 1];
-            powers_of((places[2 * i] - middle_x) / size, px);
-            powers_of((places[2 * i + 1] - middle_y) / size, py);
-            for (int64_t j = 0; j <= degree; j++)
-                basis[(k + j) * count + i] = px[degree - j] * py[j];
-        }
+        terms_of_degree(places, count, unit, degree, scratch + 5 * count, basis + k * count);
         for (; k < TERMS_TO(degree); k++)
             add_column(basis, count, terms, k, triangle, told, left, leverage);
+#pragma omp simd
         for (int64_t i = 0; i < count; i++) {
             const double rest = 1.0 - (leverage[i] < most_leverage ? leverage[i] : most_leverage);
             missed[i] = ranked_off[i] = sqrt(left[i] * left[i] + left[count + i] * left[count + i]) / rest;
@@ -232,6 +244,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             continue;
         best = degree;
         memcpy(off, missed, (size_t)count * sizeof(double));
+#pragma omp simd
         for (int64_t i = 0; i < count; i++) {
             const double own = leverage[i] < most_leverage ? leverage[i] : most_leverage;
             gain[i] = sqrt(own / (1.0 - own));
@@ -302,7 +315,7 @@ INLINE void line_shapes(double *row)
     }
 }
 
-void add_polynomial(
+FOR_EACH_PROCESSOR void add_polynomial(
     const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle, const double *told,
     const double *misses, int64_t surest, double *out)
 {

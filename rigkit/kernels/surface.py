@@ -13,8 +13,8 @@ from rigkit.kernels.calls import image_arguments
 from rigkit.kernels.declarations import header
 
 _CONSTANTS = header().constants
-SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS = (
-    _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS")
+SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS, FIT_SCRATCH = (
+    _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS", "FIT_SCRATCH")
 )
 SURFACE_DEGREE = _CONSTANTS["SURFACE_DEGREE"]
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
@@ -121,7 +121,7 @@ class _Room:
     def __init__(self, count: int, most: int) -> None:
         terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, most) - 1]
         self.sizes = (count, terms)
-        self.scratch = np.empty((terms, count)), np.empty((5, count))
+        self.scratch = np.empty((terms, count)), np.empty((FIT_SCRATCH, count))
         off, gain = np.empty((2, count))
         shape = (np.empty(3), np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1))
         self.results = (*shape, off, gain, np.empty(1))

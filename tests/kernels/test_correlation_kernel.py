@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference import correlation as reference
 
-from rigkit.detection.subpixel.correlation import _rules
+from rigkit.detection.subpixel.correlation import factor_rules
 from rigkit.kernels.edges import LAGS, sigma_factors
 
 ROUNDING = 1e-9
@@ -30,7 +30,7 @@ def test_factors_are_those_of_numpy(shared: float, rng: np.random.Generator) -> 
     blur, used, good = rng.uniform(0.2, 2.0, count), rng.uniform(30.0, 900.0, count), rng.random(count) < 0.9
     good[0] = True
     products[~good], pixels[~good], noise[~good] = np.nan, np.nan, np.nan
-    arguments = (products, pairs, noise, pixels, sides, blur, used, good, owner, boards, _rules(18.0))
+    arguments = (products, pairs, noise, pixels, sides, blur, used, good, owner, boards, factor_rules(18.0))
     ours, theirs = sigma_factors(*arguments), reference.sigma_factors(*arguments)
     assert theirs[4] == 1.0
     assert not shared or np.count_nonzero(theirs != 1.0) >= 3

@@ -58,7 +58,7 @@ def sigma_factors(
     radius_px : of the fit.
     """
     corners = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
-    return edges.sigma_factors(*corners, good, owner, boards, _rules(radius_px))
+    return edges.sigma_factors(*corners, good, owner, boards, factor_rules(radius_px))
 
 
 def uneven_factors(
@@ -94,7 +94,7 @@ def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bo
 
 
 @functools.cache
-def _rules(radius_px: float) -> edges.FactorRules:
+def factor_rules(radius_px: float) -> edges.FactorRules:
     return edges.FactorRules.of(
         light_share=LIGHT_SHARE,
         lost_error=LOST_ERROR,

@@ -12,15 +12,15 @@ small for that are fitted whole (`rigkit.detection.tags.whole`).
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from functools import partial
 
-import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, known_median, rows_where
+from rigkit.core.arrays import FloatArray, rows_where
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, BoardState, Guide
+from rigkit.detection.guided.board_guide import FITTED, MIN_GUIDE_CORNERS, BoardState, Guide
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.guided.guided import (
     MARGIN_PX,
@@ -30,18 +30,18 @@ from rigkit.detection.guided.guided import (
     MOVED_CELLS,
     SCATTER_FLOOR_PX,
 )
-from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.subpixel.correlation import sigma_factors
-from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
-from rigkit.detection.subpixel.edge_model import WINDOW_REACH
+from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.correlation import factor_rules
+from rigkit.detection.subpixel.edge_fit import edge_rules
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
-from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
+from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_FORETOLD_LIKENESS
 from rigkit.detection.tags.placing import TagBoard
-from rigkit.detection.tags.surface import SmoothMap, seen_surface
+from rigkit.detection.tags.surface import MAX_LEVERAGE, NEAREST_DEPTH, POINTS_A_TERM, SmoothMap, seen_surface
 from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
-from rigkit.kernels.edges import Rules, TagWindow, blur_of_tags, fit_tag_corners
-from rigkit.kernels.surface import TagSurface
+from rigkit.kernels.edges import TagWindow
+from rigkit.kernels.surface import HARDLY_MORE, TagSurface
+from rigkit.kernels.tag_board import CORNER_COLUMNS, TagBoardFit, TagCornerRules
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 MIN_TAG_CORNERS = 4
@@ -59,16 +59,9 @@ WIDE_BLUR = 0.15
 MAX_TAG_ROUNDS = 12
 """Rounds in which missing corners are added, each foretold by those of the one before."""
 
-TagCorners = tuple[GreyImage, BoolArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-"""The first arguments of `kernels.edges.fit_tag_corners`."""
-
 NOTHING_NEAR_PX, MIN_EDGE_CONTRAST = 1e4, 10.0
 """Of tags that stand alone no neighbouring lines are reckoned with; and grey levels between ink and paper that the fit
 starts from at least."""
-
-AROUND_NEW = np.ones((5, 5), np.uint8)
-"""A corner that was not seen where it was foretold is sought again when one so near is found: of its tag, or of one
-beside it."""
 
 FEW_CORNERS = 12
 """Corners that say how blurred the image is, to a few hundredths."""
@@ -92,267 +85,141 @@ def tag_corners(image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Ca
 
     Corners that the rough ones foretell, or a calibrated `camera`, are added where they are seen.
     """
-    fitter = _Fitter(image, tags, camera)
-    state = fitter.first(pixels)
-    if np.count_nonzero(state.known) < MIN_TAG_CORNERS:
+    fitter = _Fitter(image, tags, pixels, camera)
+    fitter.first()
+    if fitter.count < MIN_TAG_CORNERS:
         return None
     # What the lattice lacks is added before corners are fitted again; what only finer ones foretell, after that.
-    state = fitter.completed(fitter.again(state))
-    state = fitter.without_outliers(state)
-    row, column = np.nonzero(state.known)
-    if len(row) < MIN_TAG_CORNERS:
+    fitter.again()
+    fitter.completed()
+    fitter.without_outliers()
+    if fitter.count < MIN_TAG_CORNERS:
         return None
-    state, factor = fitter.last(state)
+    state, factor = fitter.last()
     row, column = np.nonzero(state.known)
-    board = tags.board
     grid = np.stack([column, row], axis=-1)
     return BoardDetection(
-        board.board_id, *board.size, grid, state.pixels[row, column], factor * state.sigma_px[row, column]
+        tags.board.board_id, *tags.board.size, grid, state.pixels[row, column], factor * state.sigma_px[row, column]
     )
 
 
 @functools.cache
-def _window(border: float) -> TagWindow:
-    return TagWindow.of(border=border, blurs=MARKER_BLURS, nothing_near=NOTHING_NEAR_PX)
+def _rules(border: float, mirrored: bool, rounded: bool) -> TagCornerRules:
+    """Return the rules of the fit; `border` in sides of a tag, else as of `edge_rules`."""
+    return TagCornerRules.of(
+        first=edge_rules(*FIRST_PASS, False, rounded),
+        last=edge_rules(*LAST_PASS, mirrored, rounded),
+        rough=edge_rules(*LAST_PASS, False, rounded),
+        window=TagWindow.of(border=border, blurs=MARKER_BLURS, nothing_near=NOTHING_NEAR_PX),
+        points_a_term=POINTS_A_TERM,
+        most_leverage=MAX_LEVERAGE,
+        nearest_depth=NEAREST_DEPTH,
+        hardly_more=HARDLY_MORE,
+        median_of_rayleigh=MEDIAN_OF_RAYLEIGH,
+        first_blur=FIRST_BLUR,
+        few_corners=FEW_CORNERS,
+        least_contrast=MIN_EDGE_CONTRAST,
+        rough_px=ROUGH_PX,
+        better_known=BETTER_KNOWN,
+        bent_sigmas=BENT_SIGMAS,
+        wide_blur=WIDE_BLUR,
+        most_gain=MAX_PREDICTED_GAIN,
+        margin_px=MARGIN_PX,
+        moved_cells=MOVED_CELLS,
+        added_contrast=MIN_ADDED_CONTRAST,
+        added_residual=MAX_ADDED_RESIDUAL_MARKED,
+        most_sigma_cells=MAX_SIGMA_CELLS,
+        narrow_blurs=NARROW_BLURS,
+        code_contrast=MIN_CODE_CONTRAST,
+        likeness=MIN_FORETOLD_LIKENESS,
+        scatter_floor=SCATTER_FLOOR_PX,
+        outlier=TAG_OUTLIER,
+        judging_gain=JUDGING_GAIN,
+        displaced_cells=DISPLACED_CELLS,
+        fewest_foretelling=MIN_FORETELLING_CORNERS,
+        fewest_guiding=MIN_GUIDE_CORNERS,
+    )
 
 
 class _Fitter:
-    """The fit of one board's corners in one image."""
+    """The fit of one board's corners in one image, from the rough `pixels` (R, C, 2)."""
 
-    def __init__(self, image: GreyImage, tags: TagBoard, camera: Camera | None) -> None:
+    def __init__(self, image: GreyImage, tags: TagBoard, pixels: FloatArray, camera: Camera | None) -> None:
         self.image, self.tags, self.camera = image, tags, camera
-        self.places, self.steps, self.signs = tags.places, tags.steps, tags.signs
-        self.reach = np.minimum(0.5 * np.maximum(self.steps[..., 0], self.steps[..., 1]), WINDOW_REACH)
-        self.window = _window(tags.pattern.border / tags.codes.modules)
-        self._mapped: tuple[BoardState, SmoothMap] | None = None
-        self._fitted: tuple[EdgeFit, FloatArray, float] | None = None
-        self._vain, self._waiting = np.zeros((2, *self.signs.shape), np.bool_)
-        self.curvature = np.full(self.places.shape, np.nan)
+        joined = tags.pattern.corner_squares
+        rules = _rules(tags.pattern.border / tags.codes.modules, joined, image.dtype == np.uint8)
+        self.fit = TagBoardFit(image, tags.told, rules, pixels)
+        # A camera's map is that of one state; what the corners tell alone needs nobody between the rounds.
+        self.rounds = MAX_TAG_ROUNDS if camera is None else 1
+
+    @property
+    def state(self) -> BoardState:
+        values = self.fit.corners.T.reshape(CORNER_COLUMNS, *self.tags.signs.shape)
+        return BoardState(np.moveaxis(values[:2], 0, 2), *values[2:], signs=self.tags.signs)
+
+    @property
+    def count(self) -> int:
+        """How many corners are known."""
+        return int(np.count_nonzero(~np.isnan(self.fit.corners[:, 0])))
+
+    def base(self, state: BoardState) -> Callable[[FloatArray], TagSurface] | None:
+        """Return the map that the camera has of the board whose corners are known so far."""
+        if self.camera is None or np.count_nonzero(state.known) < MIN_GUIDE_CORNERS:
+            return None
+        pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
+        return None if pose is None else partial(seen_surface, self.camera, pose, np.array(self.tags.board.squares_mm))
+
+    def guide(self) -> None:
+        """Tell the fit the camera's map, if there is one and the state is not the one of before."""
+        if self.camera is not None and not self.fit.mapped:
+            base = self.base(self.state)
+            self.fit.set_base(None if base is None else base(self.tags.places.reshape(-1, 2)).rows)
 
     def map_of(self, state: BoardState) -> SmoothMap:
-        """Return the map through the known corners; that of the last state asked for is kept."""
-        if self._mapped is None or self._mapped[0] is not state:
-            base = None
-            if self.camera is not None and np.count_nonzero(state.known) >= MIN_GUIDE_CORNERS:
-                pose = Guide.of(self.tags.board, self.camera, state).cam_from_board
-                if pose is not None:
-                    base = partial(seen_surface, self.camera, pose, np.array(self.tags.board.squares_mm))
-            known = state.known
-            self._mapped = state, SmoothMap(rows_where(self.places, known), rows_where(state.pixels, known), base)
-        return self._mapped[1]
+        """Return the map through the known corners of a state."""
+        known = state.known
+        return SmoothMap(rows_where(self.tags.places, known), rows_where(state.pixels, known), self.base(state))
 
-    def fit(
-        self,
-        cells: BoolArray,
-        surface: TagSurface,
-        start: FloatArray,
-        blur: FloatArray | float,
-        stage: tuple[float, int, float],
-        *,
-        mirrored: bool = True,
-    ) -> EdgeFit:
-        """Fit the edge model at the `cells`; arguments else as of `fit_edges`."""
-        self.curvature.reshape(-1, 2)[cells.reshape(-1).nonzero()[0]] = surface.curvature
-        fitted = fit_tag_corners(
-            *self._corners(cells, surface, start), np.full(len(start), blur), self.window, self._rules(stage, mirrored)
-        )
-        return EdgeFit.of_outcomes(fitted)
+    def first(self) -> None:
+        """Fit the rough corners, leave out those that fail, and add those missing that they foretell."""
+        self.guide()
+        self.fit.fit_all()
+        if self.fit.add(1, by_this_map=True):
+            self.completed()
 
-    def _rules(self, stage: tuple[float, int, float], mirrored: bool) -> Rules:
-        return edge_rules(*stage, mirrored and self.tags.pattern.corner_squares, self.image.dtype == np.uint8)
-
-    def _corners(self, cells: BoolArray, surface: TagSurface, start: FloatArray) -> TagCorners:
-        """Return what `kernels.edges.fit_tag_corners` is told of the corners at `cells`."""
-        if self.tags.pattern.corner_squares:
-            single, contrast = np.zeros((len(start), 2)), np.full(len(start), np.nan)
-        else:
-            row, column = (np.where(part % 2 == 0, 1.0, -1.0) for part in np.nonzero(cells))
-            # Line 1 runs along the row; +90 degrees from it are down, and from line 2 to the left.
-            single = np.stack([row, -column], axis=1)
-            contrast = self._contrast(np.stack([column, row], axis=1), surface, start)
-        return self.image, cells, self.steps, self.signs, start, surface.rows, single, contrast
-
-    def _contrast(self, inside: FloatArray, surface: TagSurface, start: FloatArray) -> FloatArray:
-        """Return the contrast (M,) of the corners of lone tags that lie on the sides `inside` (M, 2) of them, +1 or -1
-        along the columns and rows."""
-        pattern = self.tags.pattern
-        inwards = (inside[:, None] @ surface.sides)[:, 0]
-        ink = start + 0.5 * pattern.border / self.tags.codes.modules * inwards
-        paper = start - 0.25 * pattern.spacing * inwards
-        return np.asarray(0.5 * np.maximum(sample(self.image, paper) - sample(self.image, ink), MIN_EDGE_CONTRAST))
-
-    def first(self, pixels: FloatArray) -> BoardState:
-        """Return the rough corners fitted, those that failed left out, and those missing that they foretell."""
-        rough = BoardState.unfitted(pixels, np.full(pixels.shape[:2], np.nan))
-        state = self.fitted(rough, None)
-        more = self.added(state, self.map_of(rough))
-        return state if more is None else self.completed(more)
-
-    def _blur(self, cells: BoolArray, surface: TagSurface, pixels: FloatArray) -> float:
-        """Return s of corners at `cells`, roughly at `pixels` (M, 2), by a quick fit of a few of them."""
-        apart = max(len(pixels) // FEW_CORNERS, 1)
-        corners = self._corners(cells, surface, pixels)
-        blur = blur_of_tags(*corners, apart, FIRST_BLUR, self.window, self._rules(FIRST_PASS, False))
-        return blur if np.isfinite(blur) else FIRST_BLUR
-
-    def completed(self, state: BoardState) -> BoardState:
-        """Return the state with the missing corners that are seen, each round of them foretold by those before."""
-        for _ in range(MAX_TAG_ROUNDS):
-            more = self.added(state)
-            if more is None:
+    def completed(self) -> None:
+        """Add the missing corners that are seen, each round of them foretold by those before."""
+        for _ in range(0, MAX_TAG_ROUNDS, self.rounds):
+            self.guide()
+            if not self.fit.add(self.rounds):
                 break
-            state = more
-        return state
 
-    def fitted(self, state: BoardState, blur: float | None) -> BoardState:
-        """Return the state with all its corners fitted, with lines that bend as they have it themselves, without those
-        that failed; the fit is kept. Where `blur` is not known, a quick fit tells it."""
-        cells = state.known
-        smooth = self.map_of(state)
-        surface = smooth.at(rows_where(self.places, cells))
-        seen = surface.seen
-        if not seen.all():
-            cells[cells] = seen
-            surface = surface.of(seen)
-        start = rows_where(state.pixels, cells)
-        blur = self._blur(cells, surface, start) if blur is None else blur
-        fit = self.fit(cells, surface, start, blur, LAST_PASS)
-        self._fitted = fit, surface.sides, smooth.scatter()
-        self._vain[:] = self._waiting[:] = False
-        return state.fitted_anew(cells, fit, fit.valid & (fit.contrast > 0.0))
+    def again(self) -> None:
+        """Fit those corners again whose lines bend otherwise than when they were fitted, if that is known better
+        now."""
+        self.guide()
+        self.fit.fit_bent()
 
-    def again(self, state: BoardState) -> BoardState:
-        """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted, if
-        that is known better now."""
-        assert self._fitted is not None
-        smooth, before = self.map_of(state), self._fitted[2]
-        scatter = smooth.scatter()
-        if scatter > BETTER_KNOWN * before:
-            return state
-        self._vain[:] = self._waiting[:] = False
-        cells = state.known
-        surface = smooth.at(rows_where(self.places, cells))
-        half = np.minimum(rows_where(self.reach, cells) * surface.lengths, LAST_PASS[0])
-        # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
-        bends = np.abs(surface.curvature - rows_where(self.curvature, cells))
-        # Of two columns; max(axis=1) takes ten times as long.
-        off = np.maximum(bends[:, 0], bends[:, 1]) * np.maximum(half[:, 0], half[:, 1]) ** 2 / 6.0
-        bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
-        if not bent.any():
-            return state
-        blur = known_median(state.blur)
-        if 2 * np.count_nonzero(bent) > len(bent):
-            return self.fitted(state, blur)
-        cells[cells] = bent
-        fit = self.fit(cells, surface.of(bent), rows_where(state.pixels, cells), blur, LAST_PASS)
-        return state.without(cells).with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
+    def without_outliers(self) -> None:
+        """Leave out corners that lie where those around them cannot have them."""
+        for _ in range(0, MAX_TAG_ROUNDS, self.rounds):
+            self.guide()
+            if not self.fit.drop(self.rounds):
+                break
 
-    def added(self, state: BoardState, smooth: SmoothMap | None = None) -> BoardState | None:
-        """Return the state with those missing corners that can be added now, None where there are none; `smooth`
-        foretells them, by default the state's own map."""
-        missing = ~(state.known | self._vain | self._waiting)
-        if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
-            return None
-        smooth = smooth or self.map_of(state)
-        surface = smooth.beyond(rows_where(self.places, missing))
-        height, width = self.image.shape
-        u, v = surface.pixels.T
-        usable = (surface.gain < MAX_PREDICTED_GAIN) & (u > MARGIN_PX) & (u < width - 1.0 - MARGIN_PX)
-        usable &= (v > MARGIN_PX) & (v < height - 1.0 - MARGIN_PX)
-        if not usable.any():
-            return None
-        cells = missing.copy()
-        cells[missing] = usable
-        surface = surface.of(usable)
-        blur = known_median(state.blur)
-        start = surface.pixels
-        if (smooth.scatter() * surface.gain > blur).any():
-            wide = np.maximum(blur, WIDE_BLUR * self.tags.pattern.spacing * surface.height)
-            rough = self.fit(cells, surface, start, wide, LAST_PASS, mirrored=False)
-            start = np.where(rough.valid[:, None], rough.pixels, start)
-        fit = self.fit(cells, surface, start, blur, LAST_PASS)
-        good = self._there(state, cells, surface, fit, blur)
-        more = state.with_fit(cells, fit, good)
-        # What was foretold as well as corners are known is not there; other corners may be foretold by those new.
-        self._vain[cells], self._waiting[cells] = surface.gain <= 1.0, True
-        if not good.any():
-            return None
-        self._waiting &= cv2.dilate((more.known & ~state.known).astype(np.uint8), AROUND_NEW) == 0
-        return more
-
-    def _there(self, state: BoardState, cells: BoolArray, surface: TagSurface, fit: EdgeFit, blur: float) -> BoolArray:
-        """Return which corners (M,) fitted at the missing `cells` are those that the state's foretell by `surface`."""
-        gap = self.tags.pattern.spacing * surface.height
-        moved = np.hypot(*(fit.pixels - surface.pixels).T)
-        contrast, residual = known_median(state.contrast), known_median(state.residual)
-        seen = fit.valid & (moved < np.maximum(MOVED_CELLS, MOVED_CELLS * surface.gain) * gap)
-        seen &= fit.contrast > MIN_ADDED_CONTRAST * contrast
-        clean = fit.residual < MAX_ADDED_RESIDUAL_MARKED * residual * np.maximum(1.0, fit.contrast / contrast)
-        clean &= fit.sigma_px < MAX_SIGMA_CELLS * gap
-        # The code is in the windows of narrow borders, but says itself that the tag is there.
-        coded = seen & ~clean & (self.borders(surface) < NARROW_BLURS * blur)
-        if coded.any():
-            pixels = state.pixels.copy()
-            pixels[cells] = np.where(seen[:, None], fit.pixels, surface.pixels)
-            coded &= self.read(pixels)[cells]
-        return np.asarray(seen & (clean | coded))
-
-    def borders(self, surface: TagSurface) -> FloatArray:
-        """Return how wide the borders of tags are at places of the map, (M,) px."""
-        return np.asarray(self.tags.pattern.border / self.tags.codes.modules * surface.height)
-
-    def read(self, pixels: FloatArray) -> BoolArray:
-        """Return the corners (R, C) of tags whose codes are read in their places, by all corners (R, C, 2)."""
-        quads = np.stack([pixels[::2, ::2], pixels[::2, 1::2], pixels[1::2, 1::2], pixels[1::2, ::2]], axis=2)
-        whole = np.asarray(np.isfinite(quads).all(axis=(2, 3)))
-        tags = read_tags(self.image, quads[whole], self.tags.codes)
-        own = (tags.number == self.tags.numbers[whole]) & (tags.turns == 0)
-        whole[whole] = own & (tags.likeness >= MIN_FORETOLD_LIKENESS)
-        return whole.repeat(2, axis=0).repeat(2, axis=1)
-
-    def without_outliers(self, state: BoardState) -> BoardState:
-        """Return the state without corners that lie where those around them cannot have them."""
-        for _ in range(MAX_TAG_ROUNDS):
-            cells = state.known
-            if np.count_nonzero(cells) < MIN_GUIDE_CORNERS:
-                return state
-            smooth = self.map_of(state)
-            off, gain = smooth.left_out()
-            off = np.nan_to_num(off) / gain
-            usual = max(known_median(off), SCATTER_FLOOR_PX)
-            usual_sigma = known_median(state.sigma_px[cells])
-            sigma = np.minimum(state.sigma_px[cells], 3.0 * usual_sigma)
-            allowed = TAG_OUTLIER * np.hypot(usual, sigma)
-            if not ((gain < JUDGING_GAIN) & (off > allowed)).any():
-                return state
-            gap = self.tags.pattern.spacing * smooth.at(rows_where(self.places, cells)).height
-            excess = np.where(gain < JUDGING_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
-            # Those that contradict the most go first: they may be all that speaks against their neighbours.
-            worst = excess > max(1.0, 0.5 * float(excess.max()))
-            if not worst.any():
-                return state
-            drop = cells.copy()
-            drop[cells] = worst
-            state = state.without(drop)
-        return state
-
-    def last(self, state: BoardState) -> tuple[BoardState, float]:
+    def last(self) -> tuple[BoardState, float]:
         """Return the corners as they finally are, and the factor of their sigmas."""
-        assert self._fitted is not None
-        fit, sides, _ = self._fitted
-        owner, factor = np.zeros(len(sides), np.int64), 1.0
-        if self.tags.pattern.corner_squares:
-            good = fit.valid & (fit.contrast > 0.0)
-            factor = float(sigma_factors(fit, good, sides, owner, 1, LAST_PASS[0])[0])
+        joined = self.tags.pattern.corner_squares
+        factor = self.fit.sigma_factor(factor_rules(LAST_PASS[0])) if joined else 1.0
+        state = self.state
         for rules in WHOLE_ROUNDS:
-            whole = with_whole_tags(self.image, self.tags, self.places, state, self.map_of(state), rules)
+            whole = with_whole_tags(self.image, self.tags, self.tags.places, state, partial(self.map_of, state), rules)
             if whole is state:
                 break
             state = whole
-        cells = state.known
-        if np.count_nonzero(cells) >= MIN_GUIDE_CORNERS:
-            off, gain = self.map_of(state).left_out()
-            expected = factor * state.sigma_px[cells] * np.hypot(1.0, gain)
-            scatter = known_median(off / expected) / MEDIAN_OF_RAYLEIGH
+            self.fit.put(*(getattr(state, name) for name in FITTED))
+        if self.count >= MIN_GUIDE_CORNERS:
+            self.guide()
+            scatter = self.fit.scatter(factor) / MEDIAN_OF_RAYLEIGH
             factor *= scatter if scatter > UNEXPLAINED else 1.0
         return state, factor

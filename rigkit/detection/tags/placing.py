@@ -16,6 +16,7 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.tags.codes import Codes, excess_likeness, read_tags
+from rigkit.kernels.tag_board import TagsOfBoard, squares_of_lattice, vote_place
 
 MIN_BITS = 30
 """Bits, in all agreeing tags together, that say where a lattice lies: one tag of 36, two of 25 or 16."""
@@ -35,10 +36,6 @@ MIN_TAGS_OF_PLACE = 4
 """Fewer tags are read one by one, or not at all."""
 
 
-CORNERS_OF_SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-"""(column, row) of the corners of a square from its first, in the order of growing angle from u to v."""
-
-
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class TagBoard:
     """A board of tags and what is needed to read it and to place its corners (R, C).
@@ -50,6 +47,7 @@ class TagBoard:
     places : (R, C, 2) of its corners, in sides of a tag.
     steps : (R, C, 2, 2) how far it is to the corners above and below, right and left, within the tag or across the gap.
     signs : (R, C) +1 where brightness grows with the angle across the line along the row, else -1.
+    told : the same as kernels take it.
     """
 
     board: Board
@@ -60,6 +58,7 @@ class TagBoard:
     places: FloatArray
     steps: FloatArray
     signs: FloatArray
+    told: TagsOfBoard
 
     @staticmethod
     def of(board: Board) -> TagBoard:
@@ -78,15 +77,36 @@ def _tag_board(board: Board) -> TagBoard:
     inwards = np.array([pattern.spacing, 1.0])
     right, below = inwards[1 - odd[..., 0]], inwards[1 - odd[..., 1]]
     left, above = inwards[odd[..., 0]], inwards[odd[..., 1]]
+    codes = Codes.of(pattern, numbers.ravel())
+    places = pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2)
+    steps = np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2)
+    signs = np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0)
     return TagBoard(
         board=board,
         pattern=pattern,
         numbers=numbers,
         firsts=firsts,
-        codes=Codes.of(pattern, numbers.ravel()),
-        places=pattern.positions(grid.astype(np.float64)).reshape(board.rows, board.columns, 2),
-        steps=np.stack([np.stack([above, below], axis=-1), np.stack([right, left], axis=-1)], axis=2),
-        signs=np.where(odd[..., 0] ^ odd[..., 1], 1.0, -1.0),
+        codes=codes,
+        places=places,
+        steps=steps,
+        signs=signs,
+        told=TagsOfBoard.of(
+            places=places.reshape(-1, 2),
+            steps=steps.reshape(-1, 2, 2),
+            signs=signs.ravel(),
+            numbers=numbers.ravel(),
+            patterns=codes.patterns,
+            code_numbers=codes.numbers,
+            code_turns=codes.turns,
+            rows=board.rows,
+            columns=board.columns,
+            count=signs.size,
+            codes=len(codes.patterns),
+            modules=codes.modules,
+            joined=pattern.corner_squares,
+            spacing=pattern.spacing,
+            border=pattern.border / codes.modules,
+        ),
     )
 
 
@@ -187,13 +207,8 @@ def _place_together(
 def squares_of(lattice: Lattice, *, dark: bool) -> tuple[FloatArray, IntArray]:
     """Return the dark or the bright squares of a lattice: corners (N, 4, 2) in order of growing angle from u to v, and
     the (column, row) of their first corners (N, 2)."""
-    known, corners = lattice.known, lattice.pixels
     # Brightness falls with the angle across the edge from a dark square's first corner along the row.
-    row, column = np.nonzero(known[:-1, :-1] & known[:-1, 1:] & known[1:, 1:] & known[1:, :-1])
-    dark_ones = (row + column) % 2 == (1 if lattice.rising else 0)
-    row, column = row[dark_ones == dark], column[dark_ones == dark]
-    quads = corners[row[:, None] + CORNERS_OF_SQUARE[:, 1], column[:, None] + CORNERS_OF_SQUARE[:, 0]]
-    return quads, np.stack([column, row], axis=-1)
+    return squares_of_lattice(lattice.pixels, dark == lattice.rising)
 
 
 def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntArray) -> tuple[int, int, IntArray]:
@@ -202,18 +217,4 @@ def voted_place(lattice: Lattice, cells: IntArray, turns: IntArray, places: IntA
     The tags lie in the squares `cells` (N, 2) of the lattice, turned by `turns` (N,) quarter turns against it, and in
     those `places` (N, 2) of the board.
     """
-    columns, rows = lattice.size
-    # A tag that stands upright in the lattice turned back stands on the board.
-    back = -turns % 4
-    turned, square = cells, (columns - 1, rows - 1)
-    for turn in set(back.tolist()):
-        turned = np.where((back == turn)[:, None], grid_turned(cells, square, turn), turned)
-    shift = places - turned
-    # Numbered, to be counted.
-    low = shift.min(axis=0)
-    width, height = (shift.max(axis=0) - low + 1).tolist()
-    seats = (back * width + shift[:, 0] - low[0]) * height + shift[:, 1] - low[1]
-    votes = np.bincount(seats)
-    most = int(votes.argmax())
-    first = int((seats == most).argmax())
-    return int(votes[most]), int(back[first]), shift[first]
+    return vote_place(cells, turns, places, lattice.size)

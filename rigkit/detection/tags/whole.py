@@ -8,6 +8,7 @@ told by the corners of the other tags.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +30,7 @@ from rigkit.detection.subpixel.edge_model import PIXEL_KURTOSIS, SHARP_BLUR_PX
 from rigkit.detection.subpixel.subpixel import LAST_PASS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import SmoothMap
+from rigkit.kernels.tag_board import tag_heights
 from rigkit.kernels.tags import TagRules, fit_tags
 
 NARROW_BLURS = 2.0 * MARKER_BLURS
@@ -78,26 +80,27 @@ MAP_NODES = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 5)] * 2), axis=-1).resh
 
 
 def with_whole_tags(
-    image: GreyImage, tags: TagBoard, places: FloatArray, state: BoardState, smooth: SmoothMap, rules: TagRules
+    image: GreyImage,
+    tags: TagBoard,
+    places: FloatArray,
+    state: BoardState,
+    map_of_state: Callable[[], SmoothMap],
+    rules: TagRules,
 ) -> BoardState:
     """Return the state with the corners of tags of narrow borders as the whole tags have them.
 
-    `places` (R, C, 2) of the corners, in sides of a tag; `smooth` is the map through the corners of the state.
+    `places` (R, C, 2) of the corners, in sides of a tag; `map_of_state` makes the map through the corners of the state.
     """
-    known = state.known
-    left, right = known[:, ::2], known[:, 1::2]
-    row, column = (2 * part for part in np.nonzero(left[::2] & right[::2] & left[1::2] & right[1::2]))
-    mine = row[:, None] + TAG_CORNERS[:, 1], column[:, None] + TAG_CORNERS[:, 0]
-    corners = state.pixels[mine]
-    along, down = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    longer = np.maximum(np.hypot(along[:, 0], along[:, 1]), np.hypot(down[:, 0], down[:, 1]))
-    height = np.abs(along[:, 0] * down[:, 1] - along[:, 1] * down[:, 0]) / longer
+    longer, height = tag_heights(state.pixels)
     # What single corners have for blur is not to be relied on where the code is in their windows.
-    blur = known_median(state.blur) if len(row) else np.nan
+    blur = known_median(state.blur)
     narrow = tags.pattern.border / tags.codes.modules * height < NARROW_BLURS * blur
     if not narrow.any():
         return state
-    row, column, corners, mine = row[narrow], column[narrow], corners[narrow], (mine[0][narrow], mine[1][narrow])
+    row, column = (2 * part for part in np.nonzero(narrow))
+    mine = row[:, None] + TAG_CORNERS[:, 1], column[:, None] + TAG_CORNERS[:, 0]
+    corners = state.pixels[mine]
+    smooth = map_of_state()
     maps, centres, scales = _maps(places[row, column], corners, smooth)
     ink, breaks = _ink(tags)
     step = 1.0 if tags.pattern.corner_squares else PAPER_STEP
