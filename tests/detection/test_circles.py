@@ -170,6 +170,19 @@ def test_of_two_boards_that_the_image_cannot_tell_apart_none_is_named(pattern: C
     assert [item.board_id for item in detect_boards(image, [small, large])] == ["of 7"]
 
 
+@pytest.mark.parametrize("board", [REGULAR, HEXAGONAL], ids=lambda board: board.board_id)
+def test_edges_that_too_much_light_leaves_without_blur_are_edges(board: Board) -> None:
+    """Paper that is cut off at white takes the upper half of every edge along: what is left is a step from pixel to
+    pixel, sharper than any lens makes."""
+    scene = one_board(np.random.default_rng(1), board=board, size_px=(800, 600))
+    image = scene.render(optics=Optics(0.4), photometry=NOISY, rng=np.random.default_rng(1))
+    white = float(np.quantile(image, 0.9))
+    lit = np.clip(2.0 * 255.0 / white * image.astype(np.float64), 0.0, 255.0).astype(np.uint8)
+    (found,) = detect_boards(lit, [board])
+    assert found.board_id == board.board_id
+    assert len(found.grid) == board.rows * board.columns
+
+
 def test_circles_that_something_covers_are_left_out() -> None:
     rng = np.random.default_rng(3)
     scene = one_board(rng, lens="regular", board=HEXAGONAL)

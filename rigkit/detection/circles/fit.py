@@ -106,7 +106,7 @@ def fit_circles(
     )
     covariance = rows[:, [6, 7, 7, 8]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None]
     covariance = covariance + MODEL_SIGMA_PX**2 * np.eye(2)
-    valid = (rows[:, 14] > 0.5) & (rows[:, 9] > RULES.least_blur) & np.isfinite(rows).all(axis=1)
+    valid = (rows[:, 14] > 0.5) & np.isfinite(rows).all(axis=1)
     return CircleFit(
         pixels=rows[:, :2],
         maps=found,
