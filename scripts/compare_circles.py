@@ -1,7 +1,11 @@
 """Circle grids beside OpenCV: images found, and the error of cv2.calibrateCamera from either's centres.
 
     python scripts/compare_circles.py --board circles.toml IMAGE...     real images
+    python scripts/compare_circles.py --board circles.toml --worse IMAGE...
     python scripts/compare_circles.py                                   rendered ones, with the errors of the centres
+
+With `--worse` real images are made worse in many ways: whole grids found, those that are none, and by how much centres
+then lie off where they are in the image as it is, rms along an axis, and of rigkit's in the sigmas that it states.
 
 Rendered ones stand beside the Cramer-Rao bound of each circle; then boards 60 degrees off the axis of a fisheye and 60
 degrees slanted, without noise: by how much centres are off in the mean, and at most, along any direction of the image.
@@ -11,7 +15,9 @@ OpenCV is told the size, as rigkit is. It knows no hexagonal grids.
 from __future__ import annotations
 
 import argparse
+import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -19,8 +25,9 @@ import numpy as np
 from detection_bench.circle_bound import circle_information
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import LENSES, BenchScene, bench_camera, bench_field_deg, one_board
+from detectors.degradations import degraded
 
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, in_8_bits
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
@@ -36,19 +43,35 @@ from rigkit.synthetic.scene import PlacedBoard
 BLUR_PX, NOISE_LEVELS = 0.7, 2.0
 OBLIQUE_DEG, SLANTED_SIZE_PX, DISTANCE_SQUARES = 60.0, (1280, 960), 9.0
 FLAGS = {"regular": cv2.CALIB_CB_SYMMETRIC_GRID, "asymmetric": cv2.CALIB_CB_ASYMMETRIC_GRID}
+WORSE = (
+    *(("blur", px) for px in (1.0, 2.0, 3.0, 4.0)),
+    *(("motion", px) for px in (5.0, 10.0)),
+    *(("noise", levels) for levels in (5.0, 15.0)),
+    ("jpeg", 10.0),
+    ("glare", 200.0),
+    ("vignetting", 0.1),
+    *(("run over", px) for px in (1.0, 2.0, -1.0, -2.0)),
+    *(("overexposed", times) for times in (1.5, 2.5)),
+)
+SAME_PX = 5.0
+"""A grid whose centres lie further than this from those of the right one, in the median, is another: no degradation
+moves them so far, and circles lie further apart."""
 RENDERED = (
     Board("regular", 10, 8, 25.0, 25.0, pattern=Circles(diameter_mm=15.0)),
     Board("asymmetric", 4, 11, 40.0, 40.0, pattern=Circles("asymmetric", diameter_mm=16.0)),
 )
 
 
-def by_rigkit(image: np.ndarray, board: Board) -> FloatArray | None:
-    """Return the centres (N, 2) of the whole board, row by row, or None."""
+Seen = tuple[FloatArray, FloatArray | None]
+"""The centres (N, 2) of a whole board, row by row, and their sigmas (N,) where they are stated."""
+
+
+def by_rigkit(image: np.ndarray, board: Board) -> Seen | None:
     found = [item for item in detect_boards(image, [board]) if item.board_id == board.board_id and item.complete]
-    return found[0].pixels if found else None
+    return (found[0].pixels, found[0].sigma_px) if found else None
 
 
-def by_opencv(image: np.ndarray, board: Board) -> FloatArray | None:
+def by_opencv(image: np.ndarray, board: Board) -> Seen | None:
     pattern = board.pattern
     if not isinstance(pattern, Circles) or pattern.layout not in FLAGS:
         return None
@@ -57,7 +80,7 @@ def by_opencv(image: np.ndarray, board: Board) -> FloatArray | None:
     for extra in (0, cv2.CALIB_CB_CLUSTERING):
         known, centres = cv2.findCirclesGrid(dark, board.size, flags=FLAGS[pattern.layout] | extra)
         if known:
-            return np.asarray(centres, np.float64).reshape(-1, 2)
+            return np.asarray(centres, np.float64).reshape(-1, 2), None
     return None
 
 
@@ -79,13 +102,70 @@ def compare_real(paths: Sequence[Path], board: Board) -> None:
     for name, centres in found.items():
         count = sum(part is not None for part in centres)
         line = f"{name:7s} {count} of {len(images)} images"
-        chosen = [part for part in centres if part is not None]
+        chosen = [part[0] for part in centres if part is not None]
         if len(chosen) >= 3:
             line += f", calibrateCamera {reprojection_rms_px(chosen, board, size_px):.4f} px from all of them"
-        shared = [part for k in common if (part := centres[k]) is not None]
+        shared = [part[0] for k in common if (part := centres[k]) is not None]
         if len(shared) >= 3:
             line += f", {reprojection_rms_px(shared, board, size_px):.4f} px from the {len(common)} of both"
         print(line)
+
+
+@dataclass
+class Worse:
+    """What a detector makes of images that were made worse: whole grids, those that lie elsewhere, and by how much (N,)
+    the centres of the others moved."""
+
+    whole: int = 0
+    wrong: int = 0
+    moved: list[FloatArray] = field(default_factory=list)
+    in_sigmas: list[FloatArray] = field(default_factory=list)
+
+    def add(self, found: Seen | None, as_it_was: Seen | None, place: FloatArray) -> None:
+        """Count what was `found` of a grid at `place` (N, 2), where the same detector saw it in the image as it was."""
+        if found is None:
+            return
+        centres, sigma_px = found
+        if np.median(nearest_px(centres, place)) > SAME_PX:
+            self.wrong += 1
+            return
+        self.whole += 1
+        if as_it_was is not None:
+            off = nearest_px(centres, as_it_was[0])
+            self.moved.append(off)
+            self.in_sigmas += [] if sigma_px is None else [off / sigma_px]
+
+    def words(self) -> str:
+        wrong = f" ({self.wrong} wrong)" if self.wrong else ""
+        if not self.moved:
+            return f"{self.whole}{wrong}"
+        rms = float(np.sqrt(np.mean(np.concatenate(self.moved) ** 2) / 2.0))
+        sigmas = np.concatenate([*self.in_sigmas, np.zeros(0)])
+        return f"{self.whole}{wrong}, {rms:.3f} px" + (
+            f", {np.sqrt(np.mean(sigmas**2) / 2.0):.2f} sigmas" if len(sigmas) else ""
+        )
+
+
+def nearest_px(centres: FloatArray, others: FloatArray) -> FloatArray:
+    """Return how far (N,) each of the `centres` (N, 2) lies from the nearest of the others."""
+    return np.asarray(np.linalg.norm(centres[:, None] - others, axis=2).min(axis=1))
+
+
+def compare_worse(paths: Sequence[Path], board: Board) -> None:
+    """Print what detectors make of the images made worse, as Markdown."""
+    images = {path.name: np.asarray(grey_image(read_image(path))) for path in paths}
+    before = {name: {key: finder(image, board) for key, finder in FINDERS.items()} for name, image in images.items()}
+    print("| done to the images | " + " | ".join(FINDERS) + " |\n|:--|" + "--:|" * len(FINDERS))
+    for what, amount in WORSE:
+        scores = {key: Worse() for key in FINDERS}
+        for name, image in images.items():
+            rng = np.random.default_rng(zlib.crc32(f"{name} {what} {amount}".encode()))
+            worse = np.asarray(degraded(what, amount, in_8_bits(image), rng)[0])
+            place = next((seen[0] for seen in before[name].values() if seen is not None), None)
+            for key, finder in FINDERS.items():
+                if place is not None:
+                    scores[key].add(finder(worse, board), before[name][key], place)
+        print(f"| {what} {amount:g} | " + " | ".join(score.words() for score in scores.values()) + " |", flush=True)
 
 
 def compare_rendered(count: int) -> None:
@@ -99,8 +179,9 @@ def compare_rendered(count: int) -> None:
                 image = np.asarray(scene.render(blur_px=BLUR_PX, noise_levels=NOISE_LEVELS, rng=rng))
                 truth = scene.truth()[0].pixels
                 for name, finder in FINDERS.items():
-                    centres = finder(image, board)
-                    if centres is not None:
+                    seen = finder(image, board)
+                    if seen is not None:
+                        centres = seen[0]
                         nearest = np.linalg.norm(centres[:, None] - truth, axis=2).argmin(axis=1)
                         off[name].append(centres - truth[nearest])
                 covariance = position_bound(circle_information(scene, BLUR_PX), NOISE_LEVELS)
@@ -155,9 +236,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("images", nargs="*", type=Path)
     parser.add_argument("--board", type=Path)
+    parser.add_argument("--worse", action="store_true", help="make the real images worse in many ways")
     parser.add_argument("--count", type=int, default=12, help="rendered images of each kind")
     args = parser.parse_args()
-    if args.images:
+    if args.images and args.worse:
+        compare_worse(args.images, load_board(args.board))
+    elif args.images:
         compare_real(args.images, load_board(args.board))
     else:
         compare_rendered(args.count)

@@ -36,6 +36,11 @@ def gamma(values: Values, exponent: float, rng: np.random.Generator) -> Values:
     return np.asarray(255.0 * (values / 255.0) ** exponent, np.float32)
 
 
+def overexposed(values: Values, times: float, rng: np.random.Generator) -> Values:
+    """Return the image of so many times the light: what is brighter than white is cut off."""
+    return np.float32(times) * values
+
+
 def blurred(values: Values, sigma_px: float, rng: np.random.Generator) -> Values:
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma_px), np.float32)
 
@@ -122,6 +127,7 @@ LIGHT: dict[str, Callable[[Values, float, np.random.Generator], Values]] = {
     "noise": noisy,
     "faint": faint,
     "gamma": gamma,
+    "overexposed": overexposed,
     "blur": blurred,
     "sharpened": sharpened,
     "webcam": webcam,
