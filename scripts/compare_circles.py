@@ -25,9 +25,9 @@ import numpy as np
 from detection_bench.circle_bound import circle_information
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import LENSES, BenchScene, bench_camera, bench_field_deg, one_board
-from detectors.degradations import degraded
+from detectors.degradations import degraded, eight_bit
 
-from rigkit.core.arrays import FloatArray, in_8_bits
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
@@ -160,7 +160,7 @@ def compare_worse(paths: Sequence[Path], board: Board) -> None:
         scores = {key: Worse() for key in FINDERS}
         for name, image in images.items():
             rng = np.random.default_rng(zlib.crc32(f"{name} {what} {amount}".encode()))
-            worse = np.asarray(degraded(what, amount, in_8_bits(image), rng)[0])
+            worse = np.asarray(degraded(what, amount, eight_bit(image), rng)[0])
             place = next((seen[0] for seen in before[name].values() if seen is not None), None)
             for key, finder in FINDERS.items():
                 if place is not None:

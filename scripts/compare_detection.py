@@ -33,7 +33,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from detectors.degradations import SAME, Grey, degraded
+from detectors.degradations import SAME, degraded, eight_bit
 from detectors.peers import Worker
 
 from rigkit.core.arrays import FloatArray
@@ -43,7 +43,6 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
-from rigkit.detection.saddles.response import grey_image
 from rigkit.io.board_words import board_of_words
 from rigkit.io.images import IMAGE_ENDINGS, read_image
 
@@ -76,15 +75,6 @@ MORE = 0.1
 LIMIT_S = 20.0
 
 Find = Callable[[np.ndarray, Sequence[Board]], list[FloatArray]]
-
-
-def eight_bit(image: np.ndarray) -> Grey:
-    """Return `image` in grey levels of a byte: from the darkest to the brightest one where it has more."""
-    grey = grey_image(image)
-    if grey.dtype == np.uint8:
-        return np.asarray(grey, np.uint8)
-    low, high = float(grey.min()), float(grey.max())
-    return np.asarray(np.rint((grey - np.float32(low)) * np.float32(255.0 / max(high - low, 1e-6))), np.uint8)
 
 
 def _for(name: str, image: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ import importlib
 import os
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,9 +28,9 @@ import numpy as np
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import LENSES, one_board
 from detection_bench.tag_bound import tag_information
+from detectors.degradations import eight_bit
 
 from rigkit.calibration.hand_eye import hand_eye
-from rigkit.core.arrays import in_8_bits
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -82,20 +83,22 @@ def real(paths: Sequence[Path], board: Board, turns: int) -> None:
     falls on all of them, and the best turn of each is the least disturbed."""
     cv2.setNumThreads(1)
     images = [np.asarray(grey_image(read_image(path))) for path in paths]
-    calls: dict[str, Callable[[np.ndarray], int]] = {
-        "rigkit": lambda grey: sum(len(item.grid) for item in detect_boards(grey, [board])) // 4
+    in_bytes = [eight_bit(grey) for grey in images]
+    pattern = board.pattern
+    assert isinstance(pattern, AprilGrid)
+    calls: dict[str, Callable[[int], int]] = {
+        "rigkit": lambda k: sum(len(item.grid) for item in detect_boards(images[k], [board])) // 4
     }
     try:
         peer = importlib.import_module("pupil_apriltags")
-        for k in (1, 2):
-            detector = peer.Detector(families=pattern_of(board).family, nthreads=1, quad_decimate=k)
-            calls[f"pupil-apriltags 1/{k}"] = lambda grey, own=detector: len(own.detect(in_8_bits(grey)))  # type: ignore[misc]
+        for part in (1, 2):
+            detect = peer.Detector(families=pattern.family, nthreads=1, quad_decimate=part).detect
+            calls[f"pupil-apriltags 1/{part}"] = partial(lambda detect, k: len(detect(in_bytes[k])), detect)
     except ImportError:
         pass
-    tags = np.array([[call(grey) for grey in images] for call in calls.values()])
-    spent = np.array(
-        [[[spent_ms(lambda: call(grey)) for call in calls.values()] for grey in images] for _ in range(turns)]  # noqa: B023
-    )
+    every = range(len(images))
+    tags = np.array([[call(k) for k in every] for call in calls.values()])
+    spent = np.array([[[spent_ms(partial(call, k)) for call in calls.values()] for k in every] for _ in range(turns)])
     best = spent.min(axis=0)
     for path, own, counts in zip(paths, best, tags.T, strict=True):
         words = (f"{name} {count} tags, {ms:.1f} ms" for name, count, ms in zip(calls, counts, own, strict=True))
@@ -104,11 +107,6 @@ def real(paths: Sequence[Path], board: Board, turns: int) -> None:
         ratios = best[:, 0] / best[:, k]
         print(f"{name}: {tags[k].sum()} tags, {best[:, k].mean():.2f} ms an image", end="")
         print(f"; rigkit takes {np.median(ratios):.3f} of its time (median of the images)" if k else "")
-
-
-def pattern_of(board: Board) -> AprilGrid:
-    assert isinstance(board.pattern, AprilGrid)
-    return board.pattern
 
 
 class Track:

@@ -25,8 +25,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from compare_detection import eight_bit, images_of
-from detectors.degradations import Grey
+from compare_detection import images_of
+from detectors.degradations import Grey, eight_bit
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray

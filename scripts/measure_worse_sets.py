@@ -24,8 +24,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import cv2
 import numpy as np
-from compare_detection import eight_bit, images_of
-from detectors.degradations import degraded
+from compare_detection import images_of
+from detectors.degradations import degraded, eight_bit
 
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration

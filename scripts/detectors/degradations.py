@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray
+from rigkit.detection.saddles.response import grey_image
 
 Grey = NDArray[np.uint8]
 Values = NDArray[np.float32]
@@ -22,6 +23,15 @@ MOTION_RAD = np.radians(30.0)
 GLARE_PART, WEBCAM_PX, OPTICS_PX = 0.15, 1.2, 0.6
 """Standard deviation of a glare's spot as a part of the image's height, of what a webcam sharpens, and of a lens's
 blur."""
+
+
+def eight_bit(image: NDArray[np.generic]) -> Grey:
+    """Return `image` in grey levels of a byte: from the darkest to the brightest one where it has more."""
+    grey = grey_image(image)
+    if grey.dtype == np.uint8:
+        return np.asarray(grey, np.uint8)
+    low, high = float(grey.min()), float(grey.max())
+    return np.asarray(np.rint((grey - np.float32(low)) * np.float32(255.0 / max(high - low, 1e-6))), np.uint8)
 
 
 def noisy(values: Values, levels: float, rng: np.random.Generator) -> Values:

@@ -20,6 +20,7 @@ from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.lattice import Lattice
+from rigkit.detection.tags.corners import tag_corners
 from rigkit.detection.tags.placing import squares_of, voted_place
 from rigkit.detection.targets import aprilgrid
 from rigkit.kernels.edges import fit_corners
@@ -53,7 +54,7 @@ def compared(
             found += len(ours.grid)
         return ours
 
-    ours_of: Callable[..., BoardDetection | None] = aprilgrid.tag_corners
+    ours_of: Callable[..., BoardDetection | None] = tag_corners
     monkeypatch.setattr(aprilgrid, "tag_corners", both)
     detect_boards(image, [board], camera=camera)
     return found
