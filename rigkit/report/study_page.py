@@ -11,8 +11,8 @@ from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 
 
-def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
-    """Return the study as an HTML page that needs no other file."""
+def study_page(found: StudyTable, provenance: Mapping[str, str], *, drawn: bytes | None = None) -> str:
+    """Return the study as an HTML page that needs no other file; `drawn`: its figure, where there is one as PNG."""
     held = sum(verdict.holds for verdict in found.verdicts)
     count = len(found.verdicts)
     headline = f"{held} of {count} statements of this study hold" if count else "A study without statements to judge"
@@ -29,7 +29,7 @@ def study_page(found: StudyTable, provenance: Mapping[str, str]) -> str:
             tables=tuple(study_tables(found)),
         ),
         provenance,
-        pictures=[(f"Normal errors: {found.study.title}", lambda: study_figure(found))],
+        pictures=[(f"Normal errors: {found.study.title}", lambda: drawn or study_figure(found))],
     )
 
 

@@ -89,12 +89,13 @@ def run_studies(
             )
             places = _files_of(study, options)
             if places:
+                figure = study_figure(table, options.figure)
                 contents: dict[str, str | bytes] = {
                     "csv": tables_to_csv([cell_table(table)]),
                     "json": json_text(table.to_dict()),
                     "md": tables_to_markdown(study_tables(table)),
-                    options.figure: study_figure(table, options.figure),
-                    "html": study_page(table, software_facts()),
+                    options.figure: figure,
+                    "html": study_page(table, software_facts(), drawn=figure if options.figure == "png" else None),
                 }
                 write_together({to: contents[suffix] for suffix, to in places.items()}, force=options.force)
         yield StudyResult(study, table, tuple(places.values()))

@@ -150,34 +150,51 @@ def corner_of_a_room(walls: Sequence[Board], rng: np.random.Generator) -> Stereo
     raise AssertionError("no pair shows all boards from near enough to their fronts")
 
 
-def shoot(root: Path, placed: Sequence[PlacedBoard], side: str, camera: Camera, pose: Rigid3) -> None:
-    """Write one image of every board, the last of them into a folder of their own."""
-    rng = np.random.default_rng(7 if side == "left" else 8)
-    for n, one in enumerate(placed):
-        write((root if n < VIEWS else root / "fresh") / f"{side}/{n:02d}.png", shot([one], camera, pose, rng))
+def shoot(lab: Lab, folder: str, numbers: range, camera: Camera = LEFT, pose: Rigid3 = Rigid3.identity()) -> str:
+    """Write an image of some of the boards; return the folder."""
+    rng = np.random.default_rng(list(folder.encode()))
+    for n in numbers:
+        write(lab.root / folder / f"{n:02d}.png", shot([lab.placed[n]], camera, pose, rng))
+    return lab.path(folder)
 
 
 @pytest.fixture(scope="module", params=sorted(KINDS))
 def lab(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """A board before two cameras; what is below renders and calibrates only where a test asks for it."""
     kind = str(request.param)
     root, rng = tmp_path_factory.mktemp(kind), np.random.default_rng(5)
     words, planes = KINDS[kind]
     board = replace(board_of_words(words), board_id="target")
     (root / "target.toml").write_text(board_text(board, "as designed", root / "target.toml"))
-    placed = placed_before_both(board, VIEWS + FRESH, rng)
-    shoot(root, placed, "left", LEFT, Rigid3.identity())
-    lines = [robot_line(f"{n:02d}.png", one.world_from_board) for n, one in enumerate(placed[:VIEWS])]
-    (root / "poses.csv").write_text("\n".join(["image,x_mm,y_mm,z_mm,qx,qy,qz,qw", *lines]) + "\n")
-    told = ["--board", str(root / "target.toml"), "--model", "pinhole", "-o", str(root / "calibration.json")]
-    assert main(["calibrate", str(root / "left"), *told]) == 0
-    return Lab(kind, root, board, words, planes, tuple(placed))
+    return Lab(kind, root, board, words, planes, tuple(placed_before_both(board, VIEWS + FRESH, rng)))
+
+
+@pytest.fixture(scope="module")
+def left(lab: Lab) -> str:
+    return shoot(lab, "left", range(VIEWS))
 
 
 @pytest.fixture(scope="module")
 def right(lab: Lab) -> str:
-    """The folder of the other camera's images, rendered where a test asks for them."""
-    shoot(lab.root, lab.placed, "right", RIGHT, RIGHT_FROM_LEFT)
-    return lab.path("right")
+    return shoot(lab, "right", range(VIEWS), RIGHT, RIGHT_FROM_LEFT)
+
+
+@pytest.fixture(scope="module")
+def fresh(lab: Lab) -> str:
+    """Images that no calibration sees."""
+    return shoot(lab, "fresh/left", range(VIEWS, VIEWS + FRESH))
+
+
+@pytest.fixture(scope="module")
+def fresh_right(lab: Lab) -> str:
+    return shoot(lab, "fresh/right", range(VIEWS, VIEWS + FRESH), RIGHT, RIGHT_FROM_LEFT)
+
+
+@pytest.fixture(scope="module")
+def calibration(lab: Lab, left: str) -> str:
+    told = ["--board", lab.target, "--model", "pinhole", "-o", lab.path("calibration.json")]
+    assert main(["calibrate", left, *told]) == 0
+    return lab.path("calibration.json")
 
 
 @pytest.fixture(scope="module")
@@ -198,37 +215,35 @@ def test_it_is_printed(lab: Lab) -> None:
     assert all(Path(lab.path(f"print.{end}")).stat().st_size > 0 for end in ("pdf", "svg"))
 
 
-def test_images_tell_it(lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["board", "identify", lab.path("fresh/left")]) == 0
+def test_images_tell_it(lab: Lab, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["board", "identify", fresh]) == 0
     said = capsys.readouterr().out
     assert f"seen in {FRESH} of {FRESH} images" in said
     kind, _, size = lab.words.split(",")[0].rpartition(":")
     assert f"--board {f'{kind}:' if kind else ''}{size.rpartition('x')[0]}xMM" in said
 
 
-def test_one_camera(lab: Lab) -> None:
-    calibration = load_calibration(lab.path("calibration.json"))
-    assert calibration.heldout_rms_px is not None and calibration.heldout_rms_px < HELD_OUT_PX
-    assert not calibration.dropped and len(calibration.views) == VIEWS
-    (shape,) = calibration.boards
+def test_one_camera(lab: Lab, calibration: str) -> None:
+    found = load_calibration(calibration)
+    assert found.heldout_rms_px is not None and found.heldout_rms_px < HELD_OUT_PX
+    assert not found.dropped and len(found.views) == VIEWS
+    (shape,) = found.boards
     assert shape.declared is not None and shape.declared.pattern == lab.board.pattern
     assert shape.board.size == lab.board.size
 
 
-def test_it_still_holds_without_a_board_told(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", calibration, lab.path("fresh/left")]) == 0
+def test_it_still_holds_without_a_board_told(
+    calibration: str, fresh: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", calibration, fresh]) == 0
     assert "Still holds" in capsys.readouterr().out
 
 
-@pytest.fixture
-def calibration(lab: Lab) -> str:
-    return lab.path("calibration.json")
-
-
-def test_rig_and_its_check_and_certificate(lab: Lab, right: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rig_and_its_check_and_certificate(
+    lab: Lab, left: str, right: str, fresh: str, fresh_right: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig = lab.path("rig.json")
-    both = [lab.path("left"), right]
-    assert main(["calibrate", *both, "--board", lab.target, "--model", "pinhole", "-o", rig, "--force"]) == 0
+    assert main(["calibrate", left, right, "--board", lab.target, "--model", "pinhole", "-o", rig, "--force"]) == 0
     saved = load_saved_rig(rig)
     (board,) = saved.boards
     # In words: the calibrated board may be stretched, here by rounding.
@@ -237,7 +252,7 @@ def test_rig_and_its_check_and_certificate(lab: Lab, right: str, capsys: pytest.
     found = (poses[1] @ poses[0].inverse()).translation_mm
     true = RIGHT_FROM_LEFT.translation_mm
     assert np.linalg.norm(found - true) < 10.0 * LENGTH_REL * float(np.linalg.norm(true)) + 0.05
-    assert main(["check", rig, lab.path("fresh/left"), lab.path("fresh/right")]) == 0
+    assert main(["check", rig, fresh, fresh_right]) == 0
     assert main(["certify", rig, "--length", "100", "--distance", "400"]) == 0
     assert "95 %" in capsys.readouterr().out
 
@@ -248,9 +263,11 @@ def test_plan_and_difference(lab: Lab, calibration: str) -> None:
     assert main(["diff", calibration, calibration]) == 0
 
 
-def test_pose_and_hand(lab: Lab, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pose_and_hand(lab: Lab, left: str, calibration: str, capsys: pytest.CaptureFixture[str]) -> None:
     known = ["--camera", calibration, "--board", lab.target]
-    told = ["handeye", lab.path("poses.csv"), lab.path("left"), *known, "-o", lab.path("hand.json"), "--force"]
+    lines = [robot_line(f"{n:02d}.png", one.world_from_board) for n, one in enumerate(lab.placed[:VIEWS])]
+    Path(lab.path("poses.csv")).write_text("\n".join(["image,x_mm,y_mm,z_mm,qx,qy,qz,qw", *lines]) + "\n")
+    told = ["handeye", lab.path("poses.csv"), left, *known, "-o", lab.path("hand.json"), "--force"]
     if lab.board.looks_same_turned:
         # Nobody can say which end of such a board is which, and it is said what to take.
         assert main(told) == 2
@@ -301,7 +318,7 @@ def test_boards_on_one_mount(lab: Lab, room: tuple[Board, ...]) -> None:
     assert abs(mount.angle_deg("plane1", "plane2")[0] - 90.0) < ANGLE_DEG
 
 
-def test_the_coach_takes_pictures_of_it(lab: Lab, tmp_path: Path) -> None:
+def test_the_coach_takes_pictures_of_it(lab: Lab, left: str, tmp_path: Path) -> None:
     options = CoachOptions(
         folder=tmp_path / "coached",
         boards=(lab.words,),
@@ -309,7 +326,7 @@ def test_the_coach_takes_pictures_of_it(lab: Lab, tmp_path: Path) -> None:
     )
     coach = open_coach(options)
     for n in range(VIEWS):
-        grey = to_grey(read_image(lab.path(f"left/{n:02d}.png")))
+        grey = to_grey(read_image(Path(left, f"{n:02d}.png")))
         state = coach.look([np.repeat(grey[..., None], 3, axis=2)], take=Take.YES)
         assert state["taken"] is not None
     assert "px" in coach.finish()
