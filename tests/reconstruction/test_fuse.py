@@ -29,28 +29,40 @@ CAM_FROM_WORLD = tuple(
     Rigid3(exp_so3(np.array(w)), -exp_so3(np.array(w)) @ np.array(c)) for w, c in zip(TURNS, PLACES_MM, strict=True)
 )
 
+PAIRS = ((0, 1), (0, 2), (2, 1))
+
 
 @cache
-def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
+def corner_images() -> tuple[Corner, list[NDArray[np.uint8]]]:
     rng = np.random.default_rng(5)
     corner = Corner.of_a_room()
-    images = [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
+    return corner, [corner.image(CAMERA, pose, rng) for pose in CAM_FROM_WORLD]
+
+
+@cache
+def corner_cloud(i: int, j: int) -> PosedCloud:
+    """The cloud of one pair, by a rig that is known exactly."""
     rig = UncertainRig(cameras=[CAMERA] * 3, cam_from_rig=CAM_FROM_WORLD, covariance=np.zeros((24, 24)))
-    return corner, clouds_of(images, rig)
+    return cloud_of(corner_images()[1], rig, i, j)
+
+
+def corner_clouds() -> tuple[Corner, list[PosedCloud]]:
+    return corner_images()[0], [corner_cloud(i, j) for i, j in PAIRS]
+
+
+def cloud_of(images: Sequence[NDArray[np.generic]], rig: UncertainRig, i: int, j: int) -> PosedCloud:
+    known = rig.pair(i, j)
+    seeds = match_affine_features(images[i], images[j])
+    pose = KnownPose(known.posed.cam2_from_cam1, moved=tuple(known.moved()))
+    sparse = reconstruct_scene(seeds, *known.posed[:2], known_pose=pose, image1=images[i])
+    of_rig = known if rig.covariance.any() else None
+    dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True, calibrations=of_rig)
+    place = rig.pair(i, 0)
+    return PosedCloud.of(dense, place.posed.cam2_from_cam1, place.covariance[-6:, -6:])
 
 
 def clouds_of(images: Sequence[NDArray[np.generic]], rig: UncertainRig) -> list[PosedCloud]:
-    clouds = []
-    for i, j in ((0, 1), (0, 2), (2, 1)):
-        known = rig.pair(i, j)
-        seeds = match_affine_features(images[i], images[j])
-        pose = KnownPose(known.posed.cam2_from_cam1, moved=tuple(known.moved()))
-        sparse = reconstruct_scene(seeds, *known.posed[:2], known_pose=pose, image1=images[i])
-        of_rig = known if rig.covariance.any() else None
-        dense = grow_scene(sparse, seeds, images[i], images[j], pose_is_known=True, calibrations=of_rig)
-        place = rig.pair(i, 0)
-        clouds.append(PosedCloud.of(dense, place.posed.cam2_from_cam1, place.covariance[-6:, -6:]))
-    return clouds
+    return [cloud_of(images, rig, i, j) for i, j in PAIRS]
 
 
 def distances(corner: Corner, points: np.ndarray) -> np.ndarray:
@@ -118,13 +130,13 @@ def test_what_the_rig_leaves_open_is_in_the_sigmas_and_is_not_averaged_away() ->
 
 
 def test_one_cloud_stays_and_surfaces_apart_are_not_merged() -> None:
-    _, clouds = corner_clouds()
-    alone = fuse_clouds(clouds[:1])
-    np.testing.assert_allclose(alone.cloud.points_mm, clouds[0].world_from_cam.apply(clouds[0].cloud.points_mm))
-    np.testing.assert_allclose(alone.cloud.sigma_mm, clouds[0].cloud.sigma_mm)
+    one = corner_cloud(0, 1)
+    alone = fuse_clouds([one])
+    np.testing.assert_allclose(alone.cloud.points_mm, one.world_from_cam.apply(one.cloud.points_mm))
+    np.testing.assert_allclose(alone.cloud.sigma_mm, one.cloud.sigma_mm)
     # By far more than any sigma.
-    far = replace(clouds[0], world_from_cam=clouds[0].world_from_cam @ Rigid3(np.eye(3), [0.0, 0.0, 200.0]))
-    apart = fuse_clouds([clouds[0], far])
+    far = replace(one, world_from_cam=one.world_from_cam @ Rigid3(np.eye(3), [0.0, 0.0, 200.0]))
+    apart = fuse_clouds([one, far])
     assert (apart.pairs_of == 1).mean() > 0.95
 
 

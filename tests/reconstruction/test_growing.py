@@ -34,11 +34,16 @@ SEAM_PX = 12.0
 
 
 @cache
+def matched_corner(lens: str) -> tuple[Corner, list[np.ndarray], Correspondences]:
+    rng, corner = np.random.default_rng(5), Corner.of_a_room()
+    images = [corner.image(LENSES[lens], pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
+    return corner, images, match_affine_features(*images, tilts=TILTS)
+
+
+@cache
 def grown_corner(lens: str) -> tuple[SceneReconstruction, DenseScene, Corner]:
-    rng = np.random.default_rng(5)
-    corner, camera = Corner.of_a_room(), LENSES[lens]
-    images = [corner.image(camera, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
-    seeds = match_affine_features(*images, tilts=TILTS)
+    camera = LENSES[lens]
+    corner, images, seeds = matched_corner(lens)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
     return sparse, grow_scene(sparse, seeds, *images), corner
 
@@ -132,10 +137,8 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
 
 def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
     """A camera whose focal length and centre are one standard deviation off, of its covariance."""
-    corner, true = Corner.of_a_room(), LENSES["pinhole"]
-    rng = np.random.default_rng(5)
-    images = [corner.image(true, pose, rng) for pose in (Rigid3.identity(), CAM2_FROM_CAM1)]
-    seeds = match_affine_features(*images, tilts=TILTS)
+    corner, images, seeds = matched_corner("pinhole")
+    true = LENSES["pinhole"]
     sigmas = np.array([4.0, 4.0, 3.0, 3.0])
     camera = true.with_parameters(true.parameters + np.array([1.0, 1.0, -1.0, 1.0]) * sigmas)
     sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM)
