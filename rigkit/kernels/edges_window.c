@@ -62,6 +62,16 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     window->count += count;
 }
 
+/* Repeat the last pixel to the end of its block: what a block may leave out is decided by all of its pixels (all_beyond), and
+ * would else depend on what the memory held before. */
+INLINE void fill_up(window_t *window)
+{
+    for (int64_t i = window->count; i % BLOCK != 0; i++) {
+        window->u[i] = window->u[window->count - 1];
+        window->v[i] = window->v[window->count - 1];
+    }
+}
+
 /* Return how far the window reaches towards neighbouring line `k` of cells that are `across` px wide that way
  * (reference.edges._reach). */
 INLINE double reach_to(const geometry_t at, int k, double blur, double across, const edge_rules_t *rules)
@@ -137,6 +147,7 @@ void collect_window(
             take(window, image, start + k, first[1][k], count[1][k]);
         }
     }
+    fill_up(window);
 }
 
 /* Return whether there are pixels on all sides of (x, y) (reference.edges._surrounded). */
