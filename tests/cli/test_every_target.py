@@ -232,9 +232,7 @@ def test_one_camera(lab: Lab, calibration: str) -> None:
     assert shape.board.size == lab.board.size
 
 
-def test_it_still_holds_without_a_board_told(
-    calibration: str, fresh: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_still_holds_without_a_board_told(calibration: str, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", calibration, fresh]) == 0
     assert "Still holds" in capsys.readouterr().out
 

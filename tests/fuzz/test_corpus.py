@@ -61,8 +61,20 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "exit 70" in str(fuzz.fault_of(["export"], None, sound=False))
 
 
-QUICK = 5
-"""Cases of a class, beyond its sound ones; `scripts/fuzz.py --count 1000` looks longer."""
+QUICK, QUICK_AT_WORK = 5, 2
+"""Cases of a class, beyond its sound ones, and of one whose readers do seconds of work; `scripts/fuzz.py --count 1000` looks
+longer."""
+AT_WORK = {
+    "avi",
+    "coach-watch",
+    "mkv",
+    "mp4",
+    "mrcal-spline",
+    "pose-at-work",
+    "scene-image",
+    "scene-rig",
+    "study-at-work",
+}
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -74,7 +86,8 @@ def test_a_few_damaged_inputs_of_each_class(
     # Views of scenes are simulated where features are few, which whatever is damaged there does not change.
     monkeypatch.setattr("rigkit.affine.features.ENOUGH_PLAIN", 20)
     kind = KINDS[label]
-    for number in range(len(kind.readers) * (label != "commands") + (100 if label == "api" else QUICK)):
+    damaged = 100 if label == "api" else QUICK_AT_WORK if label in AT_WORK else QUICK
+    for number in range(len(kind.readers) * (label != "commands") + damaged):
         place = tmp_path / str(number)
         words = fuzz.case_of(kind, label, 1, number, seeds, place)
         monkeypatch.chdir(place if place.is_dir() else tmp_path)

@@ -35,10 +35,8 @@ WITHIN_TWO_OF_BASELINES = 0.85
 """Of 16: four fifths of all such draws have 15 or 16 of them, one in a hundred fewer than 13."""
 
 
-def geometry_of(
-    scene: StereoScene, rng: np.random.Generator, pose_type: PoseType = PoseType.GENERAL, level: float | None = None
-) -> PairGeometry:
-    return pair_geometry(noisy_pair(scene, BOARDS, rng, SIGMA_PX), pose_type=pose_type, level_sigma_rad=level)
+def geometry_of(scene: StereoScene, rng: np.random.Generator) -> PairGeometry:
+    return pair_geometry(noisy_pair(scene, BOARDS, rng, SIGMA_PX), pose_type=PoseType.GENERAL)
 
 
 def scene_of(camera: Camera, rng: np.random.Generator, pose_type: PoseType = PoseType.GENERAL) -> StereoScene:
@@ -95,16 +93,15 @@ def test_exact_corners_give_the_exact_scene(rng: np.random.Generator) -> None:
 def test_the_level_holds_as_it_was_declared(rng: np.random.Generator) -> None:
     """Exactly, as a prior between exact and free, and in the frames of tilted cameras as in level ones."""
     scene = scene_of(regular_camera(), rng, PoseType.PLANAR)
-    poses = {}
+    pair, poses = noisy_pair(scene, BOARDS, rng, SIGMA_PX), {}
     for level in (0.0, 1e-4, 1.0):
-        poses[level] = coplanar_planes(
-            geometry_of(scene, np.random.default_rng(3), PoseType.PLANAR, level)
-        ).cam2_from_cam1
-    free = coplanar_planes(geometry_of(scene, np.random.default_rng(3))).cam2_from_cam1
+        geometry = pair_geometry(pair, pose_type=PoseType.PLANAR, level_sigma_rad=level)
+        poses[level] = coplanar_planes(geometry).cam2_from_cam1
+    free = coplanar_planes(pair_geometry(pair, pose_type=PoseType.GENERAL)).cam2_from_cam1
     off = {level: abs(pose.rotation[1, 0]) for level, pose in poses.items()}
     assert off[0.0] < 1e-12 < off[1e-4] < off[1.0]
     assert np.allclose(poses[1.0].rotation, free.rotation, atol=1e-7)
-    geometry = geometry_of(scene, np.random.default_rng(3), PoseType.PLANAR, 1e-4)
+    geometry = pair_geometry(pair, pose_type=PoseType.PLANAR, level_sigma_rad=1e-4)
     turned = coplanar_planes(_tilted(geometry))
     straight = coplanar_planes(geometry)
     assert turned.baseline_mm()[0] == pytest.approx(straight.baseline_mm()[0], abs=0.2 * straight.baseline_mm()[1])
