@@ -150,9 +150,10 @@ def corner_of_a_room(walls: Sequence[Board], rng: np.random.Generator) -> Stereo
     raise AssertionError("no pair shows all boards from near enough to their fronts")
 
 
-def shoot(lab: Lab, folder: str, numbers: range, camera: Camera = LEFT, pose: Rigid3 = Rigid3.identity()) -> str:
-    """Write an image of some of the boards; return the folder."""
+def shoot(lab: Lab, folder: str, numbers: range) -> str:
+    """Write an image of some of the boards, by the camera that the folder is named after; return the folder."""
     rng = np.random.default_rng(list(folder.encode()))
+    camera, pose = (RIGHT, RIGHT_FROM_LEFT) if folder.endswith("right") else (LEFT, Rigid3.identity())
     for n in numbers:
         write(lab.root / folder / f"{n:02d}.png", shot([lab.placed[n]], camera, pose, rng))
     return lab.path(folder)
@@ -176,7 +177,7 @@ def left(lab: Lab) -> str:
 
 @pytest.fixture(scope="module")
 def right(lab: Lab) -> str:
-    return shoot(lab, "right", range(VIEWS), RIGHT, RIGHT_FROM_LEFT)
+    return shoot(lab, "right", range(VIEWS))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +188,7 @@ def fresh(lab: Lab) -> str:
 
 @pytest.fixture(scope="module")
 def fresh_right(lab: Lab) -> str:
-    return shoot(lab, "fresh/right", range(VIEWS, VIEWS + FRESH), RIGHT, RIGHT_FROM_LEFT)
+    return shoot(lab, "fresh/right", range(VIEWS, VIEWS + FRESH))
 
 
 @pytest.fixture(scope="module")

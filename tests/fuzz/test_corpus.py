@@ -62,8 +62,7 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 QUICK, QUICK_AT_WORK = 5, 2
-"""Cases of a class, beyond its sound ones, and of one whose readers do seconds of work; `scripts/fuzz.py --count 1000` looks
-longer."""
+"""Cases of a class, beyond its sound ones, and of one whose readers work for long; `scripts/fuzz.py` looks at more."""
 AT_WORK = {
     "avi",
     "coach-watch",
