@@ -109,7 +109,7 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     said = []
     coach_frames(
         coach,
-        watched_frames([watched], until_idle_s=1.0),
+        watched_frames([watched], until_idle_s=0.5),
         photos=True,
         show=lambda images: said.append(coach.state().get("words")),
     )
@@ -175,19 +175,20 @@ def test_what_is_shown_can_be_taken_once_and_undone(pictures: list[np.ndarray], 
 
 
 def test_a_picture_that_was_copied_slowly_is_read_once_it_is_whole(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("rigkit.coach.sources.POLL_S", 0.05)
     whole = cv2.imencode(".png", np.full((40, 50), 90, np.uint8))[1].tobytes()
     place = tmp_path / "1.png"
     place.write_bytes(whole[:-20])
     os.utime(place, (0.0, 0.0))
-    frames = watched_frames([tmp_path], until_idle_s=1.5)
+    frames = watched_frames([tmp_path], until_idle_s=0.8)
 
     def copy_on() -> None:
         """The copy rested for so long that it looked whole."""
         place.write_bytes(whole)
 
-    later = threading.Timer(0.6, copy_on)
+    later = threading.Timer(0.2, copy_on)
     later.start()
     assert [frame.source for frame in frames] == ["1.png"]
     later.join()

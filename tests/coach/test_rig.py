@@ -131,7 +131,7 @@ def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.nda
     # Taken by one camera only: it waits for the other's.
     (incoming[0] / "img7.png").write_bytes((incoming[0] / "img0.png").read_bytes())
     coach = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
-    for images, source in watched_frames(incoming, until_idle_s=0.7):
+    for images, source in watched_frames(incoming, until_idle_s=0.5):
         coach.look(images, take=Take.YES, source=source)
     taken = len(coach.guide.frames)
     assert taken == len(pairs)

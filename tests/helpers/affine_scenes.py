@@ -70,19 +70,23 @@ def see(
     incidence: float = 0.02,
 ) -> Corners | None:
     """Both views of boards at the given poses; None where a corner is behind a camera or too oblique."""
-    parts = []
-    for plane, cam1_from_board in enumerate(cam1_from_boards):
-        R = cam1_from_board.rotation
+    seen = []
+    # Whether all are seen first: most poses that are drawn show one of them from the side.
+    for cam1_from_board in cam1_from_boards:
         flat = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
         points = cam1_from_board.apply(flat)
+        R = cam1_from_board.rotation
         normals = np.broadcast_to(R[:, 2], points.shape) * -np.sign(R[:, 2] @ points[0])
-        (q1, ok1), (q2, ok2) = camera1.project(points), camera2.project(cam2_from_cam1.apply(points))
-        if not (ok1.all() and ok2.all()):
-            return None
         centre2 = cam2_from_cam1.inverse().translation_mm
         for origin in (np.zeros(3), centre2):
             if (np.sum(unit(points - origin) * normals, axis=1) > -incidence).any():
                 return None
+        (q1, ok1), (q2, ok2) = camera1.project(points), camera2.project(cam2_from_cam1.apply(points))
+        if not (ok1.all() and ok2.all()):
+            return None
+        seen.append((R, points, normals, q1, q2))
+    parts = []
+    for plane, (R, points, normals, q1, q2) in enumerate(seen):
         m = Matches.from_cameras(camera1, camera2, q1, q2)
         E21 = skew(cam2_from_cam1.translation_mm) @ cam2_from_cam1.rotation
         e = EpipolarNormals.of_matches(m, E21)

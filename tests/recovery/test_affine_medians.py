@@ -30,7 +30,7 @@ def median_error(c: Corners, directions: DirectionPairs, method: str, scale: str
 
 @pytest.fixture(scope="module")
 def scene() -> Corners:
-    return general_pairs(np.random.default_rng(12), 60, (40.0, 70.0))
+    return general_pairs(np.random.default_rng(12), 30, (40.0, 70.0))
 
 
 class TestGeneralPose:
