@@ -61,19 +61,9 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "exit 70" in str(fuzz.fault_of(["export"], None, sound=False))
 
 
-QUICK, QUICK_AT_WORK = 5, 2
+QUICK, QUICK_OF_LONG = 5, 2
 """Cases of a class, beyond its sound ones, and of one whose readers work for long; `scripts/fuzz.py` looks at more."""
-AT_WORK = {
-    "avi",
-    "coach-watch",
-    "mkv",
-    "mp4",
-    "mrcal-spline",
-    "pose-at-work",
-    "scene-image",
-    "scene-rig",
-    "study-at-work",
-}
+LONG = ("avi", "coach-watch", "mkv", "mp4", "mrcal-spline", "pose-at-work", "scene-image", "scene-rig", "study-at-work")
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -85,7 +75,7 @@ def test_a_few_damaged_inputs_of_each_class(
     # Views of scenes are simulated where features are few, which whatever is damaged there does not change.
     monkeypatch.setattr("rigkit.affine.features.ENOUGH_PLAIN", 20)
     kind = KINDS[label]
-    damaged = 100 if label == "api" else QUICK_AT_WORK if label in AT_WORK else QUICK
+    damaged = 100 if label == "api" else QUICK_OF_LONG if label in LONG else QUICK
     for number in range(len(kind.readers) * (label != "commands") + damaged):
         place = tmp_path / str(number)
         words = fuzz.case_of(kind, label, 1, number, seeds, place)
