@@ -39,6 +39,7 @@ CAM_FROM_HAND = Rigid3(exp_so3(np.array([0.1, -0.2, 0.3])), np.array([20.0, -30.
 BASE_FROM_BOARD = Rigid3(exp_so3(np.array([3.0, 0.2, 0.1])), np.array([600.0, 100.0, 0.0]))
 OPTICS, PHOTOMETRY = Optics(0.6, supersample=2), Photometry(exposure=0.95, noise_levels=1.5)
 VIEWS, FRESH = 6, 2
+SEEDS = {"left": 7, "right": 8, "fresh/left": 9, "fresh/right": 10}
 
 MIN_COSINE = 0.4
 """Of boards in a corner of a room, against the line of sight."""
@@ -152,7 +153,7 @@ def corner_of_a_room(walls: Sequence[Board], rng: np.random.Generator) -> Stereo
 
 def shoot(lab: Lab, folder: str, numbers: range) -> str:
     """Write an image of some of the boards, by the camera that the folder is named after; return the folder."""
-    rng = np.random.default_rng(list(folder.encode()))
+    rng = np.random.default_rng(SEEDS[folder])
     camera, pose = (RIGHT, RIGHT_FROM_LEFT) if folder.endswith("right") else (LEFT, Rigid3.identity())
     for n in numbers:
         write(lab.root / folder / f"{n:02d}.png", shot([lab.placed[n]], camera, pose, rng))

@@ -63,7 +63,7 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 QUICK, QUICK_OF_LONG = 5, 2
 """Cases of a class, beyond its sound ones, and of one whose readers work for long; `scripts/fuzz.py` looks at more."""
-LONG = ("avi", "coach-watch", "mkv", "mp4", "mrcal-spline", "pose-at-work", "scene-image", "scene-rig", "study-at-work")
+LONG = ("avi", "mkv", "mp4", "mrcal-spline", "pose-at-work", "scene-image", "scene-rig", "study-at-work")
 
 
 @pytest.mark.filterwarnings("ignore")
