@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from enum import Enum
 from typing import Any
 
@@ -65,11 +66,18 @@ class Coach:
     each is dealt with by itself."""
 
     def __init__(
-        self, options: GuideOptions, keeper: Keeper, finish: Callable[[], str], tell: Callable[[str], None] = ignored
+        self,
+        options: GuideOptions,
+        keeper: Keeper,
+        finish: Callable[[], str],
+        tell: Callable[[str], None] = ignored,
+        executor: Executor | None = None,
     ) -> None:
         """Go on with what the keeper has. `finish` calibrates the session and says what came of it; `tell` is given a
-        line for every frame that is kept, for every photo that is not, and for what came of it."""
-        self.guide, self.keeper = RigGuide(keeper.names, options), keeper
+        line for every frame that is kept, for every photo that is not, and for what came of it; `executor` calibrates
+        meanwhile what there is, by default while all wait."""
+        self.guide, self.keeper = RigGuide(keeper.names, options, executor), keeper
+        self._executor = executor
         self.finished: str | None = None
         self._finish, self._tell = finish, tell
         self._lock = threading.Lock()
@@ -152,7 +160,13 @@ class Coach:
         self._shown = self._shown | {"words": words}
 
     def state(self) -> dict[str, Any]:
-        """Return what was said last: for pages whose frames come from this machine."""
+        """Return what was said last: for pages whose frames come from this machine, or are photos."""
+        if self._shown.get("waits"):
+            with self._lock:
+                none = [Glance(size_px=glance.size_px, view=None) for glance in self.guide.frames[-1]]
+                advice = self.guide.advise(none)
+                if not advice.waits:
+                    self._show(none, advice)
         return self._shown | {"finished": self.finished}
 
     def take_shown(self) -> dict[str, Any]:
@@ -190,7 +204,7 @@ class Coach:
             self._tell(f"{self._names[-1]} set aside")
             self.keeper.drop(self._names.pop())
             frames = self.guide.frames[:-1]
-            self.guide = RigGuide(self.keeper.names, self.guide.options)
+            self.guide = RigGuide(self.keeper.names, self.guide.options, self._executor)
             for glances in frames:
                 self.guide.add(glances)
             self._show(None, None)

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
 from rigkit.coach.look import Glance
+from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.processes import Here
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal, projection_goal, px_words, turned_design
+from rigkit.planning.goal import Aim, Goal, projection_goal, px_words, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, covariance_of, plan_views
@@ -30,6 +34,7 @@ FIRST_FRAMES = 4
 """Before so many frames there is no calibration: the coach goes by a guess of the lens."""
 ENOUGH_FRAMES = 8
 """With fewer nobody can tell whether the lens model fits."""
+CHECKING = "Wait a moment: is it enough?"
 WORTH_TAKING = 0.6
 """A frame that brings this part of what the outline would bring is taken, wherever the board is."""
 WORTH_OF_PHOTO = 0.2
@@ -68,6 +73,14 @@ class GuideOptions:
             return self.measured(camera)
         return projection_goal(camera, self.reach.field_deg)
 
+    def stated(self, calibration: Calibration) -> str:
+        """Return in words what a calibration says of the goal: its error, and whether that is small enough."""
+        known = uncertain_camera(calibration)
+        goal = self.goal(known.camera)
+        error = float(goal.error(known.covariance))
+        is_reached = error <= self.wanted
+        return f"error {error:.2g} {goal.unit} ({'as wanted' if is_reached else f'wanted {self.wanted:g}'})"
+
     @property
     def wanted(self) -> float:
         """How small, in the goal's unit."""
@@ -85,6 +98,7 @@ class Advice:
     worth : what this very frame brings, as a part of what a board in the outline would.
     take : this very frame is worth taking.
     enough : there are enough frames.
+    waits : nothing is asked for, until it is known whether there are.
     error : what the frames so far leave of what is to become small, in `unit`; None where nobody knows yet.
     error_px : rms error of the projection that they leave.
     more_percent : what two more frames would bring.
@@ -95,6 +109,7 @@ class Advice:
     worth: float
     take: bool
     enough: bool
+    waits: bool
     error: float | None
     unit: str
     error_px: float | None
@@ -102,14 +117,16 @@ class Advice:
 
 
 class CaptureGuide:
-    """Frames taken so far and what follows from them."""
+    """Frames taken so far and what follows from them. All of `calibrate` is done by an executor, which may take its
+    time: until then a quick calibration will do, but there are not enough."""
 
-    def __init__(self, options: GuideOptions) -> None:
+    def __init__(self, options: GuideOptions, executor: Executor | None = None) -> None:
         self.options = options
         self.views: list[BoardView] = []
         self.size_px: tuple[int, int] | None = None
-        self._found: Calibration | None = None
+        self._quick: Calibration | None = None
         self._stale = False
+        self._whole = WholeCalibrations(executor or Here())
         self._plan: Plan | None = None
         self._map: list[list[float | None]] | None = None
 
@@ -122,46 +139,65 @@ class CaptureGuide:
     @property
     def calibration(self) -> Calibration | None:
         """What the frames so far say, once they say anything."""
+        if self._whole.latest is not None:
+            return self._whole.latest.calibration
         # Many frames may come at once, when a session goes on: only then is there something to be asked of it.
         if self._stale and self.size_px is not None and len(self.views) >= FIRST_FRAMES:
-            self._found = _calibrated(self.views, self.size_px) or self._found
+            self._quick = _calibrated(self.views, self.size_px) or self._quick
         self._stale = False
-        return self._found
+        return self._quick
+
+    def _go_on(self) -> None:
+        """Take what has been calibrated meanwhile, and have calibrated what has come."""
+        if self.size_px is None or _distinct(self.views) < ENOUGH_FRAMES:
+            return
+        while True:
+            # A session that goes on has no held-out error of fewer frames to compare with.
+            self._whole.ask(self.views if self._whole.is_new(self.views) else self.views[:-1], self.size_px)
+            if not self._whole.arrived():
+                return
+            self._plan = self._map = None
 
     def advise(self, glance: Glance, least_worth: float = WORTH_TAKING) -> Advice:
         """Return what to do, and whether to take this frame: it must be worth at least so much."""
+        self._go_on()
         plan = self._planned(glance.size_px)
         target = plan.views[0]
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth = self._worth(glance.view, plan)
-        take = not glance.complaint and worth >= least_worth
-        error = plan.error if self.calibration is not None else None
-        enough = (
-            error is not None
-            and _distinct(self.views) >= ENOUGH_FRAMES
-            and (error <= self.options.wanted or plan.gain < WORTH_GOING_ON)
-        )
-        unit = plan.goal.unit
+        error = None if self.calibration is None else self._stated(plan, plan.goal)
+        error_px = None if error is None else self._stated(plan, self._projection(plan))
+        reached = error is not None and error <= self.options.wanted
+        would_do = error is not None and _distinct(self.views) >= ENOUGH_FRAMES
+        would_do = would_do and (reached or plan.gain < WORTH_GOING_ON)
+        steady = self._whole.steady(len(self.views)) if would_do else False
         words = f"Hold the board: {where}"
-        if glance.view is not None and worth >= least_worth and glance.complaint:
+        if steady is None:
+            words = CHECKING
+        elif steady and error is not None and error_px is not None:
+            words = self._enough_words(plan, error, error_px, reached=reached)
+        elif glance.view is not None and worth >= least_worth and glance.complaint:
             words = glance.complaint.capitalize()
-        error_px = None if error is None else self._error_px(plan)
-        if error_px is not None and enough:
-            left = px_words(plan.knowledge.camera, error_px)
-            if unit != "px":
-                left = f"{error:.2g} {unit}, {error_px:.2g} px"
-            words = f"Enough: {left}; two more pictures would bring {100.0 * plan.gain:.0f} %"
+        elif would_do:
+            words = f"One more, to see that it is steady: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,
             worth=worth,
-            take=bool(take and not enough),
-            enough=bool(enough),
+            take=not glance.complaint and worth >= least_worth and steady is False,
+            enough=steady is True,
+            waits=steady is None,
             error=error,
-            unit=unit,
+            unit=plan.goal.unit,
             error_px=error_px,
             more_percent=None if error is None else 100.0 * plan.gain,
         )
+
+    def _enough_words(self, plan: Plan, error: float, error_px: float, *, reached: bool) -> str:
+        unit, wanted = plan.goal.unit, self.options.wanted
+        left = px_words(plan.knowledge.camera, error_px) if unit == "px" else f"{error:.2g} {unit}, {error_px:.2g} px"
+        more = f"two more pictures would bring {'' if reached else 'only '}{100.0 * plan.gain:.0f} %"
+        return f"Enough: {left}; {more}" if reached else f"Enough: {left}, not {wanted:g} {unit}, but {more}"
 
     def camera(self, size_px: tuple[int, int]) -> Camera:
         """Return the camera as far as it is known."""
@@ -175,9 +211,17 @@ class CaptureGuide:
         """Return where a board is; None where the lens does not see enough of it."""
         return _pose(self.camera(size_px), view)
 
-    def _error_px(self, plan: Plan) -> float:
-        projection = projection_goal(plan.knowledge.camera, self.options.reach.field_deg)
-        return float(projection.error(covariance_of(plan.knowledge.information)))
+    def _projection(self, plan: Plan) -> Goal:
+        return projection_goal(plan.knowledge.camera, self.options.reach.field_deg)
+
+    def _stated(self, plan: Plan, goal: Aim) -> float:
+        """Return what the frames leave of a goal: as all of `calibrate` states it for those that it has had."""
+        error = float(goal.error(covariance_of(plan.knowledge.information)))
+        whole = self._whole.latest
+        if whole is None:
+            return error
+        then, stated = covariance_of(whole.knowledge.information), whole.stated.covariance
+        return error * float(goal.error(stated) / goal.error(then))
 
     def sigma_map(self) -> list[list[float | None]] | None:
         """Return the rms error of the projection over the image, rows of LIVE_GRID px, None where the lens does not
@@ -207,14 +251,20 @@ class CaptureGuide:
         return self._plan
 
     def _known(self, size_px: tuple[int, int]) -> tuple[Knowledge, Goal]:
-        if self.calibration is not None:
+        later: Sequence[BoardView] = ()
+        if self._whole.latest is not None:
+            knowledge, later = self._whole.latest.knowledge, self.views[self._whole.count :]
+        elif self.calibration is not None:
             knowledge = Knowledge.of(self.calibration)
         else:
-            knowledge = Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), USUAL_ERROR)
-            for view in self.views:
-                pose = _pose(knowledge.camera, view)
-                if pose is not None:
-                    knowledge = knowledge.with_views(held_view(view, pose))
+            knowledge, later = (
+                Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), USUAL_ERROR),
+                self.views,
+            )
+        for view in later:
+            pose = _pose(knowledge.camera, view)
+            if pose is not None:
+                knowledge = knowledge.with_views(held_view(view, pose), view.board.board_id)
         return knowledge, self.options.goal(knowledge.camera)
 
     def _worth(self, view: BoardView | None, plan: Plan) -> float:

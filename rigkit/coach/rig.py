@@ -7,6 +7,7 @@ The lens that is worst off says what to do, until all are well; then the camera 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,14 +31,15 @@ MAX_MARKS = 1500
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigAdvice:
     """What the coach says: words, what these frames bring as a part of what a board in the outline would, whether to
-    take them and whether there are enough, the number of the camera that it speaks of, what each camera's guide says,
-    outlines (K, 2) to hold the board into by camera (None: none), and how wrong the mounts are (px; None where nobody
-    knows)."""
+    take them, whether there are enough or nothing is asked for until that is known (`waits`), the number of the camera
+    that it speaks of, what each camera's guide says, outlines (K, 2) to hold the board into by camera (None: none), and
+    how wrong the mounts are (px; None where nobody knows)."""
 
     words: str
     worth: float
     take: bool
     enough: bool
+    waits: bool
     speaks: int
     lenses: tuple[Advice, ...]
     targets: tuple[Pixels | None, ...]
@@ -47,9 +49,9 @@ class RigAdvice:
 class RigGuide:
     """Frames that all cameras took together, and what follows from them."""
 
-    def __init__(self, names: Sequence[str], options: GuideOptions) -> None:
+    def __init__(self, names: Sequence[str], options: GuideOptions, executor: Executor | None = None) -> None:
         self.names, self.options = tuple(names), options
-        self.lenses = tuple(CaptureGuide(options) for _ in names)
+        self.lenses = tuple(CaptureGuide(options, executor) for _ in names)
         self.frames: list[tuple[Glance, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
@@ -70,7 +72,7 @@ class RigGuide:
         good = bool(seeing) and not any(g.complaint for g in seeing)
         # Nobody knows an error: the lens with the fewest frames goes first.
         badly = [
-            (advice.enough, -(np.inf if advice.error is None else advice.error), len(lens.views))
+            (advice.enough, advice.waits, -(np.inf if advice.error is None else advice.error), len(lens.views))
             for lens, advice in zip(self.lenses, lenses, strict=True)
         ]
         speaks = min(range(len(lenses)), key=lambda c: badly[c])
@@ -79,8 +81,13 @@ class RigGuide:
         known_px = [px for px in mounts.values() if px is not None]
         mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
         enough = all(advice.enough for advice in lenses) and not open_mounts
-        worth = max([a.worth for a, g in zip(lenses, glances, strict=True) if not a.enough and g.view], default=0.0)
-        words, targets = lenses[speaks].words, [a.target_px if c == speaks else None for c, a in enumerate(lenses)]
+        worth = max(
+            [a.worth for a, g in zip(lenses, glances, strict=True) if not (a.enough or a.waits) and g.view], default=0.0
+        )
+        words, targets = (
+            lenses[speaks].words,
+            [a.target_px if c == speaks and not a.waits else None for c, a in enumerate(lenses)],
+        )
         if len(lenses) > 1:
             words = f"{self.names[speaks]}: {words}"
         if lenses[speaks].enough and open_mounts:
@@ -99,6 +106,7 @@ class RigGuide:
             worth=worth,
             take=take,
             enough=enough,
+            waits=lenses[speaks].waits,
             speaks=speaks,
             lenses=lenses,
             targets=tuple(targets),
@@ -191,6 +199,7 @@ class RigGuide:
                 "words": advice.words,
                 "take": advice.take,
                 "enough": advice.enough,
+                "waits": advice.waits,
                 "error": first.error,
                 "unit": first.unit,
                 "goal": self.options.wanted,

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.displaced import LensModes, with_modes
+from rigkit.calibration.displaced import LensModes, lens_modes, with_modes
 from rigkit.calibration.linearise import view_products
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
@@ -140,6 +140,11 @@ class Knowledge:
             )
             known = known.with_views(held, shape.board_id)
         return known
+
+    @classmethod
+    def beyond_model(cls, calibration: Calibration) -> Knowledge:
+        """Return the same with what the lens may do beyond its model, as its rivals do."""
+        return cls.of(calibration).departing(lens_modes(calibration))
 
     def of_views(self, held: HeldBoards, board_id: str = "") -> FloatArray:
         """Return what each view of the board `board_id` in C poses adds, (C, T, T)."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +25,7 @@ from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, watched_frames
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.findings import Severity, worst
+from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.rig_session import ONE
@@ -70,8 +73,8 @@ class CoachOptions:
     """Other machines in this network may use the page."""
 
 
-def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored) -> Coach:
-    """Return the coach of a session's folder, which is made, or gone on with; `tell` as in `Coach`.
+def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored, executor: Executor | None = None) -> Coach:
+    """Return the coach of a session's folder, which is made, or gone on with; `tell` and `executor` as in `Coach`.
 
     Raises InputError where the folder holds another session, or cannot be one.
     """
@@ -89,7 +92,7 @@ def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored) -> 
             return goal_of(camera, guide.reach, length)
 
         guide = replace(guide, measured=measured)
-    return Coach(guide, keeper, lambda: finished_words(options.folder), tell)
+    return Coach(guide, keeper, lambda: finished_words(options.folder, guide), tell, executor)
 
 
 def _names(options: CoachOptions) -> tuple[str, ...]:
@@ -103,8 +106,8 @@ def _names(options: CoachOptions) -> tuple[str, ...]:
     return tuple(names)
 
 
-def finished_words(folder: Path) -> str:
-    """Calibrate the session of a folder, write the result beside it, and say what came of it.
+def finished_words(folder: Path, guide: GuideOptions) -> str:
+    """Calibrate the session of a folder, write the result beside it, and say what came of it, and of the goal.
 
     Raises as `calibrate_session_file`.
     """
@@ -112,17 +115,19 @@ def finished_words(folder: Path) -> str:
         folder / SESSION_NAME, CalibrateOptions(report=Path(), force=True, cache=Cache.UPDATE)
     )
     if isinstance(done, SessionCalibration):
-        what, c = done.calibration.camera.model, done.calibration
+        c = done.calibration
+        what = f"{c.camera.model}, {guide.stated(c)}"
         return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written)
     rig = done.rig
-    return _finished(f"{len(rig.cameras)} cameras", rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written)
+    what = "; ".join(f"{own.name}: {guide.stated(own.calibration)}" for own in rig.cameras)
+    return _finished(what, rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written)
 
 
 def _finished(what: str, rms_px: float, heldout_px: float | None, verdict: Severity, written: Sequence[Path]) -> str:
-    error = f"rms {rms_px:.3f} px" if heldout_px is None else f"held-out {heldout_px:.3f} px"
+    fit = f"rms {rms_px:.3f} px" if heldout_px is None else f"held-out {heldout_px:.3f} px"
     page = written[-1].name
     more = {Severity.LOOK: f"; {page} says what to look at", Severity.BAD: f"; do not trust it: {page} says why"}
-    return f"Done: {what}, {error}, {written[0].name} written{more.get(verdict, '')}"
+    return f"Done: {what}, {fit}, {written[0].name} written{more.get(verdict, '')}"
 
 
 def coach_frames(
@@ -191,7 +196,18 @@ def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Prog
         with Video(path):
             pass
     frames = _frames(options)
-    coach = open_coach(options, told)
+    # Files wait while those before them are calibrated; a person does not.
+    with nullcontext() if options.watch or options.video else worker_pool(1) as pool:
+        _run(options, open_coach(options, told, pool), frames, told, progress)
+
+
+def _run(
+    options: CoachOptions,
+    coach: Coach,
+    frames: Iterator[Frame] | None,
+    told: Callable[[str], None],
+    progress: Progress,
+) -> None:
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
     of_server = bool(options.video) or frames is not None

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.displaced import lens_modes
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -38,7 +37,7 @@ def next_views(
     Raises as `plan_views` and `goal_of`.
     """
     reach = reach or Reach()
-    known = Knowledge.of(calibration).departing(lens_modes(calibration))
+    known = Knowledge.beyond_model(calibration)
     last = calibration.views[-1].cam_from_board
     return plan_views(known, boards, goal_of(known.camera, reach, length), count, reach=reach, last=last)
 

@@ -12,6 +12,7 @@ import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 from helpers.calibration_scenes import noisy_view
 
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import GuideOptions
@@ -20,13 +21,13 @@ from rigkit.coach.rig import SHARED_FRAMES, RigGuide
 from rigkit.coach.sources import watched_frames
 from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import board_pose
+from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, unit
 from rigkit.io.rig_session import load_rig_session
 from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.information import CornerError, HeldBoards, Knowledge
+from rigkit.planning.information import CornerError, HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
-from rigkit.planning.plan import covariance_of
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.coach import CoachOptions, open_coach
 
@@ -180,8 +181,8 @@ def test_a_look_at_a_smaller_picture_shows_the_same(pairs: Sequence[list[np.ndar
 def length_error_mm(calibration: Calibration, length: Task) -> float:
     """By how much lengths across the image, level and upright, are measured wrongly by lenses that are one standard
     deviation off in each independent direction: root of the squares' sum, of which the mean over the image is taken."""
-    camera, covariance = calibration.camera, covariance_of(Knowledge.of(calibration).information)
-    count = camera.parameters.size
+    known = uncertain_camera(calibration)
+    camera = known.camera
     u, v = np.meshgrid(np.linspace(0.0, SIZE[0] - 1.0, 13), np.linspace(0.0, SIZE[1] - 1.0, 10))
     middle, valid = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
     middle, squared = middle[valid], 0.0
@@ -190,7 +191,7 @@ def length_error_mm(calibration: Calibration, length: Task) -> float:
     ways = [(far * middle - half * way, far * middle + half * way) for way in (level, np.cross(middle, level))]
     ends = [[camera.project(end)[0] for end in way] for way in ways]
     seen = np.all([camera.on_image(end) for way in ends for end in way], axis=0)
-    for error in np.linalg.cholesky(covariance[:count, :count]).T:
+    for error in principal_axes(known.covariance):
         wrong = camera.with_parameters(camera.parameters + error)
         for one, other in ends:
             angle = angle_between(wrong.unproject(one[seen])[0], wrong.unproject(other[seen])[0])
