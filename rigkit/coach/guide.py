@@ -27,7 +27,7 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Aim, Goal, projection_goal, px_words, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
-from rigkit.planning.plan import Plan, covariance_of, plan_views
+from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
 from rigkit.planning.words import placement
 
 FIRST_FRAMES = 4
@@ -162,7 +162,7 @@ class CaptureGuide:
         """Return what to do, and whether to take this frame: it must be worth at least so much."""
         self._go_on()
         plan = self._planned(glance.size_px)
-        target = plan.views[0]
+        target = self.asked(glance.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth = self._worth(glance.view, plan)
         error = None if self.calibration is None else self._stated(plan, plan.goal)
@@ -198,6 +198,10 @@ class CaptureGuide:
         left = px_words(plan.knowledge.camera, error_px) if unit == "px" else f"{error:.2g} {unit}, {error_px:.2g} px"
         more = f"two more pictures would bring {'' if reached else 'only '}{100.0 * plan.gain:.0f} %"
         return f"Enough: {left}; {more}" if reached else f"Enough: {left}, not {wanted:g} {unit}, but {more}"
+
+    def asked(self, size_px: tuple[int, int]) -> Proposal:
+        """Return where the outline is."""
+        return self._planned(size_px).views[0]
 
     def camera(self, size_px: tuple[int, int]) -> Camera:
         """Return the camera as far as it is known."""

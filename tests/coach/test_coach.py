@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import re
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from helpers.sentinel_scenes import best_held
 
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach, Take
@@ -122,14 +124,18 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     assert len(kept) == len(coach.guide.frames)
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
-    assert coach.finish().startswith("Done")
+    (lens,) = coach.guide.lenses
+    said_px = lens.advise(Glance(size_px=SIZE, view=None)).error_px
+    assert said_px is not None and re.match(r"Done: \w+, error [0-9.]+ px \(", coach.finish())
     assert "00.png: taken as frame-0001.png" in told and any(
         line.startswith("001.png: not taken, as it brings little that is new: 0 % of") for line in told
     )
     assert len([line for line in told if ": taken as " in line]) == len(kept) and told[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")
     error = compare_cameras(CAMERA, found.camera).rms_px
-    stated = float(projection_goal(found.camera).error(found.covariance))
+    known = uncertain_camera(found)
+    stated = float(projection_goal(known.camera).error(known.covariance))
+    assert stated == pytest.approx(said_px, rel=0.1), "what it said is what `calibrate` states"
     assert error < max(4.0 * stated, 0.15)
 
 

@@ -1,0 +1,192 @@
+"""Is what the coach says in the end what `calibrate` states of the session, and is that true?
+
+SIMULATED: five lenses, boards that are not flat, each held where the coach asks within a human's error, until it says
+that there are enough. REAL: the images of a capture, in a random order, offered to the coach as photos in a watched
+folder are, until it says so. In both, what the coach says is put beside what all of `calibrate` states, and beside the
+truth: the lens, or the calibration from all images where boards were.
+
+    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--real [SET ...]] [--data DIR] [--cache DIR]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from bench_planner import BOARD, GRID, LENSES, NOISE_PX, SIZE, Lens, by_hand, true_error
+from planner.real import Images
+from split_halves import CAPTURES
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.compare import compare_cameras
+from rigkit.coach.guide import WORTH_OF_PHOTO, Advice, CaptureGuide, GuideOptions
+from rigkit.coach.look import Glance
+from rigkit.core.detections import BoardView
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import projection_goal
+from rigkit.synthetic.scene import PlacedBoard
+
+BOW_MM, TWIST_MM, WAVE_MM = 0.4, 0.12, 0.06
+"""How far boards of 200 mm are from flat: bowed, twisted, and wavy as no warp is."""
+WIDTH_DEG = {"tele-20": 20.0, "60": 60.0, "90": 90.0, "120": 120.0, "185": 240.0}
+GUESSED_WRONG = 0.1
+MAX_FRAMES, TRIES = 60, 5
+SAME = 1.03
+"""Goal reached, but all of `calibrate` states more than this part of it: said too early."""
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What was said at the end, what `calibrate` states, and what is true, px."""
+
+    frames: int
+    words: str
+    said: float
+    stated: float
+    true: float
+    model: str
+    seconds: float
+
+    @property
+    def reached(self) -> bool:
+        return self.words.startswith("Enough") and ", not " not in self.words
+
+    def __str__(self) -> str:
+        return (
+            f"{self.frames:2d} frames, {'reached' if self.reached else 'not reached'}: said {self.said:.3f}, calibrate "
+            f"states {self.stated:.3f}, true {self.true:.3f} px; {self.model}, longest wait {self.seconds:.1f} s"
+        )
+
+
+def see(placed: PlacedBoard, lens: Lens, image: str, rng: np.random.Generator) -> BoardView | None:
+    """Return what a camera finds of a board that is not flat; None where it is too little."""
+    points = BOARD.points().copy()
+    along = points[:, :2] - points[:, :2].mean(axis=0)
+    x, y = (2.0 * along / np.ptp(points[:, :2], axis=0)).T
+    points[:, 2] += BOW_MM * (1.0 - x**2) + TWIST_MM * x * y + WAVE_MM * np.sin(1.5 * np.pi * y)
+    there = placed.world_from_board.apply(points)
+    pixels, valid = lens.camera.project(there)
+    valid &= lens.camera.on_image(pixels)
+    if lens.field_deg is not None:
+        valid &= there[:, 2] >= np.cos(np.radians(0.5 * lens.field_deg)) * np.linalg.norm(there, axis=-1)
+    if valid.sum() < 0.7 * len(valid):
+        return None
+    noisy = pixels[valid] + NOISE_PX * rng.standard_normal((int(valid.sum()), 2))
+    noisy = np.clip(noisy, -0.5, np.array(SIZE) - 0.5)
+    return BoardView(image, BOARD, BOARD.grid()[valid], noisy, np.full(len(noisy), NOISE_PX))
+
+
+def ended(
+    guide: CaptureGuide, advice: Advice, field_deg: float | None, seconds: float
+) -> tuple[Calibration, dict[str, object]]:
+    """Return the session's calibration, and what is to be said of it but the truth."""
+    assert guide.size_px is not None
+    found = calibrate(guide.views, guide.size_px, model="auto")
+    known = uncertain_camera(found)
+    stated = float(projection_goal(known.camera, field_deg).error(known.covariance))
+    said = float("nan") if advice.error is None else advice.error
+    return found, {
+        "frames": len(guide.views),
+        "words": advice.words,
+        "said": said,
+        "stated": stated,
+        "model": found.camera.model,
+        "seconds": seconds,
+    }
+
+
+def simulated(name: str, goal_px: float, rng: np.random.Generator) -> Session:
+    lens = LENSES[name]
+    width_deg = WIDTH_DEG[name] * (1.0 + GUESSED_WRONG * rng.uniform(-1.0, 1.0))
+    reach = Reach(field_deg=lens.field_deg)
+    guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=width_deg, goal_px=goal_px, reach=reach))
+    nothing, longest = Glance(size_px=SIZE, view=None), 0.0
+    for k in range(MAX_FRAMES):
+        began = time.process_time()
+        advice = guide.advise(nothing)
+        longest = max(longest, time.process_time() - began)
+        if advice.enough:
+            break
+        asked = guide.asked(SIZE)
+        held = (see(by_hand(asked.cam_from_board, BOARD, rng), lens, f"{k:03d}", rng) for _ in range(TRIES))
+        view = next((one for one in held if one is not None), None)
+        if view is not None:
+            guide.add(view, SIZE)
+    found, said = ended(guide, advice, lens.field_deg, longest)
+    return Session(true=true_error(lens, found.camera), **said)  # type: ignore[arg-type]
+
+
+def real(images: Images, goal_px: float, rng: np.random.Generator) -> Session:
+    """Offer the images of a capture, those left over once more, as long as some are taken."""
+    size_px = images.full.camera.size_px
+    board = images.views[0].board
+    guide = CaptureGuide(GuideOptions(boards=(board,), hfov_deg=CAPTURES_DEG.get(images.name, 70.0), goal_px=goal_px))
+    left: Sequence[int] = rng.permutation(len(images.views)).tolist()
+    advice, longest = guide.advise(Glance(size_px=size_px, view=None)), 0.0
+    while left and not advice.enough:
+        again = []
+        for k in left:
+            began = time.process_time()
+            seen = Glance(size_px=size_px, view=images.views[k], edge_px=2.0, moved_px=0.0, contrast=150.0)
+            advice = guide.advise(seen, WORTH_OF_PHOTO)
+            longest = max(longest, time.process_time() - began)
+            if advice.enough:
+                break
+            if advice.take:
+                guide.add(images.views[k], size_px)
+            else:
+                again.append(k)
+        if len(again) == len(left):
+            break
+        left = again
+    advice = guide.advise(Glance(size_px=size_px, view=None))
+    found, said = ended(guide, advice, None, longest)
+    true = compare_cameras(images.full.camera, found.camera, grid=GRID, mask=images.mask).rms_px
+    return Session(true=true, **said)  # type: ignore[arg-type]
+
+
+CAPTURES_DEG = {"camodocal": 180.0, "ocam": 180.0, "fisheye-chess": 180.0, "ov-plane": 120.0}
+"""Fields of view as somebody would tell them, where they are not usual."""
+
+
+def together(name: str, sessions: Sequence[Session]) -> None:
+    reached = [s for s in sessions if s.reached]
+    early = sum(s.stated > SAME * s.said for s in reached)
+    ratio = np.array([s.stated / s.said for s in sessions])
+    print(
+        f"== {name}: {np.median([s.frames for s in sessions]):.0f} frames (median), goal reached in {len(reached)} of "
+        f"{len(sessions)}, in {early} of these `calibrate` states more; stated over said {np.median(ratio):.2f} "
+        f"(at most {ratio.max():.2f}), true over stated {np.median([s.true / s.stated for s in sessions]):.2f} "
+        f"(at most {max(s.true / s.stated for s in sessions):.2f})",
+        flush=True,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--lens", nargs="+", choices=sorted(LENSES), default=list(LENSES))
+    parser.add_argument("--goal", type=float, default=0.1, help="px")
+    parser.add_argument("--real", nargs="*", choices=sorted(CAPTURES), metavar="SET", help="of split_halves.py instead")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
+    args = parser.parse_args()
+    for name in args.lens if args.real is None else args.real:
+        images = None if args.real is None else Images.of(name, args.data, args.cache)
+        sessions = []
+        for seed in range(args.seeds):
+            rng = np.random.default_rng([seed, 5])
+            sessions.append(simulated(name, args.goal, rng) if images is None else real(images, args.goal, rng))
+            print(f"{name:8s} {seed}: {sessions[-1]}", flush=True)
+        together(name, sessions)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""There are enough frames only where all of `calibrate`, done while the capture goes on, says so of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from coach.test_coach import BOARD, CAMERA, SIZE
+from helpers.calibration_scenes import noisy_view
+
+from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.coach.guide import CHECKING, CaptureGuide, GuideOptions
+from rigkit.coach.look import Glance
+from rigkit.coach.whole import STEADY, Whole, WholeCalibrations, whole_calibration
+from rigkit.core.detections import BoardView
+from rigkit.planning.candidates import Reach, held_boards
+from rigkit.planning.goal import projection_goal
+from rigkit.workflows.coach import CoachOptions, open_coach
+
+FRAMES, NOISE_PX = 10, 0.05
+EMPTY = Glance(size_px=SIZE, view=None)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[BoardView]:
+    rng, held = np.random.default_rng(8), held_boards(CAMERA, BOARD, Reach(nearest_mm=250.0))
+    return [noisy_view(CAMERA, held.pose(10 * k), f"{k}", rng, NOISE_PX, board=BOARD) for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def whole(views: list[BoardView]) -> Whole:
+    found = whole_calibration(views, SIZE)
+    assert found is not None
+    return found
+
+
+class Later(Executor):
+    """Does nothing until it is told the result."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, Future[Any]]] = []
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.asked.append((len(args[0]), Future()))
+        return self.asked[-1][1]
+
+    def tell(self, found: Whole | None) -> int:
+        """Answer what was asked last; return of how many frames it was."""
+        count, future = self.asked[-1]
+        future.set_result(found)
+        return count
+
+
+def guide_of(views: Sequence[BoardView], executor: Executor, goal_px: float) -> CaptureGuide:
+    guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=goal_px), executor)
+    for view in views:
+        guide.add(view, SIZE)
+    return guide
+
+
+def test_it_waits_for_all_of_calibrate_and_says_what_that_states(views: list[BoardView], whole: Whole) -> None:
+    later = Later()
+    guide = guide_of(views, later, goal_px=10.0)
+    seen = Glance(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
+    now = guide.advise(seen)
+    assert now.waits and now.words == CHECKING and not now.enough and not now.take
+    assert later.tell(whole) == FRAMES and guide.advise(seen).waits, "no held-out error of fewer to compare with"
+    assert later.tell(whole) == FRAMES - 1
+    now = guide.advise(EMPTY)
+    stated = projection_goal(whole.stated.camera).error(whole.stated.covariance)
+    assert now.enough and not now.waits and now.words.startswith("Enough: ")
+    assert now.error == pytest.approx(stated) and now.error_px == pytest.approx(stated)
+    # Another frame makes it better, but nobody has calibrated it.
+    more = noisy_view(CAMERA, held_boards(CAMERA, BOARD, Reach()).pose(7), "more", np.random.default_rng(9), NOISE_PX)
+    guide.add(replace(more, board=BOARD), SIZE)
+    after = guide.advise(EMPTY)
+    assert after.waits and not after.enough and after.error is not None and after.error < now.error
+
+
+def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardView], whole: Whole) -> None:
+    stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
+    # As with a rival that nobody has told apart yet.
+    unsure = replace(whole, stated=UncertainCamera(whole.stated.camera, 9.0 * whole.stated.covariance))
+    later = Later()
+    guide = guide_of(views, later, goal_px=2.0 * stated)
+    assert guide.advise(EMPTY).waits
+    later.tell(unsure)
+    guide.advise(EMPTY)
+    later.tell(unsure)
+    now = guide.advise(EMPTY)
+    assert now.error == pytest.approx(3.0 * stated)
+    # What it is less sure of is said, and that more pictures would not bring it where that is so.
+    assert not now.enough or f"not {2.0 * stated:g} px" in now.words
+
+
+def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: Whole) -> None:
+    usual = whole.calibration.heldout_rms_px
+    assert usual is not None
+    worse = replace(whole.calibration, heldout_rms_px=(1.0 + 2.0 * STEADY) * usual)
+    later = Later()
+    guide = guide_of(views, later, goal_px=10.0)
+    guide.advise(EMPTY)
+    later.tell(whole)
+    guide.advise(EMPTY)
+    later.tell(replace(whole, calibration=worse))
+    now = guide.advise(EMPTY)
+    assert not now.enough and not now.waits and now.words.startswith("One more, to see that it is steady: ")
+
+
+def test_without_its_process_the_capture_goes_on(
+    views: list[BoardView], whole: Whole, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rigkit.coach.whole.whole_calibration", lambda *_: whole)
+
+    class Ended(Executor):
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+            raise BrokenProcessPool
+
+    at_once, meanwhile = WholeCalibrations(Ended()), WholeCalibrations(later := Later())
+    at_once.ask(views, SIZE)
+    meanwhile.ask(views, SIZE)
+    later.asked[0][1].set_exception(BrokenProcessPool())
+    assert not meanwhile.arrived()
+    meanwhile.ask(views, SIZE)
+    assert at_once.arrived() and meanwhile.arrived() and at_once.latest is meanwhile.latest is whole
+
+
+def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
+    views: list[BoardView], whole: Whole, tmp_path: Path
+) -> None:
+    """Photos come one by one: no look follows the last."""
+    later = Later()
+    wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=10.0)
+    coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=wanted), executor=later)
+    for view in views:
+        coach.guide.add([Glance(size_px=SIZE, view=view)])
+    coach.look([np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)])
+    assert coach.state()["waits"]
+    for _ in range(2):
+        later.tell(whole)
+        coach.state()
+    assert coach.state()["enough"] and not coach.state()["waits"]
