@@ -5,7 +5,7 @@ that there are enough. REAL: the images of a capture, in a random order, offered
 folder are, until it says so. In both, what the coach says is put beside what all of `calibrate` states, and beside the
 truth: the lens, or the calibration from all images where boards were.
 
-    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--real [SET ...]] [--data DIR] [--cache DIR]
+    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--real SET ... [--data DIR] [--cache DIR]]
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import compare_cameras
-from rigkit.coach.guide import WORTH_OF_PHOTO, Advice, CaptureGuide, GuideOptions
+from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions
 from rigkit.coach.look import Glance
 from rigkit.core.detections import BoardView
 from rigkit.planning.candidates import Reach
@@ -135,7 +135,7 @@ def real(images: Images, goal_px: float, rng: np.random.Generator) -> Session:
         for k in left:
             began = time.process_time()
             seen = Glance(size_px=size_px, view=images.views[k], edge_px=2.0, moved_px=0.0, contrast=150.0)
-            advice = guide.advise(seen, WORTH_OF_PHOTO)
+            advice = guide.advise(seen, photo=True)
             longest = max(longest, time.process_time() - began)
             if advice.enough:
                 break
@@ -174,7 +174,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lens", nargs="+", choices=sorted(LENSES), default=list(LENSES))
     parser.add_argument("--goal", type=float, default=0.1, help="px")
-    parser.add_argument("--real", nargs="*", choices=sorted(CAPTURES), metavar="SET", help="of split_halves.py instead")
+    parser.add_argument("--real", nargs="+", choices=sorted(CAPTURES), metavar="SET", help="of split_halves.py instead")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
     args = parser.parse_args()

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.coach.guide import WORTH_OF_PHOTO, WORTH_TAKING, GuideOptions
+from rigkit.coach.guide import GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import RigAdvice, RigGuide
@@ -105,8 +105,7 @@ class Coach:
         with self._lock:
             whole = photo or take is Take.YES
             glances = self._glances(images, whole=whole, photo=photo)
-            worth_taking = WORTH_OF_PHOTO if photo else WORTH_TAKING
-            advice = self.guide.advise(glances, worth_taking)
+            advice = self.guide.advise(glances, photo=photo)
             kept = take is Take.YES or (take is Take.WORTH and advice.take)
             taken = None
             if kept and any(glance.view is not None for glance in glances):

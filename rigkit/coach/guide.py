@@ -38,7 +38,8 @@ CHECKING = "Wait a moment: is it enough?"
 WORTH_TAKING = 0.6
 """A frame that brings this part of what the outline would bring is taken, wherever the board is."""
 WORTH_OF_PHOTO = 0.2
-"""A photo is there already, and another like the outline may never come: five of these bring as much."""
+"""A photo is there already, and another like the outline may never come: five of these bring as much. One that takes
+WORTH_GOING_ON of the error away is taken, too, however much more the outline would."""
 WORTH_GOING_ON = 0.05
 """Where two more frames would bring less than this, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
@@ -158,13 +159,13 @@ class CaptureGuide:
                 return
             self._plan = self._map = None
 
-    def advise(self, glance: Glance, least_worth: float = WORTH_TAKING) -> Advice:
-        """Return what to do, and whether to take this frame: it must be worth at least so much."""
+    def advise(self, glance: Glance, *, photo: bool = False) -> Advice:
+        """Return what to do, and whether to take this frame, or `photo`."""
         self._go_on()
         plan = self._planned(glance.size_px)
         target = self.asked(glance.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        worth = self._worth(glance.view, plan)
+        worth, least_worth = self._worth(glance.view, plan, photo=photo), least_worth_of(photo=photo)
         error = None if self.calibration is None else self._stated(plan, plan.goal)
         error_px = None if error is None else self._stated(plan, self._projection(plan))
         reached = error is not None and error <= self.options.wanted
@@ -271,9 +272,10 @@ class CaptureGuide:
                 knowledge = knowledge.with_views(held_view(view, pose), view.board.board_id)
         return knowledge, self.options.goal(knowledge.camera)
 
-    def _worth(self, view: BoardView | None, plan: Plan) -> float:
+    def _worth(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
         """Return what this frame brings, as a part of what the outline would: nothing where the board was not moved
-        since one that is taken, for the two count as one."""
+        since one that is taken, for the two count as one. A photo that is new is worth taking as one of the first, and
+        where it takes enough off the error."""
         if view is None or _distinct([*self.views, view]) == _distinct(self.views):
             return 0.0
         pose = _pose(plan.knowledge.camera, view)
@@ -282,7 +284,17 @@ class CaptureGuide:
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
         after = float(plan.goal.error(covariance_of(known.information + more)))
-        return (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
+        brings = (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
+        if not photo:
+            return brings
+        # So few frames do not tell what others would bring.
+        few = WORTH_OF_PHOTO if _distinct(self.views) < ENOUGH_FRAMES else 0.0
+        return max(brings, WORTH_OF_PHOTO / WORTH_GOING_ON * (1.0 - after / plan.error), few)
+
+
+def least_worth_of(*, photo: bool) -> float:
+    """Return what a frame has to be worth to be taken."""
+    return WORTH_OF_PHOTO if photo else WORTH_TAKING
 
 
 def _distinct(views: Sequence[BoardView]) -> int:

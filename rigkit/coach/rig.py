@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.coach.guide import WORTH_TAKING, Advice, CaptureGuide, GuideOptions, held_view
+from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions, held_view, least_worth_of
 from rigkit.coach.look import Glance
 from rigkit.core.arrays import Pixels
 from rigkit.planning.candidates import held_boards, outline_mm
@@ -65,9 +65,10 @@ class RigGuide:
             if glance.view is not None:
                 lens.add(glance.view, glance.size_px)
 
-    def advise(self, glances: Sequence[Glance], least_worth: float = WORTH_TAKING) -> RigAdvice:
-        """Return what to do, and whether to take these frames: they must be worth at least so much."""
-        lenses = tuple(lens.advise(glance, least_worth) for lens, glance in zip(self.lenses, glances, strict=True))
+    def advise(self, glances: Sequence[Glance], *, photo: bool = False) -> RigAdvice:
+        """Return what to do, and whether to take these frames, or photos."""
+        least_worth = least_worth_of(photo=photo)
+        lenses = tuple(lens.advise(glance, photo=photo) for lens, glance in zip(self.lenses, glances, strict=True))
         seeing = [g for g in glances if g.view is not None]
         good = bool(seeing) and not any(g.complaint for g in seeing)
         # Nobody knows an error: the lens with the fewest frames goes first.

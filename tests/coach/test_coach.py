@@ -95,7 +95,7 @@ def test_a_photo_that_is_there_needs_to_bring_less_than_a_frame_that_may_be_wait
     )
     photo = far.as_photo()
     assert WORTH_OF_PHOTO < guide.advise(photo).worth < WORTH_TAKING
-    assert not guide.advise(photo).take and guide.advise(photo, WORTH_OF_PHOTO).take
+    assert not guide.advise(photo).take and guide.advise(photo, photo=True).take
 
 
 def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[np.ndarray], tmp_path: Path) -> None:
