@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from bench_planner import BOARD, GRID, LENSES, NOISE_PX, SIZE, Lens, by_hand, true_error
-from planner.real import Images
+from bench_planner import BOARD, LENSES, NOISE_PX, SIZE, Lens, by_hand, true_error
+from planner.real import GRID, Images
 from split_halves import CAPTURES
 
 from rigkit.calibration.calibrate import calibrate
