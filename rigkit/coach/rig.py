@@ -89,7 +89,7 @@ class RigGuide:
             lenses[speaks].words,
             [a.target_px if c == speaks and not a.waits else None for c, a in enumerate(lenses)],
         )
-        if len(lenses) > 1:
+        if len(lenses) > 1 and not enough:
             words = f"{self.names[speaks]}: {words}"
         if lenses[speaks].enough and open_mounts:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))

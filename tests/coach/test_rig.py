@@ -107,6 +107,7 @@ def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator) ->
         assert asked.enough or all(target is not None for target in asked.targets), "outlines in both images"
     assert advice.enough and k >= 5 * (SHARED_FRAMES - 1)
     assert advice.mount_px is not None and advice.mount_px < 0.3
+    assert advice.words.startswith("Enough: ")
     state = guide.state(now, advice)
     assert [camera["name"] for camera in state["cameras"]] == ["left", "right"]
     assert state["cameras"][0]["map"][0] and json.dumps(state)
