@@ -75,10 +75,11 @@ def test_it_waits_for_all_of_calibrate_and_says_what_that_states(views: list[Boa
     now = guide.advise(EMPTY)
     stated = projection_goal(whole.stated.camera).error(whole.stated.covariance)
     assert now.enough and not now.waits and now.words.startswith("Enough: ")
+    assert now.error is not None
     assert now.error == pytest.approx(stated) and now.error_px == pytest.approx(stated)
     # Another frame makes it better, but nobody has calibrated it.
-    more = noisy_view(CAMERA, held_boards(CAMERA, BOARD, Reach()).pose(7), "more", np.random.default_rng(9), NOISE_PX)
-    guide.add(replace(more, board=BOARD), SIZE)
+    pose = held_boards(CAMERA, BOARD, Reach(nearest_mm=250.0)).pose(7)
+    guide.add(noisy_view(CAMERA, pose, "more", np.random.default_rng(9), NOISE_PX, board=BOARD), SIZE)
     after = guide.advise(EMPTY)
     assert after.waits and not after.enough and after.error is not None and after.error < now.error
 
