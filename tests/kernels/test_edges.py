@@ -182,7 +182,7 @@ def test_what_the_memory_held_before_does_not_matter(rng: np.random.Generator, m
     sign = np.where(np.indices(cells.shape).sum(axis=0) % 2 == 0, 1.0, -1.0).ravel()
     rows, room = [], kernels().edges_scratch
     for held in (0.0, 5.0, 1e13, np.nan):
-        monkeypatch.setattr(edges, "_scratch", lambda rules, held=held: np.full(room(rules), held, np.float32))
+        monkeypatch.setattr(edges, "scratch_of", lambda rules, held=held: np.full(room(rules), held, np.float32))
         # One by one: a window covers what a smaller one before it has left.
         for alone in np.eye(cells.size, dtype=bool):
             corner = truth.reshape(-1, 2)[alone] + 0.2, geometry.of(alone), sign[alone], np.ones(1)
