@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,6 +46,12 @@ class Plan:
     def gain(self) -> float:
         """The part of the error that all views together take away."""
         return 1.0 - self.views[-1].error / self.error if self.views else 0.0
+
+    def stated(self, error: float) -> Plan:
+        """Return the plan with this error before the views, and those after them changed in proportion: a calibration
+        states what its images agree on, which may be more or less than what their corners would tell."""
+        factor = error / self.error
+        return replace(self, error=error, views=tuple(replace(v, error=factor * v.error) for v in self.views))
 
 
 def covariance_of(information: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
@@ -32,14 +33,16 @@ def next_views(
     length: Task | None = None,
     reach: Reach | None = None,
 ) -> Plan:
-    """Return the views of `boards` that would improve a calibration most, the first near the last one taken.
+    """Return the views of `boards` that would improve a calibration most, the first near the last one taken; the error
+    before them is what the calibration states.
 
     Raises as `plan_views` and `goal_of`.
     """
     reach = reach or Reach()
     known = Knowledge.beyond_model(calibration)
     last = calibration.views[-1].cam_from_board
-    return plan_views(known, boards, goal_of(known.camera, reach, length), count, reach=reach, last=last)
+    goal, stated = goal_of(known.camera, reach, length), uncertain_camera(calibration).covariance
+    return plan_views(known, boards, goal, count, reach=reach, last=last).stated(float(goal.error(stated)))
 
 
 def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:

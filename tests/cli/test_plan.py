@@ -10,11 +10,13 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_values
-from rigkit.io.calibration_file import camera_to_json, save_calibration
+from rigkit.io.calibration_file import camera_to_json, load_calibration, save_calibration
+from rigkit.planning.goal import projection_goal
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +34,8 @@ def test_next_pictures_of_a_calibration(calibrated: Path, tmp_path: Path, capsys
     data = json.loads(capsys.readouterr().out)
     errors = [data["error_now"], *(view["error_then"] for view in data["views"])]
     assert errors == sorted(errors, reverse=True) and len(errors) == 3
+    stated = uncertain_camera(load_calibration(calibrated))
+    assert errors[0] == pytest.approx(float(projection_goal(stated.camera).error(stated.covariance)))
     outline = np.array(data["views"][0]["outline_px"])
     assert (outline >= 0.0).all() and (outline <= [1623.0, 1239.0]).all()
     text = page.read_text()
