@@ -43,6 +43,7 @@ EXAMPLES: dict[str, str] = {
 """,
     "plan": """\
   rigkit plan calibration.json -r next.html               the three pictures that would help most, drawn
+  rigkit plan rig.json                                    the same for a rig, of all cameras at once
   rigkit plan calibration.json --check                    the three pictures to check it with
   rigkit plan session.toml -n 5 --length 800 --distance 1500
   rigkit plan --lens 120 --size 1280x960 --board 9x6x30 --views 12

@@ -19,13 +19,17 @@ MAX_VIEWS = 100
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "source", nargs="?", type=Path, metavar="CALIBRATION|SESSION.toml", help="what there is so far; or give --lens"
+        "source",
+        nargs="?",
+        type=Path,
+        metavar="CALIBRATION|RIG.json|SESSION.toml",
+        help="what there is so far; or give --lens",
     )
     parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
     parser.add_argument(
         "--check",
         action="store_true",
-        help="pictures to check it (or a rig.json) with: those that would tell changes best",
+        help="pictures to check it with: those that would tell changes best",
     )
     parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")

@@ -31,6 +31,7 @@ from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, sess
 from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.corners import Cache
+from rigkit.workflows.next_frames import next_frames
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
 from rigkit.workflows.provenance import digest_line, software_facts
 
@@ -84,22 +85,17 @@ class PlannedSession:
 def plan_session(
     path: str | Path, options: PlanOptions | None = None, *, progress: Progress = silent
 ) -> PlannedSession:
-    """Return the views that would improve a calibration most, given its file or the session that it comes from; or
-    those to check it with, of a rig, too.
+    """Return the views that would improve a calibration most, given its file or the session that it comes from, or a
+    rig, given its file; or those to check it with.
 
-    Raises InputError: a rig that is to be improved (its cameras are planned one by one), a file that is neither, or a
-    page that cannot be written; DegenerateError: the views so far do not determine the camera, or no board can be held
+    Raises InputError: the session of a rig, a file that is none of these, or a page that cannot be written;
+    DegenerateError: the views so far do not determine the camera, or no board can be held
     in view.
     """
     options, source = options or PlanOptions(), Path(path)
     rig = is_rig_session(source) if source.suffix == ".toml" else is_rig_file(source)
-    if rig and source.suffix == ".toml" and options.check:
+    if rig and source.suffix == ".toml":
         raise InputError(f"plan: '{source}' is a session of a rig; give the rig that it was calibrated to, rig.json")
-    if rig and not options.check:
-        raise InputError(
-            f"plan: '{source}' is of a rig; give the calibration of the camera that is to be improved, "
-            "rig-CAMERA.json, or ask for pictures to check the rig with: --check"
-        )
     ensure_writable(options.report, force=options.force, inputs=[source])
     if source.suffix != ".toml":
         warn_if_bad(source)
@@ -107,7 +103,11 @@ def plan_session(
         watched, boards = load_watched(source)
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
-        return _checked(watched, boards, options, source)
+        if options.check:
+            return _checked(watched, boards, options, source)
+        with about(source):
+            plan = next_frames(watched, boards, options.count, length=options.length, reach=options.reach)
+        return _shown(plan, options, f"Next pictures for {source.name}", source)
     if source.suffix == ".toml":
         session = load_session(source)
         calibrating = CalibrateOptions(cache=Cache.UPDATE)

@@ -89,15 +89,13 @@ def test_what_is_refused(command: list[str], words: str, capsys: pytest.CaptureF
     assert words in capsys.readouterr().err
 
 
-def test_a_rig_is_planned_camera_by_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, session = tmp_path / "rig.json", tmp_path / "rig.toml"
-    path.write_text('{"schema": "rigkit.rig/1"}')
-    assert main(["plan", str(path)]) == 2
-    assert "rig-CAMERA.json" in capsys.readouterr().err
+def test_a_session_of_a_rig_is_planned_by_its_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = tmp_path / "rig.toml"
     cameras = "".join(f'[[cameras]]\nid = "{name}"\nimages = "{name}*.png"\n' for name in ("left", "right"))
     session.write_text(f'schema = "rigkit.session/1"\nboard = "board.toml"\n{cameras}')
-    assert main(["plan", str(session), "--check"]) == 2
-    assert "rig.json" in capsys.readouterr().err
+    for asked in ([], ["--check"]):
+        assert main(["plan", str(session), *asked]) == 2
+        assert "rig.json" in capsys.readouterr().err
 
 
 def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -125,6 +123,12 @@ def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixt
     assert all(set(view["seen_by"]) == set(poses) for view in said["views"])
     text = page.read_text()
     assert "before camera" in text and "rotation of right" in text and text.count("<svg") == 2
+    assert main(["plan", str(path), "-n", "2", "--json"]) == 0
+    better = json.loads(capsys.readouterr().out)
+    assert "mounts included" in better["goal"]
+    assert better["error_now"] > better["views"][0]["error_then"] > better["views"][1]["error_then"]
+    assert main(["plan", str(path), "-n", "1", "--length", "300", "--distance", "900"]) == 0
+    assert "standard error of a length of 300 mm" in capsys.readouterr().out
 
 
 def test_a_calibration_that_was_called_bad_is_warned_of(

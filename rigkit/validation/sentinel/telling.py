@@ -15,15 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.rigid3 import Rigid3
-from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees_held
+from rigkit.core.errors import InputError
+from rigkit.planning.candidates import Reach
 from rigkit.planning.information import CornerError, Knowledge
-from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
+from rigkit.planning.plan import Plan, choose_views, covariance_of
 from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched, told_by
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.frames import Frames
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 from rigkit.validation.sentinel.power import LENS_KINDS, Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK
@@ -86,68 +86,6 @@ def _metric(watched: Watched, cause: Cause) -> FloatArray | None:
     return np.radians(1.0) ** 2 * turn_weight(watched.cameras[c]) if cause.kind == "rotation" else None
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Frames:
-    """Frames that could be taken: boards in poses rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3), the
-    numbers of the boards (C,), which cameras see all of them (C, cameras), that for which each was thought of first
-    (C,), and what they say of theta (C, T, T) in px^2."""
-
-    rotation: FloatArray
-    translation_mm: Points
-    board: IntArray
-    seen: BoolArray
-    owner: IntArray
-    information: FloatArray
-
-    @classmethod
-    def of(cls, watched: Watched, boards: Sequence[Board], reach: Reach) -> _Frames:
-        """Raises DegenerateError where no board fits into the image of any camera."""
-        parts: list[_Frames] = []
-        refused: DegenerateError | None = None
-        for number, board in enumerate(boards):
-            for c in range(len(watched.cameras)):
-                try:
-                    parts.append(cls._before(watched, c, board, number, reach))
-                except DegenerateError as error:
-                    refused = error
-        if not parts:
-            assert refused is not None
-            raise refused
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
-
-    @classmethod
-    def _before(cls, watched: Watched, c: int, board: Board, number: int, reach: Reach) -> _Frames:
-        """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
-        held = held_boards(watched.cameras[c], board, reach)
-        held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
-        in_rig = held.carried(watched.cam_from_rig[c].inverse())
-        seen = np.stack(
-            [
-                sees_held(camera, board, in_rig.carried(pose), reach)
-                for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
-            ],
-            axis=1,
-        )
-        seen[:, c] = True
-        corners = [own[:, None] & board.exists() for own in seen.T]
-        count = np.ones(len(held), dtype=np.int64)
-        told = told_by(watched, board, in_rig.rotation, in_rig.translation_mm, corners)
-        return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, told)
-
-    def proposal(self, index: int, watched: Watched, board: Board, error: float) -> Proposal:
-        """Return one as a view of the camera for which it was thought of."""
-        c = int(self.owner[index])
-        rig_from_board = Rigid3(self.rotation[index], self.translation_mm[index])
-        names = [watched.names[c], *(n for k, n in enumerate(watched.names) if self.seen[index, k] and k != c)]
-        return Proposal(
-            board,
-            watched.cam_from_rig[c] @ rig_from_board,
-            error,
-            watched.cameras[c],
-            tuple(names) if len(watched.names) > 1 else (),
-        )
-
-
 def views_that_tell(
     watched: Watched, boards: Sequence[Board], count: int, reach: Reach | None = None
 ) -> tuple[Plan, tuple[Power, ...]]:
@@ -159,13 +97,11 @@ def views_that_tell(
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
-    frames, sigma = _Frames.of(watched, boards, reach or Reach()), watched.fresh_sigma_px
+    frames, sigma = Frames.of(watched, boards, reach or Reach()), watched.fresh_sigma_px
     inverse, told = covariance_of(watched.covariance), frames.information / sigma**2
     aim = ChangeAim.of(watched, inverse, told.sum(axis=0))
     taken, errors = choose_views(inverse, told, aim, count)
-    views = [
-        frames.proposal(i, watched, boards[frames.board[i]], error) for i, error in zip(taken, errors, strict=True)
-    ]
+    views = frames.proposals(watched, boards, taken, errors)
     evidence = FreshEvidence(
         information=frames.information[taken],
         score=np.zeros((len(taken), watched.layout.count)),

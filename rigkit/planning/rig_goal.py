@@ -1,0 +1,63 @@
+"""What a rig is for, as a weight on the errors of its lenses and mounts together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rigkit.calibration.rig.layout import Layout
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.arrays import FloatArray, Points
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
+from rigkit.planning.goal import GOAL_GRID, Goal
+
+
+def rig_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], distance_mm: float) -> Goal:
+    """Return the mean square error of the projections of all cameras, for what lies at a distance before each of them:
+    where one point appears in two cameras, lenses and mounts err together. The motion of the world, which boards leave
+    open, follows as well as it can.
+
+    Its weight is on the parameters of all cameras, then the mounts of all but the first (`Layout.of_cameras`): left
+    rotation perturbation, rad, and translation, mm.
+    """
+    points = np.concatenate([_before(c, pose, distance_mm) for c, pose in zip(cameras, cam_from_rig, strict=True)])
+    layout = Layout.of_cameras(cameras)
+    rows = np.concatenate(
+        [_design(c, pose, points, layout, k) for k, (c, pose) in enumerate(zip(cameras, cam_from_rig, strict=True))]
+    )
+    # Turns by radians and shifts by millimetres: of one size at the distance.
+    motion = rows[:, layout.count :] / np.array([1.0, 1.0, 1.0, *[1.0 / distance_mm] * 3])
+    along, _ = np.linalg.qr(motion)
+    left = rows[:, : layout.count] - along @ (along.T @ rows[:, : layout.count])
+    what = f"rms error of all projections, {distance_mm:.0f} mm away, mounts included"
+    return Goal(left.T @ left / (len(rows) / 2), "px", what)
+
+
+def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float) -> Points:
+    """Return what a camera sees at a distance, all over its image, in the rig's frame."""
+    rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
+    return cam_from_rig.inverse().apply(distance_mm * rays[valid])
+
+
+def _design(camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int) -> FloatArray:
+    """Return how the pixels of the points that camera `k` sees move, (2 N, G + 6): by all of the layout, and by a
+    motion of the world."""
+    turned = points @ cam_from_rig.rotation.T
+    in_cam = turned + cam_from_rig.translation_mm
+    by_point = np.zeros((2, 3, len(points)))
+    by_parameters = np.zeros((2, camera.parameters.size, len(points)))
+    u, v, valid = camera.derivatives(in_cam[:, 0], in_cam[:, 1], in_cam[:, 2], by_point, by_parameters)
+    seen = valid & camera.on_image(np.stack([u, v], axis=-1))
+    slope = by_point[..., seen].transpose(2, 0, 1)
+    out = np.zeros((len(slope), 2, layout.count + 6))
+    out[..., layout.cameras[k]] = by_parameters[..., seen].transpose(2, 0, 1)
+    # x = exp(w) R X + t + v of the mount; R (exp(W) X + T) + t of the world.
+    mount = layout.mounts[k]
+    if mount is not None:
+        out[..., mount] = np.concatenate([-slope @ skew(turned[seen]), slope], axis=-1)
+    by_world = slope @ cam_from_rig.rotation
+    out[..., layout.count :] = np.concatenate([-by_world @ skew(points[seen]), by_world], axis=-1)
+    return out.reshape(-1, layout.count + 6)

@@ -1,0 +1,85 @@
+"""Frames that could be taken of a camera or of all cameras of a rig at once, and what they would say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees_held
+from rigkit.planning.plan import Proposal
+from rigkit.validation.sentinel.evidence import Watched, told_by
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frames:
+    """Frames that could be taken: boards in poses rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3), the
+    numbers of the boards (C,), which cameras see all of them (C, cameras), that for which each was thought of first
+    (C,), and what they say of theta (C, T, T) in px^2."""
+
+    rotation: FloatArray
+    translation_mm: Points
+    board: IntArray
+    seen: BoolArray
+    owner: IntArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, watched: Watched, boards: Sequence[Board], reach: Reach) -> Frames:
+        """Raises DegenerateError where no board fits into the image of any camera."""
+        parts: list[Frames] = []
+        refused: DegenerateError | None = None
+        for number, board in enumerate(boards):
+            for c in range(len(watched.cameras)):
+                try:
+                    parts.append(cls._before(watched, c, board, number, reach))
+                except DegenerateError as error:
+                    refused = error
+        if not parts:
+            assert refused is not None
+            raise refused
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
+
+    @classmethod
+    def _before(cls, watched: Watched, c: int, board: Board, number: int, reach: Reach) -> Frames:
+        """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
+        held = held_boards(watched.cameras[c], board, reach)
+        held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
+        in_rig = held.carried(watched.cam_from_rig[c].inverse())
+        seen = np.stack(
+            [
+                sees_held(camera, board, in_rig.carried(pose), reach)
+                for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
+            ],
+            axis=1,
+        )
+        seen[:, c] = True
+        corners = [own[:, None] & board.exists() for own in seen.T]
+        count = np.ones(len(held), dtype=np.int64)
+        told = told_by(watched, board, in_rig.rotation, in_rig.translation_mm, corners)
+        return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, told)
+
+    def proposals(
+        self, watched: Watched, boards: Sequence[Board], taken: Sequence[int], errors: Sequence[float]
+    ) -> tuple[Proposal, ...]:
+        """Return some, and the errors after them, as views of the cameras for which they were thought of."""
+        return tuple(
+            self._proposal(k, watched, boards[self.board[k]], error) for k, error in zip(taken, errors, strict=True)
+        )
+
+    def _proposal(self, index: int, watched: Watched, board: Board, error: float) -> Proposal:
+        c = int(self.owner[index])
+        rig_from_board = Rigid3(self.rotation[index], self.translation_mm[index])
+        names = [watched.names[c], *(n for k, n in enumerate(watched.names) if self.seen[index, k] and k != c)]
+        return Proposal(
+            board,
+            watched.cam_from_rig[c] @ rig_from_board,
+            error,
+            watched.cameras[c],
+            tuple(names) if len(watched.names) > 1 else (),
+        )
