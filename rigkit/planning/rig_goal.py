@@ -12,22 +12,22 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
-from rigkit.planning.goal import GOAL_GRID, Goal
+from rigkit.planning.goal import GOAL_GRID, Goal, rays_within
 
 
-def rig_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], distance_mm: float) -> Goal:
+def rig_goal(
+    cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], distance_mm: float, field_deg: float | None = None
+) -> Goal:
     """Return the mean square error of the projections of all cameras, for what lies at a distance before each of them:
     where one point appears in two cameras, lenses and mounts err together. The motion of the world, which boards leave
-    open, follows as well as it can.
+    open, follows as well as it can. Lenses see no farther than a field of view of `field_deg`.
 
     Its weight is on the parameters of all cameras, then the mounts of all but the first (`Layout.of_cameras`): left
     rotation perturbation, rad, and translation, mm.
     """
-    points = np.concatenate([_before(c, pose, distance_mm) for c, pose in zip(cameras, cam_from_rig, strict=True)])
-    layout = Layout.of_cameras(cameras)
-    rows = np.concatenate(
-        [_design(c, pose, points, layout, k) for k, (c, pose) in enumerate(zip(cameras, cam_from_rig, strict=True))]
-    )
+    placed, layout = list(zip(cameras, cam_from_rig, strict=True)), Layout.of_cameras(cameras)
+    points = np.concatenate([_before(c, pose, distance_mm, field_deg) for c, pose in placed])
+    rows = np.concatenate([_design(c, pose, points, layout, k, field_deg) for k, (c, pose) in enumerate(placed)])
     # Turns by radians and shifts by millimetres: of one size at the distance.
     motion = rows[:, layout.count :] / np.array([1.0, 1.0, 1.0, *[1.0 / distance_mm] * 3])
     along, _ = np.linalg.qr(motion)
@@ -36,13 +36,15 @@ def rig_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], distance
     return Goal(left.T @ left / (len(rows) / 2), "px", what)
 
 
-def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float) -> Points:
+def _before(camera: Camera, cam_from_rig: Rigid3, distance_mm: float, field_deg: float | None) -> Points:
     """Return what a camera sees at a distance, all over its image, in the rig's frame."""
-    rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
-    return cam_from_rig.inverse().apply(distance_mm * rays[valid])
+    rays = rays_within(camera, grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2), field_deg)
+    return cam_from_rig.inverse().apply(distance_mm * rays)
 
 
-def _design(camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int) -> FloatArray:
+def _design(
+    camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout, k: int, field_deg: float | None
+) -> FloatArray:
     """Return how the pixels of the points that camera `k` sees move, (2 N, G + 6): by all of the layout, and by a
     motion of the world."""
     turned = points @ cam_from_rig.rotation.T
@@ -51,6 +53,8 @@ def _design(camera: Camera, cam_from_rig: Rigid3, points: Points, layout: Layout
     by_parameters = np.zeros((2, camera.parameters.size, len(points)))
     u, v, valid = camera.derivatives(in_cam[:, 0], in_cam[:, 1], in_cam[:, 2], by_point, by_parameters)
     seen = valid & camera.on_image(np.stack([u, v], axis=-1))
+    if field_deg is not None:
+        seen &= in_cam[:, 2] >= np.cos(np.radians(0.5 * field_deg)) * np.linalg.norm(in_cam, axis=-1)
     slope = by_point[..., seen].transpose(2, 0, 1)
     out = np.zeros((len(slope), 2, layout.count + 6))
     out[..., layout.cameras[k]] = by_parameters[..., seen].transpose(2, 0, 1)

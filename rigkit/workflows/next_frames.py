@@ -30,9 +30,13 @@ def next_frames(
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
-    frames, sigma = Frames.of(watched, boards, reach or Reach()), watched.fresh_sigma_px
-    away = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
-    goal = rig_goal(watched.cameras, watched.cam_from_rig, away) if length is None else _length_goal(watched, length)
+    reach = reach or Reach()
+    frames, sigma = Frames.of(watched, boards, reach), watched.fresh_sigma_px
+    if length is None:
+        away = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
+        goal = rig_goal(watched.cameras, watched.cam_from_rig, away, reach.field_deg)
+    else:
+        goal = _length_goal(watched, length)
     inverse = covariance_of(watched.covariance)
     taken, errors = choose_views(inverse, frames.information / sigma**2, goal, count)
     before = float(goal.error(watched.covariance))
