@@ -56,8 +56,9 @@ def calibrated(views: Views, lens: Lens) -> RigCalibration:
 
 
 def watched(rig: RigCalibration) -> Watched:
+    """Return a rig as its file would have it."""
     return Watched(
-        names=NAMES,
+        names=tuple(c.name for c in rig.cameras),
         cameras=tuple(c.camera for c in rig.cameras),
         cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
         covariance=rig.covariance,

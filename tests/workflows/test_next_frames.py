@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bench_rig_planner import watched
 from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, Views, mounts, rig_views, sizes
 
@@ -27,18 +28,6 @@ NAMES = ("reg", "wide")
 AWAY_MM = 500.0
 HELD_DEG = 1.0
 """A board that is held otherwise than asked for brings something else: with this much, 12 % less."""
-
-
-def watched(rig: RigCalibration) -> Watched:
-    return Watched(
-        names=NAMES,
-        cameras=tuple(c.camera for c in rig.cameras),
-        cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
-        covariance=rig.covariance,
-        sigma_px=rig.sigma_px,
-        overdispersion=rig.overdispersion,
-        freedom=rig.freedom,
-    )
 
 
 def calibrated(views: Views) -> RigCalibration:
