@@ -148,6 +148,7 @@ def plan_page(
         lead="",
         told={"words": "", "colour": "", "headline": facts.headline},
         views=shown_views(plan, taken),
+        dots=taken is not None and len(taken) > 0,
         tables=[shown_table(table) for table in facts.tables],
         provenance=provenance,
     )

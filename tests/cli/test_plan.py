@@ -39,7 +39,7 @@ def test_next_pictures_of_a_calibration(calibrated: Path, tmp_path: Path, capsys
     outline = np.array(data["views"][0]["outline_px"])
     assert (outline >= 0.0).all() and (outline <= [1623.0, 1239.0]).all()
     text = page.read_text()
-    assert data["views"][1]["words"] in text and text.count("<svg") == 2
+    assert data["views"][1]["words"] in text and text.count("<svg") == 2 and "Blue dots" in text
     assert main(["plan", str(calibrated), "-r", str(page)]) == 2
     assert "exists" in capsys.readouterr().err
 
@@ -123,6 +123,7 @@ def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixt
     assert all(set(view["seen_by"]) == set(poses) for view in said["views"])
     text = page.read_text()
     assert "before camera" in text and "rotation of right" in text and text.count("<svg") == 2
+    assert "Blue dots" not in text
     assert main(["plan", str(path), "-n", "2", "--json"]) == 0
     better = json.loads(capsys.readouterr().out)
     assert "mounts included" in better["goal"]
