@@ -12,7 +12,8 @@ const NEAR_PX = 14;
 const SCALE_PX = 140;
 const TURN_PER_PX = 0.008;
 const DISTANCE = 3.2;
-const FILL = 2.1;
+// As it is first turned, the scene reaches so far from the middle of the view to its edge.
+const FILLED = 0.9;
 
 function viewer(canvas, scene) {
   const show = {normals: true, cameras: true, planes: true};
@@ -22,13 +23,28 @@ function viewer(canvas, scene) {
   const middle = [0, 1, 2].map((k) => (Math.min(...all.map((p) => p[k])) + Math.max(...all.map((p) => p[k]))) / 2);
   const reach = Math.max(...all.map((p) => Math.hypot(p[0] - middle[0], p[1] - middle[1], p[2] - middle[2])));
 
-  function project(p) {
+  // How large all is drawn, and the size of the view that this was found for.
+  let fill = 1, fitted = "";
+
+  function turned(p) {
     const x = (p[0] - middle[0]) / reach, y = (p[1] - middle[1]) / reach, z = (p[2] - middle[2]) / reach;
     const cy = Math.cos(view.yaw), sy = Math.sin(view.yaw), cp = Math.cos(view.pitch), sp = Math.sin(view.pitch);
-    const x1 = cy * x + sy * z, z1 = -sy * x + cy * z;
-    const y2 = cp * y + sp * z1, z2 = -sp * y + cp * z1 + DISTANCE;
-    const scale = view.zoom * FILL * Math.min(canvas.width, canvas.height) / (view.flat ? DISTANCE : z2);
-    return [canvas.width / 2 + scale * x1, canvas.height / 2 + scale * y2, z2];
+    const z1 = -sy * x + cy * z;
+    return [cy * x + sy * z, cp * y + sp * z1, -sp * y + cp * z1 + DISTANCE];
+  }
+
+  function project(p) {
+    const [x, y, z] = turned(p), scale = view.zoom * fill / (view.flat ? DISTANCE : z);
+    return [canvas.width / 2 + scale * x, canvas.height / 2 + scale * y, z];
+  }
+
+  function fit() {
+    const beyond = all.map((p) => {
+      const [x, y, z] = turned(p);
+      return Math.max(Math.abs(x) / canvas.width, Math.abs(y) / canvas.height) / (view.flat ? DISTANCE : z);
+    });
+    fill = FILLED / 2 / Math.max(...beyond, 1e-9);
+    fitted = `${canvas.width} ${canvas.height}`;
   }
 
   function draw() {
@@ -36,6 +52,7 @@ function viewer(canvas, scene) {
     const ratio = window.devicePixelRatio || 1;
     canvas.width = canvas.clientWidth * ratio;
     canvas.height = canvas.clientHeight * ratio;
+    if (fitted !== `${canvas.width} ${canvas.height}`) fit();
     const pen = canvas.getContext("2d");
     const wire = getComputedStyle(canvas).getPropertyValue("--wire").trim() || "#333";
     pen.clearRect(0, 0, canvas.width, canvas.height);
@@ -95,7 +112,7 @@ function viewer(canvas, scene) {
 
   // A round length that is some SCALE_PX long: true at the middle of the scene.
   function scaleBar(pen, ratio, wire) {
-    const pxPerMm = view.zoom * FILL * Math.min(canvas.width, canvas.height) / DISTANCE / reach;
+    const pxPerMm = view.zoom * fill / DISTANCE / reach;
     const rough = SCALE_PX * ratio / pxPerMm, power = 10 ** Math.floor(Math.log10(rough));
     const length = Math.max(...[1, 2, 5].map((m) => m * power).filter((m) => m <= rough));
     const x = 14 * ratio, y = canvas.height - 14 * ratio;
@@ -176,6 +193,7 @@ function viewer(canvas, scene) {
   }, {passive: false});
   canvas.addEventListener("dblclick", () => {
     view = {...START};
+    fitted = "";
     draw();
   });
   canvas.addEventListener("keydown", (e) => {
@@ -200,6 +218,7 @@ function viewer(canvas, scene) {
   for (const press of canvas.parentElement.querySelectorAll("button[data-from]")) {
     press.addEventListener("click", () => {
       view = {...FROM[press.dataset.from]};
+      fitted = "";
       draw();
     });
   }

@@ -20,12 +20,16 @@ from rigkit.validation.checks import validate
 PROBE = """<script>
 const canvas = document.querySelector("canvas[data-scene]");
 const before = canvas.dataset.view;
-const painted = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((v) => v > 0);
+const {width, height} = canvas, {data} = canvas.getContext("2d").getImageData(0, 0, width, height);
+const painted = data.some((v) => v > 0);
+const outermost = (x, y) => x === 0 || y === 0 || x === width - 1 || y === height - 1;
+const cut = data.some((v, i) => v > 0 && outermost((i >> 2) % width, Math.floor((i >> 2) / width)));
 const at = (type, x) => canvas.dispatchEvent(
   new PointerEvent(type, {clientX: x, clientY: 100, pointerId: 1, bubbles: true, isPrimary: true}));
 canvas.setPointerCapture = () => {};
 at("pointerdown", 100); at("pointermove", 160); at("pointerup", 160);
-document.body.dataset.probe = [before, canvas.dataset.view, painted, document.body.scrollWidth <= innerWidth].join("|");
+const fits = document.body.scrollWidth <= innerWidth;
+document.body.dataset.probe = [before, canvas.dataset.view, painted, cut, fits].join("|");
 </script></body>"""
 
 
@@ -40,8 +44,8 @@ def test_the_page_works_without_network(tmp_path: Path) -> None:
     )
     assert not re.search(r"""(src|href)=["']?https?:""", page)
     assert "set &lt;square&gt;" in page
-    before, after, painted, fits = probed(page.replace("</body>", PROBE), tmp_path)
-    assert painted == "true"
+    before, after, painted, cut, fits = probed(page.replace("</body>", PROBE), tmp_path)
+    assert painted == "true" and cut == "false"
     assert fits == "true"
     first, second = (np.array([float(v) for v in text.split()]) for text in (before, after))
     assert abs(first[0] - second[0]) > 0.1
