@@ -31,13 +31,15 @@ def test_a_rival_widens_the_baseline_by_its_own_difference(
     monkeypatch.setattr(assemble, "between_rig_models", keep)
     other = calibrate_rig(views, sizes(), model={**MODELS, "wide": "double_sphere"})
     rig = calibrate_rig(views, sizes(), model=MODELS)
-    joint, single, sigmas = given["arguments"]
+    joint, sigmas = given["arguments"]
+    single = joint.views.single  # type: ignore[attr-defined]
     rival = Rival("double_sphere", other.single[1].camera, LIKELY)
-    extra = between_rig_models(joint, (single[0], replace(single[1], rivals=(rival,))), sigmas)  # type: ignore[arg-type, index]
+    views_with_rival = replace(joint.views, single=(single[0], replace(single[1], rivals=(rival,))))  # type: ignore[attr-defined]
+    extra = between_rig_models(replace(joint, views=views_with_rival), sigmas)  # type: ignore[arg-type, type-var]
     count = len(rig.covariance)
     length, _ = rig.baseline_mm("reg", "wide")
     apart = abs(other.baseline_mm("reg", "wide")[0] - length)
     alone = replace(rig, covariance=extra[:count, :count], scale_sigma=0.0, departures=())
     assert apart > 0.01
     assert alone.baseline_mm("reg", "wide")[1] == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
-    assert not between_rig_models(joint, single, sigmas).any()  # type: ignore[arg-type]
+    assert not between_rig_models(joint, sigmas).any()  # type: ignore[arg-type]

@@ -10,7 +10,6 @@ import numpy as np
 from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.clustered import Clustered, effective_freedom
 from rigkit.calibration.covariance import GlobalCovariance
-from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.carried import carried, pose_products
@@ -18,7 +17,6 @@ from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.observations import Places
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.uncertainty import FarProjection
@@ -29,11 +27,7 @@ from rigkit.geometry.rigid3 import Rigid3
 
 
 def assemble_rig(
-    names: Sequence[str],
-    single: tuple[Calibration, ...],
-    joint: JointRig,
-    places: Places,
-    heldout: tuple[float | None, tuple[float | None, ...]],
+    joint: JointRig, heldout: tuple[float | None, tuple[float | None, ...]]
 ) -> tuple[RigCalibration, list[FarProjection]]:
     """Return the rig, and how sure the projection of each of its cameras is; `heldout` is the error of frames that took
     no part, over all cameras and of each.
@@ -45,17 +39,17 @@ def assemble_rig(
     sigma = residual_sigma(joint)
     known = _global_covariance(joint, sigma)
     overdispersion = known.clustered.overdispersion
-    beside = _error_of_held(joint, names, layout, single, normal.covariance[0])
+    beside = _error_of_held(joint, layout, normal.covariance[0])
     off = shape_error(observations, state, sigma * overdispersion)
     beside[: len(off), : len(off)] += np.outer(off, off)
     covariance = known.covariance
-    beside += between_rig_models(joint, single, np.sqrt(np.diag(covariance + beside)))
+    beside += between_rig_models(joint, np.sqrt(np.diag(covariance + beside)))
     covariance += beside
     boards = observations.cameras[0].boards
     points = observations.shape.points(state.unknowns)
     first_row = observations.cameras[0].first_row
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
-    cameras, squared = _cameras(joint, names, single, heldout[1], known, beside)
+    cameras, squared = _cameras(joint, heldout[1], known, beside)
     everything = np.concatenate(squared)
     last = layout.mounts[-1] or layout.cameras[-1]
     # One ruler has measured all boards: its error does not average out.
@@ -69,14 +63,14 @@ def assemble_rig(
         sigma_px=sigma,
         overdispersion=overdispersion,
         freedom=known.clustered.freedom,
-        single=single,
+        single=joint.views.single,
         convergence=joint.solution.convergence,
         corner_count=everything.size,
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
         departures=lens_modes(observations, joint.solution, far, last.stop),
-        board_rigs=_board_rigs(joint, layout, places, boards, shapes, covariance, scale, known.clustered),
+        board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
     return rig, far
 
@@ -92,19 +86,14 @@ def _global_covariance(joint: JointRig, sigma_px: float) -> GlobalCovariance:
 
 
 def _cameras(
-    joint: JointRig,
-    names: Sequence[str],
-    single: Sequence[Calibration],
-    heldout: Sequence[float | None],
-    known: GlobalCovariance,
-    beside: FloatArray,
+    joint: JointRig, heldout: Sequence[float | None], known: GlobalCovariance, beside: FloatArray
 ) -> tuple[list[RigCamera], list[FloatArray]]:
     """Return the cameras as the rig has them, and the squared residuals of the corners of each, px^2; `beside` (G, G)
     is what is not sure of the globals beside what frames show."""
     observations, state = joint.observations, joint.solution.state
     layout = state.layout(observations)
     cameras, squared = [], []
-    for c, (name, own) in enumerate(zip(names, observations.cameras, strict=True)):
+    for c, (name, own) in enumerate(zip(joint.views.names, observations.cameras, strict=True)):
         alone = state.of_camera(c, observations)
         parts = carried(observations, state, c, alone.translation_mm)
         frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, beside)
@@ -112,7 +101,7 @@ def _cameras(
         squared.append((residuals.px**2).sum(axis=-1)[kept])
         p = alone.camera.parameters.size
         found = replace(
-            single[c],
+            joint.views.single[c],
             camera=alone.camera,
             rms_px=float(np.sqrt(squared[c].mean())),
             heldout_rms_px=heldout[c],
@@ -128,14 +117,12 @@ def _cameras(
     return cameras, squared
 
 
-def _error_of_held(
-    joint: JointRig, names: Sequence[str], layout: Layout, single: Sequence[Calibration], unit: FloatArray
-) -> FloatArray:
+def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatArray:
     """Return what the errors of the values near which lenses and mounts are held add to the covariance (G, G) of all
     globals: K W C W K, with the information W by which they are held and the covariance C of those values."""
     out = np.zeros_like(unit)
-    known = joint.known
-    held = zip(names, layout.cameras, single, joint.observations.held, strict=False)
+    known, names = joint.known, joint.views.names
+    held = zip(names, layout.cameras, joint.views.single, joint.observations.held, strict=False)
     for name, where, alone, (_, information) in held:
         if known is None or name not in known.cameras:
             through = unit[:, where] @ information
@@ -169,14 +156,13 @@ def residual_sigma(joint: JointRig) -> float:
 def _board_rigs(
     joint: JointRig,
     layout: Layout,
-    places: Places,
     boards: Sequence[Board],
     shapes: dict[str, FloatArray],
     covariance: FloatArray,
     scale: float,
     clustered: Clustered,
 ) -> tuple[BoardRig, ...]:
-    state = joint.solution.state
+    state, places = joint.solution.state, joint.views.places
     index = {b.board_id: i for i, b in enumerate(boards)}
     freedom = effective_freedom(clustered.freedom, clustered.overdispersion, len(clustered.covariance))
     out = []
@@ -191,7 +177,7 @@ def _board_rigs(
             int
         )
         scenes: dict[tuple[int, str], int] = {}
-        for c, own in enumerate(joint.seen):
+        for c, own in enumerate(joint.views.seen):
             for entry in own.values():
                 if entry.key[1] == target and entry.board_id in names:
                     scenes[(c, entry.frame)] = scenes.get((c, entry.frame), 0) + 1

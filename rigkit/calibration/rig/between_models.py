@@ -13,7 +13,6 @@ import numpy as np
 
 from rigkit.calibration.between_models import same_model, spread_rays
 from rigkit.calibration.poses import steps_between
-from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
@@ -23,7 +22,7 @@ from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError
 
 
-def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: FloatArray) -> FloatArray:
+def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
     """Return what the rivals of the lenses add to the covariance (G, G) of all globals; `sigmas` (G,) are the standard
     deviations without that. Lenses that are held near what each camera says alone bring their rivals with them. What
     shape the boards have is a question to all cameras together: the same lens from another one is no rival here."""
@@ -31,7 +30,7 @@ def between_rig_models(joint: JointRig, single: Sequence[Calibration], sigmas: F
     out = np.zeros((layout.count, layout.count))
     if joint.observations.held or joint.known is not None:
         return out
-    rays = []
+    single, rays = joint.views.single, []
     for c, weight in enumerate(joint.observations.weights):
         points, _ = here.of_camera(c, joint.observations).points_in_cam(joint.observations.cameras[c])
         rays.append(spread_rays(points[weight > 0.0]))

@@ -7,13 +7,12 @@ how far apart they are themselves, in units of its squares. What the boards say 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 
 from rigkit.calibration.rig.frames import target_poses
-from rigkit.calibration.rig.observations import FrameObservations, Places
+from rigkit.calibration.rig.observations import RigViews
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Finding
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
@@ -26,8 +25,9 @@ SIZES_ERRORS = 6.0
 """So many standard errors apart, as the frames of both boards scatter."""
 
 
-def sizes_apart(names: Sequence[str], seen: Sequence[FrameObservations], places: Places) -> tuple[Finding, ...]:
-    """Return a finding where two boards contradict each other on how far apart two of the cameras `names` are."""
+def sizes_apart(views: RigViews) -> tuple[Finding, ...]:
+    """Return a finding where two boards contradict each other on how far apart two of the cameras are."""
+    names, seen, places = views.names, views.seen, views.places
     for i, j in combinations(range(len(seen)), 2):
         shared = seen[i].keys() & seen[j].keys()
         pairs = sorted({seen[i][place].key for place in shared if seen[i][place].key == seen[j][place].key})

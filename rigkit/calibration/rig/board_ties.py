@@ -9,7 +9,7 @@ from dataclasses import replace
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
-from rigkit.calibration.rig.observations import FrameObservations, frame_observations
+from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
@@ -41,7 +41,7 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     flat = replace(calibration, boards=tuple(replace(b, kind="flat") for b in calibration.boards))
     try:
         named, places, notes = board_places([group], [seen], boards)
-        joint = solve_jointly(["camera"], named, [flat], places, silent)
+        joint = solve_jointly(RigViews(["camera"], named, (flat,), places), silent)
     except (InputError, DegenerateError):
         return ()
     if notes or joint.left_out or joint.shared_count < MIN_IMAGES_OF_TIE or joint.cost_sigmas > TIED_SIGMAS:

@@ -22,7 +22,7 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import BAD, solve_jointly
 from rigkit.calibration.rig.known import KnownCameras
 from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
-from rigkit.calibration.rig.observations import FrameObservations, Places, frame_observations
+from rigkit.calibration.rig.observations import FrameObservations, Places, RigViews, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
 from rigkit.core.boards import Board
@@ -89,35 +89,31 @@ def calibrate_rig(
             again = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
             named, places, notes = board_places(rigid_boards, again, boards)
         seen = named
-    with _mistakes_named(list(views), seen, single, places):
-        joint = solve_jointly(list(views), seen, single, places, progress, known)
-    rig, far = assemble_rig(list(views), single, joint, places, heldout_rms(joint, folds))
-    notes = (*same, *_mispaired(rig, seen, places, joint.cost_sigmas), *notes, *joint.notes)
+    every = RigViews(list(views), seen, single, places)
+    with _mistakes_named(every):
+        joint = solve_jointly(every, progress, known)
+    rig, far = assemble_rig(joint, heldout_rms(joint, folds))
+    notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
     return replace(rig, verdicts=judge_rig(rig, far, notes, in_force=options.in_force))
 
 
 @contextmanager
-def _mistakes_named(
-    names: Sequence[str], seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places
-) -> Iterator[None]:
+def _mistakes_named(views: RigViews) -> Iterator[None]:
     """Say in errors which mistake with files made the cameras disagree."""
     try:
         yield
     except DegenerateError as error:
-        cause = why_nothing_agrees(names, seen, single, places)
+        cause = why_nothing_agrees(views)
         raise error if cause is None else DegenerateError(f"rig: {cause.text} ({error})") from error
 
 
-def _mispaired(
-    rig: RigCalibration, seen: Sequence[FrameObservations], places: Places, cost_sigmas: float
-) -> list[Finding]:
+def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[Finding]:
     """Return which mistake with files made frames disagree, of those left out or, where sharing poses usually costs
     more than a good rig, of all."""
-    names = [camera.name for camera in rig.cameras]
-    if cost_sigmas > BAD and (cause := why_nothing_agrees(names, seen, rig.single, places)):
+    if cost_sigmas > BAD and (cause := why_nothing_agrees(views)):
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
-    return put_together_wrongly(names, seen, mounts, rig.single, places, left_out)
+    return put_together_wrongly(views, mounts, left_out)
 
 
 def _require_entries(views: Views, **given: object) -> None:

@@ -89,7 +89,7 @@ def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
     return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
 
 
-def part_far(seen: list[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
+def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
     """Part the targets whose views put them far apart, by `off_px`; return (frame, target, reason)."""
     shared = shared_keys(seen)
     usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
@@ -114,7 +114,7 @@ def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
     return f"its boards disagree on where it is ({how}); one of them was moved against the others"
 
 
-def part(seen: list[FrameObservations], key: Key) -> None:
+def part(seen: Sequence[FrameObservations], key: Key) -> None:
     """Give every view of the target a pose of its own: they still support their camera's intrinsics."""
     for k, own in enumerate(seen):
         for place, entry in own.items():

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.board_orientation import same_looks
-from rigkit.calibration.rig.observations import FrameObservations, Observation, Places, outer_corners, turns_of
+from rigkit.calibration.rig.observations import (
+    FrameObservations,
+    Observation,
+    Places,
+    RigViews,
+    outer_corners,
+    turns_of,
+)
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
@@ -93,19 +100,17 @@ _FRAME = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0,
 ALONE = (Rigid3.identity(),)
 
 
-def mounts_of(
-    names: Sequence[str], seen: Sequence[FrameObservations], places: Places
-) -> tuple[list[Rigid3], tuple[Finding, ...]]:
+def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
     """Return cam_from_rig of every camera, along a tree of pairs that share the most targets, and what is not sure
     about them.
 
     Raises InputError where a camera shares none.
     """
-    targets = [_targets(own, places) for own in seen]
+    names, targets = views.names, [_targets(own, views.places) for own in views.seen]
     mounts: dict[int, Rigid3] = {0: Rigid3.identity()}
     notes: list[Finding] = []
-    while len(mounts) < len(seen):
-        edges = [(i, j) for i in mounts for j in range(len(seen)) if j not in mounts]
+    while len(mounts) < len(targets):
+        edges = [(i, j) for i in mounts for j in range(len(targets)) if j not in mounts]
         i, j = max(edges, key=lambda e: len(targets[e[0]].keys() & targets[e[1]].keys()))
         shared = sorted(targets[i].keys() & targets[j].keys())
         if not shared:
@@ -124,7 +129,7 @@ def mounts_of(
                 )
             )
         mounts[j] = motion @ mounts[i]
-    return [mounts[k] for k in range(len(seen))], tuple(notes)
+    return [mounts[k] for k in range(len(targets))], tuple(notes)
 
 
 def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | None]:
@@ -163,17 +168,15 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     return middle, Rigid3(rotation[tried[others[0]]], shift[tried[others[0]]]) if others else None
 
 
-def turned_alike(
-    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], places: Places
-) -> list[FrameObservations]:
+def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
     """Return the views with every board numbered from the corner that the first camera to see it numbers from."""
     out: list[FrameObservations] = []
-    for k, own in enumerate(seen):
+    for k, own in enumerate(views.seen):
         mine: FrameObservations = {}
         for key, entry in own.items():
-            before = next((i for i in range(k) if key in seen[i]), None)
+            before = next((i for i in range(k) if key in views.seen[i]), None)
             looks = same_looks(entry.view.board)
-            if before is None or len(looks) == 1 or entry.board_id in places:
+            if before is None or len(looks) == 1 or entry.board_id in views.places:
                 mine[key] = entry
                 continue
             expected = mounts[k] @ mounts[before].inverse() @ out[before][key].cam_from_board
@@ -182,23 +185,25 @@ def turned_alike(
             off = [float(np.linalg.norm(w.cam_from_board.apply(points) - expected.apply(points))) for w in orientations]
             mine[key] = orientations[int(np.argmin(off))]
         out.append(mine)
-    return out
+    return views.with_seen(out)
 
 
-def apart(
-    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
-) -> dict[Key, float]:
+def apart(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
     """Return how far apart the boards that share a pose put each other, in px: of two cameras the better of the two
     directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
     out: dict[Key, float] = {}
-    best = [_most_seen(own) for own in seen]
-    all_corners = [_CameraCorners.of(own) for own in seen]
-    for i in range(len(seen)):
-        for j in range(i, len(seen)):
-            there = _transfer_px(best[i], all_corners[j], mounts[j] @ mounts[i].inverse(), cameras[j], places)
-            back = there
-            if i != j:
-                back = _transfer_px(best[j], all_corners[i], mounts[i] @ mounts[j].inverse(), cameras[i], places)
+    # A camera that saw nothing is as far from the others as it likes.
+    some = [k for k, own in enumerate(views.seen) if own]
+    best = {k: _most_seen(views.seen[k]) for k in some}
+    corners = {k: _CameraCorners.of(views.seen[k]) for k in some}
+
+    def transfer_px(i: int, j: int) -> dict[Key, float]:
+        return _transfer_px(best[i], corners[j], mounts[j] @ mounts[i].inverse(), views.cameras[j], views.places)
+
+    for n, i in enumerate(some):
+        for j in some[n:]:
+            there = transfer_px(i, j)
+            back = there if i == j else transfer_px(j, i)
             for key in there:
                 out[key] = max(out.get(key, 0.0), min(there[key], back[key]))
     return out
@@ -256,17 +261,15 @@ def _transfer_px(
     return out
 
 
-def first_frames(
-    keys: Sequence[Key], seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], places: Places
-) -> tuple[Mat3, Points]:
+def first_frames(keys: Sequence[Key], views: RigViews, mounts: Sequence[Rigid3]) -> tuple[Mat3, Points]:
     """Return rig_from_target of every key, from the view that has the most of its corners."""
     best: dict[Key, tuple[int, int, Observation]] = {}
-    for k, own in enumerate(seen):
+    for k, own in enumerate(views.seen):
         for key, entry in _most_seen(own).items():
             count = int(entry.kept.sum())
             if key not in best or count > best[key][0]:
                 best[key] = (count, k, entry)
-    rotation, shift = target_poses([best[key][2] for key in keys], places)
+    rotation, shift = target_poses([best[key][2] for key in keys], views.places)
     back = [m.inverse() for m in mounts]
     turn, place = _stack([back[best[key][1]] for key in keys])
     return turn @ rotation, (turn @ shift[..., None])[..., 0] + place

@@ -28,7 +28,7 @@ from rigkit.calibration.rig.disagree import (
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
 from rigkit.calibration.rig.known import KnownCameras
-from rigkit.calibration.rig.observations import FrameObservations, Places
+from rigkit.calibration.rig.observations import FrameObservations, Places, RigViews
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
@@ -63,8 +63,8 @@ class JointRig:
 
     Attributes
     ----------
-    observations, solution : what was used and what came out.
-    seen : of every camera, with the keys by which poses are shared.
+    views : what every camera saw, with the keys by which poses are shared.
+    observations, solution : what was used of it and what came out.
     sigma_px : prior standard deviation of a corner of median quality, from the cameras alone.
     cost_sigmas : how many sigmas sharing a pose usually costs; about 1 where the models hold.
     left_out : (frame, target, reason).
@@ -72,9 +72,9 @@ class JointRig:
     known : what was held where it was known.
     """
 
+    views: RigViews
     observations: RigObservations
     solution: Solution[RigState]
-    seen: tuple[FrameObservations, ...]
     sigma_px: float
     cost_sigmas: float
     left_out: tuple[tuple[str, str, str], ...]
@@ -85,7 +85,7 @@ class JointRig:
     def frames(self) -> IntArray:
         """Number of the frame of every pose, (F,); frames in which all cameras see what they saw in an earlier one
         have its number."""
-        frame = {entry.key: entry.frame for own in self.seen for entry in own.values()}
+        frame = {entry.key: entry.frame for own in self.views.seen for entry in own.values()}
         names = [frame[key] for key in self.observations.keys]
         shown = [
             (names[f], f"{c} {view.board.board_id}", view.pixels)
@@ -105,37 +105,31 @@ class JointRig:
     @property
     def shared_count(self) -> int:
         """Targets, counted in every frame, of which several views are tied."""
-        return len(shared_keys(self.seen))
+        return len(shared_keys(self.views.seen))
 
 
-def solve_jointly(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    single: Sequence[Calibration],
-    places: Places,
-    progress: Progress,
-    known: KnownCameras | None = None,
-) -> JointRig:
+def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | None = None) -> JointRig:
     """Solve for everything together, leaving out targets on which the cameras (or the target's boards) disagree.
 
     Raises InputError where a camera shares nothing with the others, DegenerateError where too little is left.
     """
-    mounts, notes = mounts_of(names, seen, places)
-    mounts = list(mounts) if known is None else known.mounts(names, mounts)
-    seen = turned_alike(seen, mounts, places)
-    sizes, also = sizes_apart(names, seen, places), tuple[Finding, ...]()
+    mounts, notes = mounts_of(views)
+    mounts = list(mounts) if known is None else known.mounts(views.names, mounts)
+    views = turned_alike(views, mounts)
+    seen, single = views.seen, views.single
+    sizes, also = sizes_apart(views), tuple[Finding, ...]()
     shared = len(shared_keys(seen))
-    left_out = part_far(seen, apart(seen, mounts, [result.camera for result in single], places))
+    left_out = part_far(seen, apart(views, mounts))
     sigma = _sigma(single)
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
-        _require_agreement(names, seen, places, len(left_out), shared)
-        observations, solution = _solved(names, seen, mounts, single, places, sigma, known)
+        _require_agreement(views, len(left_out), shared)
+        observations, solution = _solved(views, mounts, sigma, known)
         cost = cost_of_sharing(observations, solution, seen)
         usual = usual_cost(cost, sigma)
         worse = bad_ones(cost, usual)
         if not worse and masked(cost, sigma):
-            worse = _one_bad(names, seen, mounts, single, places, sigma, cost, known)
+            worse = _one_bad(views, mounts, sigma, cost, known)
         if not worse or i == MAX_ROUNDS - 1:
             break
         for key in worse:
@@ -155,13 +149,13 @@ def solve_jointly(
     if usual_sigmas > DISAGREES:
         observations = replace(observations, held=_held(single, sigma, usual_sigmas**2 - 1.0))
         if known is not None:
-            observations = known.hold(observations, solution.state, names)
+            observations = known.hold(observations, solution.state, views.names)
         solution = solve_rig(observations, solution.state, sigma)
         also = (_disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1),)
     return JointRig(
+        views=views,
         observations=observations,
         solution=solution,
-        seen=tuple(seen),
         sigma_px=sigma,
         cost_sigmas=usual_sigmas,
         left_out=tuple(left_out),
@@ -171,19 +165,13 @@ def solve_jointly(
 
 
 def _solved(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    mounts: Sequence[Rigid3],
-    single: Sequence[Calibration],
-    places: Places,
-    sigma: float,
-    known: KnownCameras | None,
+    views: RigViews, mounts: Sequence[Rigid3], sigma: float, known: KnownCameras | None
 ) -> tuple[RigObservations, Solution[RigState]]:
-    observations, unknowns = _observations(seen, single, places, sigma)
-    frame_rotation, frame_mm = first_frames(observations.keys, seen, mounts, places)
-    board_rotation, board_mm = _board_poses(observations.cameras[0], places)
+    observations, unknowns = _observations(views, sigma)
+    frame_rotation, frame_mm = first_frames(observations.keys, views, mounts)
+    board_rotation, board_mm = _board_poses(observations.cameras[0], views.places)
     start = RigState(
-        cameras=tuple(result.camera for result in single),
+        cameras=tuple(views.cameras),
         mount_rotation=np.array([m.rotation for m in mounts]),
         mount_mm=np.array([m.translation_mm for m in mounts]),
         frame_rotation=frame_rotation,
@@ -193,7 +181,7 @@ def _solved(
         unknowns=unknowns,
     )
     if known is not None:
-        observations = known.hold(observations, start, names)
+        observations = known.hold(observations, start, views.names)
     return observations, solve_rig(observations, start, sigma)
 
 
@@ -241,26 +229,19 @@ def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[t
 
 
 def _one_bad(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    mounts: Sequence[Rigid3],
-    single: Sequence[Calibration],
-    places: Places,
-    sigma: float,
-    cost: Mapping[Key, float],
-    known: KnownCameras | None,
+    views: RigViews, mounts: Sequence[Rigid3], sigma: float, cost: Mapping[Key, float], known: KnownCameras | None
 ) -> list[Key]:
     """Return the one target, if any, without which the others agree: among few, a bad one pulls the mounts so far that
     all of them look bad."""
     found: list[tuple[float, float, Key]] = []
     for key in sorted(cost, key=lambda k: -cost[k])[:TRIED]:
-        trial = [dict(own) for own in seen]
-        part(trial, key)
+        trial = views.with_seen([dict(own) for own in views.seen])
+        part(trial.seen, key)
         try:
-            mounts_of(names, trial, places)
+            mounts_of(trial)
         except InputError:
             continue
-        without = cost_of_sharing(*_solved(names, trial, mounts, single, places, sigma, known), trial)
+        without = cost_of_sharing(*_solved(trial, mounts, sigma, known), trial.seen)
         found.append((sum(without.values()), usual_cost(without, sigma, mean=True), key))
     if not found:
         return []
@@ -273,17 +254,15 @@ def _sigma(single: Sequence[Calibration]) -> float:
     return float(np.median([c.sigma_px for c in single]))
 
 
-def _observations(
-    seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places, sigma: float
-) -> tuple[RigObservations, FloatArray]:
+def _observations(views: RigViews, sigma: float) -> tuple[RigObservations, FloatArray]:
     """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners, and
     return the first unknowns of the boards' shape."""
-    entries = [list(own.values()) for own in seen]
+    entries, places = [list(own.values()) for own in views.seen], views.places
     keys = {key: i for i, key in enumerate(dict.fromkeys(e.key for own in entries for e in own))}
     everything = Observations.from_views([e.view for own in entries for e in own])
     ends = np.cumsum([0, *(len(own) for own in entries)])
     cameras, weights, frame = [], [], []
-    for own, first, last, alone in zip(entries, ends[:-1], ends[1:], single, strict=True):
+    for own, first, last, alone in zip(entries, ends[:-1], ends[1:], views.single, strict=True):
         observations = everything.subset(np.arange(first, last))
         kept = np.zeros(observations.present.shape, dtype=bool)
         squared = np.zeros(observations.present.shape)
@@ -297,7 +276,7 @@ def _observations(
         frame.append(np.array([keys[e.key] for e in own], dtype=np.int64))
     first_of = {target for target, _ in places.values()}
     free = tuple(b.board_id in places and b.board_id not in first_of for b in everything.boards)
-    shape, unknowns = common_shape(everything, single)
+    shape, unknowns = common_shape(everything, views.single)
     found = RigObservations(
         cameras=tuple(cameras),
         weights=tuple(weights),
@@ -316,20 +295,18 @@ def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray
     return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
 
 
-def _require_agreement(
-    names: Sequence[str], seen: Sequence[FrameObservations], places: Places, left: int, shared: int
-) -> None:
+def _require_agreement(views: RigViews, left: int, shared: int) -> None:
     """Raise DegenerateError where so much was left out that the rest means nothing."""
     if not left:
         return
-    advice = _advice(seen)
+    advice = _advice(views.seen)
     if left > MIN_SHARE * shared:
         raise DegenerateError(
             f"rig: {left} of {shared} boards that several views share had to be left out because the views disagree on "
             f"where they are; {advice}"
         )
     try:
-        mounts_of(names, seen, places)
+        mounts_of(views)
     except InputError as error:
         raise DegenerateError(
             f"{error}; {left} boards were left out because the cameras disagree on them: {advice}"

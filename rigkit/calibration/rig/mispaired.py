@@ -15,10 +15,9 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.disagree import shared_keys
 from rigkit.calibration.rig.frames import apart, mounts_of, turned_alike
-from rigkit.calibration.rig.observations import FrameObservations, Observation, Places
+from rigkit.calibration.rig.observations import FrameObservations, Observation, RigViews
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
@@ -75,56 +74,36 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
     return out
 
 
-def put_together_wrongly(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    mounts: Sequence[Rigid3],
-    single: Sequence[Calibration],
-    places: Places,
-    left_out: Iterable[Key],
-) -> list[Finding]:
+def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterable[Key]) -> list[Finding]:
     """Return findings on the frames `left_out` that agree with the `mounts` of the others when two cameras' images are
-    exchanged there, or when those of one camera are counted otherwise.
-
-    Parameters
-    ----------
-    seen : of every camera, as it was before anything was left out.
-    single : of every camera alone.
+    exchanged there, or when those of one camera are counted otherwise. `views` are as they were before anything was
+    left out.
     """
-    frames = {frame for frame, _ in left_out}
-    cameras = [c.camera for c in single]
-    own = [_of_frames(one, frames) for one in seen]
-    now = _by_frame(_off(own, mounts, cameras, places))
-    tried: list[tuple[list[FrameObservations], str, str, str]] = []
-    for i, j in combinations(range(len(seen)), 2):
-        trial = list(own)
-        trial[i], trial[j] = own[j], own[i]
+    frames, names = {frame for frame, _ in left_out}, views.names
+    those = views.with_seen([_of_frames(one, frames) for one in views.seen])
+    own, now = those.seen, _by_frame(_off(those, mounts))
+    tried: list[tuple[RigViews, str, str, str]] = []
+    for i, j in combinations(range(len(own)), 2):
+        trial = those.with_camera(i, own[j]).with_camera(j, own[i])
         tried.append((trial, f"'{names[i]}' and '{names[j]}' are exchanged", "put right", "give them their own names"))
-    for k, camera in enumerate(cameras):
-        trial = list(own)
-        trial[k] = _turned(own[k], camera)
+    for k, camera in enumerate(views.cameras):
+        trial = those.with_camera(k, _turned(own[k], camera))
         remedy = "take them as the camera wrote them"
         tried.append((trial, f"'{names[k]}' are turned by half a turn", "turned back", remedy))
     out = []
     for trial, what, mended, remedy in tried:
-        if right := _put_right(now, _by_frame(_off(trial, mounts, cameras, places))):
+        if right := _put_right(now, _by_frame(_off(trial, mounts))):
             agree = "the cameras agree there on where the boards are"
             message = f"the images of {what} in {_named(right)}: {mended}, {agree}"
             out.append(Finding.bad(message, f"{remedy}, and calibrate again"))
-    return [*out, *_miscounted(names, seen, mounts, cameras, places, now)]
+    return [*out, *_miscounted(views, mounts, now)]
 
 
-def _miscounted(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    mounts: Sequence[Rigid3],
-    cameras: Sequence[Camera],
-    places: Places,
-    now: Mapping[str, float],
-) -> list[Finding]:
+def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, float]) -> list[Finding]:
     """Return a finding where frames that are left out, and lie apart `now`, agree with others before or after them."""
     if not now:
         return []
+    seen = views.seen
     # A frame that only one camera has may be where the other one's image belongs.
     agree = {frame for frame, _ in shared_keys(seen)} - now.keys()
     usual = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
@@ -132,36 +111,25 @@ def _miscounted(
         for step in STEPS:
             trial = [_of_frames(own, usual.keys() - agree) for own in seen]
             trial[k] = _of_frames(_counted(seen, k, step), usual.keys() - agree)
-            right = _put_right(usual, _by_frame(_off(trial, mounts, cameras, places)))
+            right = _put_right(usual, _by_frame(_off(views.with_seen(trial), mounts)))
             if len(right) >= max(MIN_PUT_RIGHT, MIN_SHARE_PUT_RIGHT * len(now)):
                 moments = _in_order(usual)
                 called = [moments[moments.index(frame) + step] for frame in right]
                 message = (
-                    f"the images of '{names[k]}' in {_named(called)} are of {_steps(step)}: counted so, the cameras "
-                    "agree there on where the boards are; an image is missing, or was taken twice"
+                    f"the images of '{views.names[k]}' in {_named(called)} are of {_steps(step)}: counted so, the "
+                    "cameras agree there on where the boards are; an image is missing, or was taken twice"
                 )
                 return [Finding.bad(message, "name the images of one moment alike, and calibrate again")]
     return []
 
 
-def why_nothing_agrees(
-    names: Sequence[str], seen: Sequence[FrameObservations], single: Sequence[Calibration], places: Places
-) -> Finding | None:
+def why_nothing_agrees(views: RigViews) -> Finding | None:
     """Return with which mistake put right the frames agree, where most of them do not; None with none."""
-    cameras = [c.camera for c in single]
-
-    def usual_px(trial: Sequence[FrameObservations]) -> float:
-        try:
-            mounts, _ = mounts_of(names, trial, places)
-        except InputError:
-            return np.inf
-        off = _off(trial, mounts, cameras, places)
-        return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_PUT_RIGHT else np.inf
-
-    limit = PUT_RIGHT * usual_px(seen)
-    for k, camera in enumerate(cameras):
+    names, seen = views.names, views.seen
+    limit = PUT_RIGHT * _usual_px(views)
+    for k, camera in enumerate(views.cameras):
         for step in STEPS if k else ():
-            if usual_px([*seen[:k], _counted(seen, k, step), *seen[k + 1 :]]) <= limit:
+            if _usual_px(views.with_camera(k, _counted(seen, k, step))) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' are of {_steps(step)} in all frames: counted so, the cameras agree; "
                     "an image is missing, or they did not begin together",
@@ -169,7 +137,7 @@ def why_nothing_agrees(
                 )
         for axis in (0, 1):
             mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
-            if usual_px([*seen[:k], mirrored, *seen[k + 1 :]]) <= limit:
+            if _usual_px(views.with_camera(k, mirrored)) <= limit:
                 # Of two cameras either may be the mirrored one.
                 who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
                 return Finding.bad(
@@ -177,9 +145,9 @@ def why_nothing_agrees(
                     "take them as the camera wrote them",
                 )
         turned = _turned(seen[k], camera)
-        for sides in _as_one_frame_has_it(names, seen, k, turned, cameras, places):
+        for sides in _as_one_frame_has_it(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
-            if sides and usual_px([*seen[:k], some, *seen[k + 1 :]]) <= limit:
+            if sides and _usual_px(views.with_camera(k, some)) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' are turned by half a turn in {_named(_in_order(sides))}, or in all "
                     "others: turned back, the cameras agree",
@@ -188,31 +156,30 @@ def why_nothing_agrees(
     return None
 
 
-def _as_one_frame_has_it(
-    names: Sequence[str],
-    seen: Sequence[FrameObservations],
-    k: int,
-    changed: FrameObservations,
-    cameras: Sequence[Camera],
-    places: Places,
-) -> Iterator[set[str]]:
+def _usual_px(views: RigViews) -> float:
+    """Return how far apart views usually are by the mounts that they tell, px; infinite where they tell none."""
+    try:
+        mounts, _ = mounts_of(views)
+    except InputError:
+        return np.inf
+    off = _off(views, mounts)
+    return float(np.median(list(off.values()))) if len(_by_frame(off)) >= MIN_PUT_RIGHT else np.inf
+
+
+def _as_one_frame_has_it(views: RigViews, k: int, changed: FrameObservations) -> Iterator[set[str]]:
     """Yield for each frame in which ones what camera k saw agrees better `changed`, by the mount that it tells."""
-    trial = [*seen[:k], changed, *seen[k + 1 :]]
-    for frame in _in_order({frame for frame, _ in seen[k]}):
+    trial = views.with_camera(k, changed)
+    for frame in _in_order({frame for frame, _ in views.seen[k]}):
         try:
-            mounts, _ = mounts_of(names, [_of_frames(own, {frame}) for own in seen], places)
+            mounts, _ = mounts_of(views.with_seen([_of_frames(own, {frame}) for own in views.seen]))
         except InputError:
             continue
-        now, then = (_by_frame(_off(one, mounts, cameras, places)) for one in (seen, trial))
+        now, then = (_by_frame(_off(one, mounts)) for one in (views, trial))
         yield {name for name, value in then.items() if value < now[name]}
 
 
-def _off(
-    seen: Sequence[FrameObservations], mounts: Sequence[Rigid3], cameras: Sequence[Camera], places: Places
-) -> dict[Key, float]:
-    some = [k for k, own in enumerate(seen) if own]
-    seen, mounts, cameras = [seen[k] for k in some], [mounts[k] for k in some], [cameras[k] for k in some]
-    return apart(turned_alike(seen, mounts, places), mounts, cameras, places)
+def _off(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
+    return apart(turned_alike(views, mounts), mounts)
 
 
 def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:

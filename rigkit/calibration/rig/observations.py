@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.board_orientation import board_turn, same_looks
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.state import Key
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView, grid_turned
@@ -58,6 +59,35 @@ class Observation:
 
 FrameObservations = dict[tuple[str, str], Observation]
 """What a camera saw, by (frame, board)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigViews:
+    """What a rig is solved from.
+
+    Attributes
+    ----------
+    names, seen, single : of every camera what it is called, what it saw, and its calibration alone.
+    places : of the boards that are mounted to others.
+    """
+
+    names: Sequence[str]
+    seen: Sequence[FrameObservations]
+    single: tuple[Calibration, ...]
+    places: Places
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras, as each alone has been calibrated."""
+        return [alone.camera for alone in self.single]
+
+    def with_seen(self, seen: Sequence[FrameObservations]) -> RigViews:
+        """Return the same where the cameras saw this."""
+        return replace(self, seen=seen)
+
+    def with_camera(self, k: int, seen: FrameObservations) -> RigViews:
+        """Return the same where camera `k` saw this."""
+        return self.with_seen([*self.seen[:k], seen, *self.seen[k + 1 :]])
 
 
 def outer_corners(board: Board) -> Points:
