@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.board_orientation import same_looks
-from rigkit.calibration.rig.observations import FrameObservations, Observation, Places, outer_corners
+from rigkit.calibration.rig.observations import FrameObservations, Observation, RigViews, outer_corners
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -51,20 +51,19 @@ class _BoardSeen:
 
 
 def board_places(
-    groups: Sequence[Sequence[str]], seen: Sequence[FrameObservations], boards: Mapping[str, Board]
-) -> tuple[list[FrameObservations], Places, tuple[Finding, ...]]:
-    """Return the views with the boards of every group identified, oriented alike and given the key of their target,
-    the places of the boards, and what could not be tied.
+    groups: Sequence[Sequence[str]], views: RigViews, boards: Mapping[str, Board]
+) -> tuple[RigViews, tuple[Finding, ...]]:
+    """Return the views with the boards of every group identified, oriented alike and given the key of their target and
+    their places on it, and what could not be tied.
 
     Raises InputError: a board of a group is never seen together with the others, or they cannot be identified.
 
     Parameters
     ----------
     groups : ids of the boards that are mounted to each other.
-    seen : of every camera.
     boards : all boards by id.
     """
-    out = [dict(own) for own in seen]
+    out = [dict(own) for own in views.seen]
     places: dict[str, tuple[str, Rigid3]] = {}
     notes: list[Finding] = []
     for group in groups:
@@ -96,7 +95,7 @@ def board_places(
                     f"{', '.join(group)} is which; there they count as boards of their own"
                 )
             )
-    return out, places, tuple(notes)
+    return replace(views, seen=out, places=places), tuple(notes)
 
 
 def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Reading | None, target: str) -> None:

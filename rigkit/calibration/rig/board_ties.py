@@ -40,8 +40,8 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     # Sharing a shape is for the solution itself to find: here flat boards will do.
     flat = replace(calibration, boards=tuple(replace(b, kind="flat") for b in calibration.boards))
     try:
-        named, places, notes = board_places([group], [seen], boards)
-        joint = solve_jointly(RigViews(["camera"], named, (flat,), places), silent)
+        named, notes = board_places([group], RigViews(["camera"], [seen], (flat,), {}), boards)
+        joint = solve_jointly(named, silent)
     except (InputError, DegenerateError):
         return ()
     if notes or joint.left_out or joint.shared_count < MIN_IMAGES_OF_TIE or joint.cost_sigmas > TIED_SIGMAS:

@@ -22,7 +22,7 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import BAD, solve_jointly
 from rigkit.calibration.rig.known import KnownCameras
 from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
-from rigkit.calibration.rig.observations import FrameObservations, Places, RigViews, frame_observations
+from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
 from rigkit.core.boards import Board
@@ -75,21 +75,14 @@ def calibrate_rig(
     _require_known(views, sizes_px, known)
     same = same_pictures(views)
     options = _Options(sizes_px, model, degree, board, folds, known)
-    single = options.each_alone(views, progress)
-    seen = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
-    places: Places = {}
-    notes: tuple[Finding, ...] = ()
+    every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
-        boards = _boards(views, rigid_boards)
-        named, places, notes = board_places(rigid_boards, seen, boards)
-        if board != "flat" and _renamed(seen, named):
+        boards, alone = _boards(views, rigid_boards), every
+        every, notes = board_places(rigid_boards, alone, boards)
+        if board != "flat" and _renamed(alone.seen, every.seen):
             # The boards' shapes were those of mixtures.
-            views = {name: [(e.frame, e.view) for e in own.values()] for name, own in zip(views, named, strict=True)}
-            single = options.each_alone(views, progress)
-            again = [frame_observations(own, result) for own, result in zip(views.values(), single, strict=True)]
-            named, places, notes = board_places(rigid_boards, again, boards)
-        seen = named
-    every = RigViews(list(views), seen, single, places)
+            views = {n: [(e.frame, e.view) for e in own.values()] for n, own in zip(views, every.seen, strict=True)}
+            every, notes = board_places(rigid_boards, options.each_alone(views, progress), boards)
     with _mistakes_named(every):
         joint = solve_jointly(every, progress, known)
     rig, far = assemble_rig(joint, heldout_rms(joint, folds))
@@ -177,8 +170,8 @@ class _Options:
         models = {self.model} if isinstance(self.model, str) else set(self.model.values())
         return [name for name, values in (("model", models), ("board_shape", {self.board})) if values == {"auto"}]
 
-    def each_alone(self, views: Views, progress: Progress) -> tuple[Calibration, ...]:
-        """Return the calibration of each camera alone; errors name the camera."""
+    def each_alone(self, views: Views, progress: Progress) -> RigViews:
+        """Return the views as each camera alone is calibrated with them; errors name the camera."""
         found: dict[str, Calibration] = {}
         asked = []
         for name, own in views.items():
@@ -197,7 +190,8 @@ class _Options:
             asked.append((name, alone, How(self.sizes_px[name], model, degree, self.board, self.folds, silent)))
         names = [name for name, _, _ in asked]
         found |= dict(zip(names, calibrate_together(asked, progress=progress), strict=True))
-        return tuple(found[name] for name in views)
+        seen = [frame_observations(own, found[name]) for name, own in views.items()]
+        return RigViews(list(views), seen, tuple(found[name] for name in views), {})
 
 
 def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:
