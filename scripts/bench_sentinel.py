@@ -59,7 +59,7 @@ from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
 from rigkit.validation.sentinel.telling import views_that_tell
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import watched_camera, watched_rig
 from rigkit.validation.sentinel.whitened import Whitened
 
 BOARD = bench_planner.BOARD
@@ -248,7 +248,7 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
             ]
             return [FreshView(frame, c, view) for frame, c, view in both if view is not None]
 
-        watched = watched_rig(frames(held(lens, VIEWS, rng), camera, MOUNT), camera)
+        watched = calibrated_rig(frames(held(lens, VIEWS, rng), camera, MOUNT), camera)
         turn = exp_so3(np.radians(TURNED_DEG) * unit(rng.standard_normal(3)))
         poses = {
             "rotation": Rigid3(turn @ MOUNT.rotation, turn @ MOUNT.translation_mm),
@@ -262,20 +262,11 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
         tell(f"rig {name}: {what}", checks, what)
 
 
-def watched_rig(views: Sequence[FreshView], camera: Camera) -> Watched:
+def calibrated_rig(views: Sequence[FreshView], camera: Camera) -> Watched:
     """Return a rig of two as `views` calibrate it."""
     names = ("left", "right")
     own = {name: [(v.frame, v.view) for v in views if v.camera == c] for c, name in enumerate(names)}
-    rig = calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model)
-    return Watched(
-        names=names,
-        cameras=rig.with_departures[0],
-        cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
-        covariance=rig.with_departures[1],
-        sigma_px=rig.sigma_px,
-        overdispersion=rig.overdispersion,
-        freedom=rig.freedom,
-    )
+    return watched_rig(calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model))
 
 
 def rendered_view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView | None:
@@ -336,7 +327,7 @@ def scene(seeds: int, noise_px: float, name: str) -> None:
             for c, mount in enumerate((Rigid3.identity(), MOUNT)):
                 view = seen(camera, mount @ board, f"{k:02d}", noise_px, rng)
                 views += [] if view is None else [FreshView(f"{k:02d}", c, view)]
-        watched, walls = watched_rig(views, camera), Corner.of_a_room(seed)
+        watched, walls = calibrated_rig(views, camera), Corner.of_a_room(seed)
         left = walls.image(camera, Rigid3.identity(), rng)
         for what, checks in found.items():
             pose = turned(MOUNT, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)

@@ -31,7 +31,7 @@ from helpers.measuring import read_off
 
 from rigkit.calibration.calibrate import FOLDS, calibrate
 from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.displaced import DisplacedCamera, uncertain_camera
+from rigkit.calibration.displaced import DisplacedCamera
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -45,8 +45,9 @@ from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Instrument, Quantity, Task, instrument_of_rig
+from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
+from rigkit.validation.sentinel.watch import watched_camera, watched_rig
 
 SIZE_PX = (1280, 960)
 BOARD = Board("board", 9, 6, 40.0, 40.0)
@@ -148,18 +149,7 @@ def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generat
     sizes = dict.fromkeys(views, SIZE_PX)
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=session.model, degree=session.degree, folds=session.folds)
-    names = ("left", "right")
-    known, covariance = rig.with_departures
-    found = instrument_of_rig(
-        names,
-        known,
-        [c.cam_from_rig for c in rig.cameras],
-        covariance,
-        names,
-        sigma_px=rig.sigma_px,
-        scale_sigma=rig.scale_sigma,
-        freedom=rig.freedom,
-    )
+    found = Instrument.of(watched_rig(rig))
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
         use = certificate.in_view & ~certificate.coarse
@@ -188,16 +178,7 @@ def alone_trial(
     lens = lenses[0]
     (views,) = frames_of((lens,), (Rigid3.identity(),), session, rng)
     found = calibrate(views, SIZE_PX, model=session.model, degree=session.degree, folds=session.folds, board="flat")
-    uncertain = uncertain_camera(found, quoted=False)
-    known = Instrument(
-        names=("camera",),
-        cameras=(uncertain.camera,),
-        cam_from_rig=(Rigid3.identity(),),
-        covariance=uncertain.covariance,
-        sigma_px=found.sigma_px,
-        freedom=found.freedom,
-    )
-    certificate = certify(known, ALONE, cells=CELLS)
+    certificate = certify(Instrument.of(watched_camera(found, "camera")), ALONE, cells=CELLS)
     use = certificate.in_view & ~certificate.coarse
     rays, _ = lens.unproject(certificate.pixels[use])
     exact, _ = measured_points(rays, ALONE, False)

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.displaced import uncertain_camera
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
@@ -18,8 +16,9 @@ from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Instrument, Task, instrument_of_rig
+from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.camera_files import called_bad
+from rigkit.workflows.check import as_watched
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
@@ -88,28 +87,9 @@ def load_instrument(
     if not is_rig_file(path):
         if cameras is not None:
             raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
-        calibration = load_calibration(path)
-        known = uncertain_camera(calibration, quoted=False)
-        return Instrument(
-            names=(Path(path).stem,),
-            cameras=(known.camera,),
-            cam_from_rig=(Rigid3.identity(),),
-            covariance=known.covariance,
-            sigma_px=sigma_px or calibration.sigma_px,
-            freedom=calibration.freedom,
-        )
-    saved = load_saved_rig(path)
-    lenses, covariance, known_px = saved.stated(path)
-    names = list(saved.cameras)
-    if len(names) < 2:
-        raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
-    return instrument_of_rig(
-        names,
-        lenses,
-        [pose for _, pose in saved.cameras.values()],
-        covariance,
-        cameras or (names[0], names[1]),
-        sigma_px=sigma_px or known_px,
-        scale_sigma=saved.scale_sigma,
-        freedom=saved.freedom,
-    )
+        known = as_watched(load_calibration(path), Path(path))
+    else:
+        known = as_watched(load_saved_rig(path), Path(path))
+        if len(known.names) < 2:
+            raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
+    return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)

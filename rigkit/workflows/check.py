@@ -13,6 +13,7 @@ import numpy as np
 
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
@@ -28,7 +29,7 @@ from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure
 from rigkit.io.images import read_image_of
 from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
 from rigkit.planning.candidates import Reach
 from rigkit.planning.goal import Goal
 from rigkit.report.check_page import check_facts, check_page
@@ -146,22 +147,32 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
-    if not is_rig_file(source):
-        calibration = load_calibration(source)
-        with about(source):
-            boards = tuple(shape.board for shape in calibration.boards)
-        return watched_camera(calibration, source.stem), boards
-    rig = load_saved_rig(source)
-    lenses, covariance, sigma_px = rig.stated(source)
+    known = load_saved_rig(source) if is_rig_file(source) else load_calibration(source)
+    if isinstance(known, SavedRig):
+        return as_watched(known, source), known.boards
+    with about(source):
+        boards = tuple(shape.board for shape in known.boards)
+    return as_watched(known, source), boards
+
+
+def as_watched(known: Calibration | SavedRig, source: Path) -> Watched:
+    """Return what the file `source` of a calibration or a rig says of cameras and mounts.
+
+    Raises InputError for a rig's that does not say how sure it is.
+    """
+    if isinstance(known, Calibration):
+        return watched_camera(known, source.stem)
+    lenses, covariance, sigma_px = known.stated(source)
     return Watched(
-        names=tuple(rig.cameras),
+        names=tuple(known.cameras),
         cameras=lenses,
-        cam_from_rig=tuple(pose for _, pose in rig.cameras.values()),
+        cam_from_rig=tuple(pose for _, pose in known.cameras.values()),
         covariance=covariance,
         sigma_px=sigma_px,
-        overdispersion=rig.overdispersion,
-        freedom=rig.freedom,
-    ), rig.boards
+        overdispersion=known.overdispersion,
+        freedom=known.freedom,
+        scale_sigma=known.scale_sigma,
+    )
 
 
 def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:

@@ -19,8 +19,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.validation.certificate.certify import certify
-from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task, instrument_of_rig
+from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import OF_CORNERS, OF_LENSES, OF_MOUNTS, measured_points
+from rigkit.validation.sentinel.evidence import Watched
 
 TRIALS = 800
 COVERAGE = (0.93, 0.97)
@@ -57,10 +58,19 @@ def rig_covariance(camera: Camera, rng: np.random.Generator) -> FloatArray:
     return joint
 
 
+def known_rig(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Watched:
+    return Watched(
+        names=("left", "right"),
+        cameras=(lens(name), lens(name)),
+        cam_from_rig=(Rigid3.identity(), SECOND),
+        covariance=joint,
+        sigma_px=0.08,
+        scale_sigma=scale_sigma,
+    )
+
+
 def rig_of(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Instrument:
-    names, poses = ("left", "right"), (Rigid3.identity(), SECOND)
-    cameras = (lens(name), lens(name))
-    return instrument_of_rig(names, cameras, poses, joint, names, sigma_px=0.08, scale_sigma=scale_sigma)
+    return Instrument.of(known_rig(name, joint, scale_sigma=scale_sigma))
 
 
 def places_of(certificate: Certificate, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -183,16 +193,7 @@ def test_what_is_not_counted_in_is_said(rng: np.random.Generator) -> None:
 def test_the_first_camera_may_be_any_of_the_rig(rng: np.random.Generator) -> None:
     """A rig's frame is no camera's affair: seen from the other side the same length is as uncertain."""
     joint = rig_covariance(lens("brown"), rng)
-    forth = rig_of("brown", joint)
-    back = instrument_of_rig(
-        ("left", "right"),
-        forth.cameras,
-        forth.cam_from_rig,
-        joint,
-        ("right", "left"),
-        sigma_px=0.08,
-        scale_sigma=4e-4,
-    )
+    forth, back = (Instrument.of(known_rig("brown", joint), pair) for pair in (None, ("right", "left")))
     task = Task(quantity=Quantity.DEPTH, size_mm=1.0, distance_mm=1500.0)
     one, other = certify(forth, task, cells=(21, 17)), certify(back, task, cells=(21, 17))
     # Not the same lines of sight, but over the whole field much the same.
@@ -215,12 +216,4 @@ def test_refusals(rng: np.random.Generator) -> None:
     with pytest.raises(InputError, match="size must be positive"):
         Task(quantity=Quantity.LENGTH, size_mm=0.0, distance_mm=1000.0)
     with pytest.raises(InputError, match="two different cameras of left, right"):
-        instrument_of_rig(
-            ("left", "right"),
-            (camera, camera),
-            (Rigid3.identity(), SECOND),
-            rig_covariance(camera, rng),
-            ("left", "left"),
-            sigma_px=0.1,
-            scale_sigma=0.0,
-        )
+        Instrument.of(known_rig("brown", rig_covariance(camera, rng)), ("left", "left"))

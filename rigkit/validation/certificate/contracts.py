@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
-from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.validation.sentinel.evidence import Watched
 
 
 class Quantity(StrEnum):
@@ -61,6 +61,37 @@ class Instrument:
             raise InputError(f"certificate: the corners' sigma must be positive, got {self.sigma_px} px")
         if not self.freedom > 0.0:
             raise InputError(f"certificate: a covariance has degrees of freedom, got {self.freedom}")
+
+    @classmethod
+    def of(cls, known: Watched, pair: tuple[str, str] | None = None) -> Instrument:
+        """Return a camera, or two of a rig: its first two, or a `pair` by their names, the one whose image the
+        certificate is drawn over first.
+
+        Raises InputError: a name that no camera has, or the same twice.
+        """
+        names = known.names[:2] if pair is None else pair
+        if len(set(names) & set(known.names)) < len(names):
+            raise InputError(
+                f"certificate: two different cameras of {', '.join(known.names)} are needed, got {' and '.join(names)}"
+            )
+        order = [known.names.index(name) for name in names]
+        layout, covariance = known.layout, known.covariance
+        if len(order) == 2:
+            place, absent = np.arange(layout.count), np.full(6, -1)
+            rows = [place[layout.cameras[k]] for k in order] + [place[layout.mount(k)] if k else absent for k in order]
+            kept = np.concatenate(rows)
+            free = np.flatnonzero(kept >= 0)
+            covariance = np.zeros((len(kept), len(kept)))
+            covariance[np.ix_(free, free)] = known.covariance[np.ix_(kept[free], kept[free])]
+        return cls(
+            names=tuple(names),
+            cameras=tuple(known.cameras[k] for k in order),
+            cam_from_rig=tuple(known.cam_from_rig[k] for k in order),
+            covariance=covariance,
+            sigma_px=known.sigma_px,
+            scale_sigma=known.scale_sigma,
+            freedom=known.freedom,
+        )
 
     @property
     def is_rig(self) -> bool:
@@ -190,49 +221,3 @@ class Certificate:
             f"Certificate({t.quantity} of {t.size_mm:g} mm at {t.distance_mm:g} mm: {100 * t.confidence:g} % within "
             f"{self.median:.3g} {t.unit} in the middle of the field, {self.worst:.3g} {t.unit} at worst)"
         )
-
-
-def instrument_of_rig(
-    names: Sequence[str],
-    cameras: Sequence[Camera],
-    cam_from_rig: Sequence[Rigid3],
-    covariance: FloatArray,
-    pair: tuple[str, str],
-    *,
-    sigma_px: float,
-    scale_sigma: float,
-    freedom: float = float("inf"),
-) -> Instrument:
-    """Return two cameras of a rig of N.
-
-    Raises InputError: a name that no camera has, or the same twice.
-
-    Parameters
-    ----------
-    names, cameras, cam_from_rig : of all cameras of the rig, the first is its frame.
-    covariance : of all intrinsics, then of the mounts of all cameras but the first, as a rig file has it.
-    pair : names of the two cameras, the one whose image the certificate is drawn over first.
-    sigma_px, scale_sigma, freedom : see `Instrument`.
-    """
-    unknown = [name for name in pair if name not in names]
-    if unknown or pair[0] == pair[1]:
-        raise InputError(
-            f"certificate: two different cameras of {', '.join(names)} are needed, got {' and '.join(pair)}"
-        )
-    order = [list(names).index(name) for name in pair]
-    layout = Layout.of_cameras(cameras)
-    place, absent = np.arange(layout.count), np.full(6, -1)
-    rows = [place[layout.cameras[k]] for k in order] + [place[layout.mount(k)] if k else absent for k in order]
-    kept = np.concatenate(rows)
-    known = np.flatnonzero(kept >= 0)
-    joint = np.zeros((len(kept), len(kept)))
-    joint[np.ix_(known, known)] = covariance[np.ix_(kept[known], kept[known])]
-    return Instrument(
-        names=tuple(pair),
-        cameras=tuple(cameras[k] for k in order),
-        cam_from_rig=tuple(cam_from_rig[k] for k in order),
-        covariance=joint,
-        sigma_px=sigma_px,
-        scale_sigma=scale_sigma,
-        freedom=freedom,
-    )

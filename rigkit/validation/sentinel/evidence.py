@@ -47,6 +47,8 @@ class Watched:
         model is among the parameters of a camera (`rigkit.calibration.displaced`), after those of the model.
     covariance : (T, T) of theta.
     sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
+    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where
+        nobody stated it.
     freedom : degrees of freedom of the covariance.
     boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
         that have the name, are as stated.
@@ -59,6 +61,7 @@ class Watched:
     sigma_px: float
     overdispersion: float = 1.0
     freedom: float = float("inf")
+    scale_sigma: float = 0.0
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
 
     @property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.sentinel.evidence import Watched
@@ -25,4 +26,19 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
         overdispersion=calibration.overdispersion,
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
+    )
+
+
+def watched_rig(rig: RigCalibration) -> Watched:
+    """Return a rig as it was calibrated, with what its lenses may do beyond their models."""
+    cameras, covariance = rig.with_departures
+    return Watched(
+        names=tuple(c.name for c in rig.cameras),
+        cameras=cameras,
+        cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
+        covariance=covariance,
+        sigma_px=rig.sigma_px,
+        overdispersion=rig.overdispersion,
+        freedom=rig.freedom,
+        scale_sigma=rig.scale_sigma,
     )
