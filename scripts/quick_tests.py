@@ -1,14 +1,15 @@
 """Choose the tests that `./scripts/test` leaves to `./scripts/test --thorough`, and write them to tests/thorough.txt.
 
-    python scripts/quick_tests.py [--total 200] [--data FILE ...] [--tests PATH ...]
+    python scripts/quick_tests.py [--total 200] [--further] [--data FILE ...] [--tests PATH ...]
 
 Runs all tests but the slow ones under coverage (a quarter of an hour of one quiet core), each a context of its own. The
 quick run can do without a test where its other tests reach every line and every branch of rigkit that it reaches. Left
 out are the dearest of these, until the rest takes --total seconds of processor time: of the tests that take longer than
 a limit, which falls until that is so, the quick run keeps those that together reach what the shorter ones do not,
-chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979). It also
-keeps a short one of every file, `KEPT`, tests that fail under coverage, and those that start programs which are not
-Python's: what these reach is not seen. Prints seconds, lines and branches of both.
+chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979), but for
+those that others chosen later make needless. It also keeps a short one of every file, `KEPT`, tests that fail under
+coverage, and those that start programs which are not Python's: what these reach is not seen. With --further only the
+quick tests of now run, in half the time, and more of them are left out. Prints seconds, lines and branches of both.
 """
 
 from __future__ import annotations
@@ -181,7 +182,7 @@ def record(data: Path, tests: Sequence[str]) -> None:
         started = Path(folder, "coveragerc")
         started.write_text(OF_PROCESSES % Path(folder, "started"))
         os.environ["COVERAGE_PROCESS_START"] = str(started)
-        pytest.main(["--rootdir", str(ROOT), "-q", *(tests or ["tests"])], plugins=[recorder])
+        pytest.main(["--rootdir", str(ROOT), "-q", *tests], plugins=[recorder])
         del os.environ["COVERAGE_PROCESS_START"]
         measured.stop()
         measured.save()
@@ -263,6 +264,13 @@ class Reach:
             out[best] = False
             wanted &= ~self.parts[best]
             open_tests = open_tests[open_tests != best]
+        # What was chosen early may be reached by what was chosen later: the dearest go first.
+        dear = np.flatnonzero((each_s > limit_s) & ~fixed & ~out & ~missing)
+        times = self.parts[~out & ~missing].sum(axis=0)
+        for test in dear[np.argsort(-each_s[dear])]:
+            if (times[self.parts[test]] > 1).all():
+                out[test] = True
+                times -= self.parts[test]
         # Of every file at least one stays, if it is short: what it is about is looked at.
         files = np.array([test.partition("::")[0] for test in self.tests])
         for file in set(files) - set(files[~out]):
@@ -287,18 +295,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--total", type=float, default=200.0, help="seconds that the quick tests may take, of one core")
     parser.add_argument("--data", type=Path, nargs="+", default=[ROOT / "out" / "quick-tests.db"], help="used if there")
+    parser.add_argument("--further", action="store_true", help="run the quick tests of now alone, leave out more")
     parser.add_argument("--tests", nargs="+", default=[], help="instead of all: into the first of --data")
     args = parser.parse_args()
     os.chdir(ROOT)
     if not args.data[0].exists():
         args.data[0].parent.mkdir(parents=True, exist_ok=True)
-        record(args.data[0], args.tests)
+        quick = ["-m", "not slow and not thorough"] if args.further else []
+        record(args.data[0], [*(args.tests or ["tests"]), *quick])
     reach = Reach.of(args.data)
     for limit in LIMITS_S:
         out = reach.left_out(limit)
         if reach.total_s(~out) <= args.total:
             break
-    names = sorted(test for test, is_out in zip(reach.tests, out, strict=True) if is_out)
+    left = {test for test, is_out in zip(reach.tests, out, strict=True) if is_out}
+    if args.further:
+        left |= {line for line in CHOSEN.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+    names = sorted(left)
     CHOSEN.write_text(HEAD + "".join(f"{name}\n" for name in names), encoding="utf-8")
     failed = [test for test, (_, started) in zip(reach.tests, reach.seconds, strict=True) if not np.isfinite(started)]
     print(f"tests of more than {limit} s; {len(failed)} failed under coverage and stay {' '.join(failed)}")
