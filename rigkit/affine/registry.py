@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,16 @@ AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
 _COUNT: dict[str, int | None] = {"F2UDIR": 2, "F3UDIR": None, "DET3UDIR": None, "2SDIR": 2, "3SDIR": None}
 _MIN_COUNT = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _How:
+    """How affinities are found: see `affines_from_directions`."""
+
+    method: str
+    epipolar: EpipolarNormals | None
+    scale: str
+    determinant: FloatArray | None
 
 
 def needs_epipolar(method: str) -> bool:
@@ -65,30 +75,22 @@ def affines_from_directions(
     """
     if F21 is not None and epipolar is None and needs_epipolar(method):
         epipolar = _epipolar_of(directions, F21)
-    _check(directions, method, epipolar, scale, determinant, epipolar_rows, noise)
-    A21, conditioning, use = _solved(directions, method, epipolar, scale, determinant, min_conditioning)
+    how = _How(method, epipolar, scale, determinant)
+    _check(directions, how, epipolar_rows, noise)
+    A21, conditioning, use = _solved(directions, how, min_conditioning)
     if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
         A21 = soft_epipolar(directions, use, epipolar)
     with np.errstate(invalid="ignore"):
         valid = (use.sum(axis=1) >= _MIN_COUNT[method]) & (conditioning >= min_conditioning)
     valid &= finite(A21)
     A21[~valid] = np.nan
-    covariance = None
-    if noise is not None:
-        covariance = _covariance(directions, method, use, valid, epipolar, scale, determinant, noise)
+    covariance = None if noise is None else _covariance(directions, how, use, valid, noise)
     return Affinities(A21, valid, conditioning, covariance)
 
 
-def _solved(
-    directions: DirectionPairs,
-    method: str,
-    epipolar: EpipolarNormals | None,
-    scale: str,
-    determinant: FloatArray | None,
-    min_conditioning: float,
-) -> tuple[Affines, FloatArray, BoolArray]:
+def _solved(directions: DirectionPairs, how: _How, min_conditioning: float) -> tuple[Affines, FloatArray, BoolArray]:
     """Return affinities (N, 2, 2), conditioning (N,) and which directions were used (N, K), a block at a time."""
-    n = len(directions.valid)
+    n, method, epipolar = len(directions.valid), how.method, how.epipolar
     A21 = np.full((n, 2, 2), np.nan)
     conditioning = np.full(n, np.nan)
     use = np.zeros(directions.valid.shape, dtype=bool)
@@ -100,8 +102,8 @@ def _solved(
             planar = planar if chosen is planar.use else planar.only(chosen)
             a, conditioning[block] = epipolar_block(planar, n1, n2)
         elif method == "DET3UDIR":
-            known = None if determinant is None else np.asarray(determinant, dtype=np.float64)[block]
-            a, conditioning[block] = determinant_block(planar, scale, known)
+            known = None if how.determinant is None else np.asarray(how.determinant, dtype=np.float64)[block]
+            a, conditioning[block] = determinant_block(planar, how.scale, known)
         else:
             count = _COUNT[method]
             planar = planar if count is None else planar.only(first_of(planar.use, count))
@@ -112,22 +114,15 @@ def _solved(
 
 
 def _covariance(
-    directions: DirectionPairs,
-    method: str,
-    use: BoolArray,
-    valid: BoolArray,
-    epipolar: EpipolarNormals | None,
-    scale: str,
-    determinant: FloatArray | None,
-    noise: DirectionNoise,
+    directions: DirectionPairs, how: _How, use: BoolArray, valid: BoolArray, noise: DirectionNoise
 ) -> FloatArray:
     """Propagate the noise of the directions in use to vec(A), (N, 4, 4), to first order; NaN where invalid."""
-    lines = None if epipolar is None else EpipolarNormals(epipolar.n1[valid], epipolar.n2[valid])
-    known = None if determinant is None else np.asarray(determinant, dtype=np.float64)[valid]
-    some = replace(directions, valid=use).select(valid)
+    lines = None if how.epipolar is None else EpipolarNormals(how.epipolar.n1[valid], how.epipolar.n2[valid])
+    known = None if how.determinant is None else np.asarray(how.determinant, dtype=np.float64)[valid]
+    some, how = replace(directions, valid=use).select(valid), replace(how, epipolar=lines, determinant=known)
 
     def solve(moved: DirectionPairs) -> Affines:
-        return _solved(moved, method, lines, scale, known, 0.0)[0]
+        return _solved(moved, how, 0.0)[0]
 
     out = np.full((len(valid), 4, 4), np.nan)
     out[valid] = propagated(solve, some, DirectionNoise(noise.covariance1[valid], noise.covariance2[valid]))
@@ -146,18 +141,11 @@ def _known(method: str) -> str:
     return method
 
 
-def _check(
-    directions: DirectionPairs,
-    method: str,
-    epipolar: EpipolarNormals | None,
-    scale: str,
-    determinant: FloatArray | None,
-    epipolar_rows: str,
-    noise: DirectionNoise | None,
-) -> None:
+def _check(directions: DirectionPairs, how: _How, epipolar_rows: str, noise: DirectionNoise | None) -> None:
+    method, epipolar, determinant = how.method, how.epipolar, how.determinant
     n, k = directions.valid.shape
-    if scale not in SCALES:
-        raise InputError(f"affine scale '{scale}' is unknown; known: {', '.join(SCALES)}")
+    if how.scale not in SCALES:
+        raise InputError(f"affine scale '{how.scale}' is unknown; known: {', '.join(SCALES)}")
     if epipolar_rows not in ("hard", "soft"):
         raise InputError(f"epipolar rows '{epipolar_rows}' are unknown; known: hard, soft")
     if needs_epipolar(method):
