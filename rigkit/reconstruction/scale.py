@@ -83,24 +83,6 @@ def board_scales_and_gradients(
     Boards that disagree by many standard deviations have a wrong square size or a wrong pose under them.
     The gradients are (B, N, 3); scales that nothing tells are NaN. Parameters, errors as of `metric_scale`.
     """
-    scales, sigmas, slopes = _fit_boards(points_unit, board_index, grid, boards, covariances)
-    if not np.isfinite(scales).any():
-        raise DegenerateError(
-            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it; "
-            "take images in which both cameras see one whole"
-        )
-    return scales, sigmas**2 + (scales * square_sigmas(boards)) ** 2, slopes
-
-
-def square_sigmas(boards: Sequence[Board]) -> FloatArray:
-    """Return the standard deviations (B,) of the squares as parts of them; 0 where none is stated."""
-    return np.array([(b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards])
-
-
-def _fit_boards(
-    points_unit: Points, board_index: IntArray, grid: IntArray, boards: Sequence[Board], covariances: FloatArray | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return scale and sigma of every board (B,), NaN where it has none, and the scales' gradients (B, N, 3)."""
     points = np.asarray(points_unit, dtype=np.float64)
     index, cells = np.asarray(board_index), np.asarray(grid)
     if len(index) != len(points) or len(cells) != len(points):
@@ -122,7 +104,17 @@ def _fit_boards(
         found = _similarity_scale(points[on], model, None if covariances is None else covariances[on])
         if found is not None:
             scales[b], sigmas[b], slopes[b, on] = found
-    return scales, sigmas, slopes
+    if not np.isfinite(scales).any():
+        raise DegenerateError(
+            f"no scale: none of {len(boards)} boards has {MIN_CORNERS_FOR_SCALE} triangulated corners that span it; "
+            "take images in which both cameras see one whole"
+        )
+    return scales, sigmas**2 + (scales * square_sigmas(boards)) ** 2, slopes
+
+
+def square_sigmas(boards: Sequence[Board]) -> FloatArray:
+    """Return the standard deviations (B,) of the squares as parts of them; 0 where none is stated."""
+    return np.array([(b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards])
 
 
 def _similarity_scale(
