@@ -6,7 +6,7 @@ taken at one moment fits nothing. Both are settled by the mount that most frames
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,17 +53,17 @@ def _stack(motions: Sequence[Rigid3]) -> tuple[Mat3, Points]:
     return np.array([m.rotation for m in motions]), np.array([m.translation_mm for m in motions])
 
 
-def _places_of(entries: Sequence[Observation], places: Places) -> tuple[Mat3, Points]:
-    """Return target_from_board of the board of every entry, (n, 3, 3) and (n, 3)."""
+def places_of(names: Iterable[str], places: Places) -> tuple[Mat3, Points]:
+    """Return target_from_board of boards by their names, (n, 3, 3) and (n, 3)."""
     alone = ("", Rigid3.identity())
-    return _stack([places.get(e.board_id, alone)[1] for e in entries])
+    return _stack([places.get(name, alone)[1] for name in names])
 
 
 def target_poses(entries: Sequence[Observation], places: Places) -> tuple[Mat3, Points]:
     """Return cam_from_target of every entry, as its board has it, (n, 3, 3) and (n, 3)."""
     rotation, shift = _stack([e.cam_from_board for e in entries])
     if places:
-        place, lever = _places_of(entries, places)
+        place, lever = places_of((e.board_id for e in entries), places)
         rotation = rotation @ np.swapaxes(place, -1, -2)
         shift = shift - (rotation @ lever[..., None])[..., 0]
     return rotation, shift
@@ -244,7 +244,7 @@ def _transfer_px(
     turn, place = target_poses([first[e.key] for e in entries], places)
     turn, place = motion.rotation @ turn, motion.apply(place)
     if places:
-        own, lever = _places_of(entries, places)
+        own, lever = places_of((e.board_id for e in entries), places)
         turn, place = turn @ own, place + (turn @ lever[..., None])[..., 0]
     in_cam = np.einsum("nij,nj->ni", np.repeat(turn, counts, axis=0), second.points[mask])
     in_cam += np.repeat(place, counts, axis=0)

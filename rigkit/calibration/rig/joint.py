@@ -26,9 +26,9 @@ from rigkit.calibration.rig.disagree import (
     usual_distance_px,
     why,
 )
-from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, turned_alike
+from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, places_of, turned_alike
 from rigkit.calibration.rig.known import KnownCameras
-from rigkit.calibration.rig.observations import FrameObservations, Places, RigViews
+from rigkit.calibration.rig.observations import FrameObservations, RigViews
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
@@ -169,7 +169,8 @@ def _solved(
 ) -> tuple[RigObservations, Solution[RigState]]:
     observations, unknowns = _observations(views, sigma)
     frame_rotation, frame_mm = first_frames(observations.keys, views, mounts)
-    board_rotation, board_mm = _board_poses(observations.cameras[0], views.places)
+    boards = observations.cameras[0].boards
+    board_rotation, board_mm = places_of((board.board_id for board in boards), views.places)
     start = RigState(
         cameras=tuple(views.cameras),
         mount_rotation=np.array([m.rotation for m in mounts]),
@@ -286,13 +287,6 @@ def _observations(views: RigViews, sigma: float) -> tuple[RigObservations, Float
         places=free,
     )
     return found, unknowns
-
-
-def _board_poses(observations: Observations, places: Places) -> tuple[FloatArray, FloatArray]:
-    """Return target_from_board of every board of the table."""
-    alone = ("", Rigid3.identity())
-    poses = [places.get(b.board_id, alone)[1] for b in observations.boards]
-    return np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
 
 
 def _require_agreement(views: RigViews, left: int, shared: int) -> None:
