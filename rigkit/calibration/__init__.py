@@ -5,7 +5,8 @@
 - one model by least squares: `state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`,
   `solver`, `outliers`, `fit`
 - which model and board shape: `folds`, `heldout`, `models_tried`, `choice`, `lens_choice`, `one_model`
-- how sure that is: `repeats`, `clustered`, `covariance`, `uncertainty`, `between_models`, `departures`, `displaced`
+- how sure that is: `repeats`, `clustered`, `covariance`, `uncertainty`, `between_models`, `departures`, `series`,
+  `displaced`
 - what to think of it: `captured`, `coverage`, `neighbours`, `moved`, `changing`, `mixed`, `verdicts`
 - what comes out: `assemble`, `result`
 

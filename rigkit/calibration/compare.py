@@ -53,7 +53,7 @@ class CalibrationComparison:
         of them differ by more. A difference is mostly of one kind (the focal length, which the distances of the boards
         take up): it scatters like the size of a single number, by several times, and its mean square is that of a few
         large ones.
-    usual_px : between these lie nine of ten.
+    usual_px : between these lie nine of ten: what is larger than the second has a chance of less than one in ten.
     chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
         each in its own model.
     same_model : both are of one model and size.
@@ -125,8 +125,8 @@ def compare_calibrations(
         covariance,
         drawn,
     )
-    chance = found.chance([_without(way, turn) for way in _touched(a.camera, pixels)])
-    usual = np.sqrt(np.quantile((found.null**2).sum(axis=0), (0.5 - 0.5 * USUAL, 0.5, 0.5 + 0.5 * USUAL)))
+    chance, unusual = found.chance([_without(way, turn) for way in _touched(a.camera, pixels)])
+    usual = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - USUAL - unusual, 0.5, 1.0 - unusual)))
     low, median, high = usual.tolist()
     same_model = _kind(a.camera) == _kind(b.camera)
     return CalibrationComparison(difference, median, (low, high), chance, same_model)
@@ -182,8 +182,9 @@ class _Modes:
         null = turned.T @ (how @ (drawn / safe[:, None]))
         return cls(axes, modes, null, np.maximum(expected, 0.0), beyond)
 
-    def chance(self, ways: Sequence[FloatArray]) -> float:
-        """Return the probability of a difference as large as the one found.
+    def chance(self, ways: Sequence[FloatArray]) -> tuple[float, float]:
+        """Return the probability of a difference as large as the one found, and how unlikely one answer must be for
+        that to be 1 - USUAL: it is one of several.
 
         What is large is asked in several ways, and the one that says most is compared with what it would say by chance
         (Tippett's combination). Of anything: the mean square, and the difference in units of what is expected
@@ -208,7 +209,7 @@ class _Modes:
             null_size = np.einsum("in,ij,jn->n", by_chance, inverse, by_chance)
             likely.append(_exceeded(float(size @ inverse @ size), null_size))
         least = np.min(likely, axis=0)
-        return float(np.count_nonzero(least <= least[0]) / len(least))
+        return float(np.count_nonzero(least <= least[0]) / len(least)), float(np.quantile(least[1:], 1.0 - USUAL))
 
 
 def _exceeded(size: float, null: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ inadequacy as a random function beside its parameters.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,7 @@ from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Pixels
-from rigkit.kernels.departures import POSE, LensCorners, averaged_amounts, displacements
+from rigkit.kernels.departures import DISPLACEMENTS, POSE, LensCorners, averaged_amounts, displacements
 
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
 """A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
@@ -40,6 +41,9 @@ ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
 """Of at least so many corners every second (third ...) is taken, where as many of each view are left."""
 RIDGE = 1e-12
 """Added to the information of parameters, as a part of its mean: those that do not move take up nothing."""
+
+Fields = Callable[[FloatArray], FloatArray]
+"""Displacements (2, F, N) px at places with the derivatives (2, P + 3, N) by parameters and turns of the rays."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,6 +87,28 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
     return averaged_amounts(information, score, SIZES_TRIED)
 
 
+def amounts_of(calibration: Calibration, fields: Fields) -> FloatArray:
+    """Return E[a a^T] (F, F) of the amounts a of F further displacements, `fields`: independent and of variance one
+    beforehand, with what the images say of them, poses and parameters eliminated."""
+    sigmas = calibration.parameter_sigmas
+    p = len(sigmas)
+    products, freedom = _products(calibration, calibration.camera, sigmas, np.eye(3), fields)
+    count = len(products) - p - DISPLACEMENTS - 1
+    if not np.isfinite(products).all():
+        return np.eye(count)
+    of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
+    # The fields stand after the parameters, the residual last.
+    chosen = [*range(p, p + count), -1]
+    left = products[np.ix_(chosen, chosen)] - products[chosen, :p] @ np.linalg.solve(
+        of_parameters, products[:p, chosen]
+    )
+    variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
+    values, axes = np.linalg.eigh(left[:-1, :-1] / variance)
+    known = (axes / (1.0 + np.maximum(values, 0.0))) @ axes.T
+    mean = known @ left[:-1, -1] / variance
+    return np.asarray(known + np.outer(mean, mean))
+
+
 def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) -> FloatArray:
     """Return what the corners of a calibration would tell of the parameters (P,) of another `camera`, poses eliminated,
     (P, P) for corners of unit variance; `turn` takes rays of the calibrated camera to its own."""
@@ -90,10 +116,12 @@ def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) ->
     return _products(calibration, camera, np.ones(p), turn)[0][:p, :p]
 
 
-def _products(calibration: Calibration, camera: Camera, sigmas: FloatArray, turn: Mat3) -> tuple[FloatArray, int]:
+def _products(
+    calibration: Calibration, camera: Camera, sigmas: FloatArray, turn: Mat3, fields: Fields | None = None
+) -> tuple[FloatArray, int]:
     """Return the sums of products (K, K) of derivatives by the parameters of a camera in units of `sigmas` (P,), the
-    displacements and the residuals, of all kept corners, poses eliminated; and how many residuals there are for the
-    parameters. `turn` takes rays of the calibrated camera to those of `camera`."""
+    `fields` if given, the displacements and the residuals, of all kept corners, poses eliminated; and how many
+    residuals there are for the parameters. `turn` takes rays of the calibrated camera to those of `camera`."""
     corners = calibration.corners
     used, count = _enough(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
@@ -101,6 +129,9 @@ def _products(calibration: Calibration, camera: Camera, sigmas: FloatArray, turn
     x, y, z = lever + turn @ corners.translation_mm.T[:, view]
     by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
     u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
+    if fields is not None:
+        more = fields(np.concatenate([by_parameters, turned_rays(np.stack([x, y, z]), by_point)], axis=1))
+        by_parameters, sigmas = np.concatenate([by_parameters, more], axis=1), np.append(sigmas, np.ones(more.shape[1]))
     residuals = corners.residuals_px[used]
     # Corners that do not project tell nothing.
     told = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
@@ -110,6 +141,15 @@ def _products(calibration: Calibration, camera: Camera, sigmas: FloatArray, turn
     back = pose_inverses(with_pose[:, :POSE]) @ np.swapaxes(coupling, 1, 2)
     out -= coupling.transpose(1, 0, 2).reshape(len(out), -1) @ back.reshape(-1, len(out))
     return out, 2 * len(used) - POSE * len(count)
+
+
+def turned_rays(along: FloatArray, by_point: FloatArray) -> FloatArray:
+    """Return d pixel / d W (2, 3, N) of a turn W of the rays to points `along` (3, N), from d pixel / d point there."""
+    out = np.empty_like(by_point)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        out[:, k] = along[i] * by_point[:, j] - along[j] * by_point[:, i]
+    return out
 
 
 def _enough(kept: IntArray, view: IntArray) -> tuple[IntArray, IntArray]:

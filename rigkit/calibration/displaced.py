@@ -231,8 +231,8 @@ def telling_modes(far: FarProjection) -> FloatArray:
     relative = far.left_over(at).transpose(1, 2, 0) / whole[:, None]
     fields = relative.reshape(DISPLACEMENTS, -1)
     covariance = far.departures.covariance.copy()
-    for rival, away in far.away(at):
-        amounts = _amounts_like(far, at, whole, fields, np.sqrt(rival.likely) * away)
+    for away in far.away(at):
+        amounts = _amounts_like(far, at, whole, fields, away)
         covariance += np.outer(amounts, amounts)
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))

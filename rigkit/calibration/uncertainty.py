@@ -25,8 +25,9 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.departures import Departures, information_of_lens
+from rigkit.calibration.departures import Departures, information_of_lens, turned_rays
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
+from rigkit.calibration.series import TERMS, Remainder
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv
@@ -117,6 +118,7 @@ class FarProjection:
     corners_left : (2, P + J, N) what that leaves, at the corners, of such steps and of the displacements.
     rivals : lenses of other models, each with how the parameters (P,) follow it and the rotation of its rays (3, 3):
         where boards were it is followed, elsewhere the two go apart.
+    remainder : what the lens's series leaves out; None: it is no series.
     calibration : whose it is.
     """
 
@@ -131,6 +133,7 @@ class FarProjection:
     hides_departures: FloatArray
     corners_left: FloatArray
     rivals: tuple[tuple[Rival, FloatArray, Mat3], ...]
+    remainder: Remainder | None
 
     @classmethod
     def of(cls, calibration: Calibration, *, from_boards: bool = False) -> FarProjection:
@@ -158,10 +161,11 @@ class FarProjection:
         hides = symmetric_pinv(square) @ across
         left -= hides.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
+        correlation = known / np.outer(safe, safe)
         return cls(
             calibration=calibration,
             camera=camera,
-            correlation=known / np.outer(safe, safe),
+            correlation=correlation,
             sigmas=sigmas,
             rays_valid=valid,
             corners=at,
@@ -170,6 +174,7 @@ class FarProjection:
             hides_departures=hides[:, p:],
             corners_left=left,
             rivals=tuple((one, *followed(camera, one.camera, rays, sigmas)) for one in calibration.rivals),
+            remainder=Remainder.of(calibration, known, hides[:, :p] / safe),
         )
 
     def covariance(self, rays: FloatArray) -> FloatArray:
@@ -184,30 +189,38 @@ class FarProjection:
     def _less_sure(self, rays: Rays) -> FloatArray:
         """Return by how much (M, 2, 2) rivals know less of `rays` (M, 3) than the lens chosen: where it is a rival that
         is right, its own covariance is the true one (Buckland et al. 1997, eq. 9). Where boards were that is nothing;
-        elsewhere a richer model leaves open what the chosen one takes for known."""
+        elsewhere a richer model leaves open what the chosen one takes for known. Of a series with more terms that would
+        be what nobody knows of a term that is there no more than the others let expect: the `remainder` stands for it.
+        """
         out = np.zeros((len(rays), 2, 2))
-        if not self.rivals:
+        if not self._others:
             return out
         own, *others = self._alone
         known = own.along(rays)
-        for (rival, _, turn), other in zip(self.rivals, others, strict=True):
+        for (rival, turn), other in zip(self._others, others, strict=True):
             more = other.along(rays @ turn.T) - known
             # As with `away`: what one of the two does not see is not compared.
             values, axes = np.linalg.eigh(np.where(np.isfinite(more).all(axis=(1, 2), keepdims=True), more, 0.0))
             out += rival.likely * (axes * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(axes, 1, 2)
         return out
 
+    @property
+    def _others(self) -> list[tuple[Rival, Mat3]]:
+        """Rivals that are not the same series with other terms."""
+        same = self.camera.model if len(self.camera.series) >= TERMS else ""
+        return [(rival, turn) for rival, _, turn in self.rivals if rival.camera.model != same]
+
     @cached_property
     def _alone(self) -> list[_Alone]:
         """The lens and its rivals, each as if there were no other."""
         rays = self.corners.rays
-        lenses = [(self.camera, np.eye(3)), *((rival.camera, turn) for rival, _, turn in self.rivals)]
+        lenses = [(self.camera, np.eye(3)), *((rival.camera, turn) for rival, turn in self._others)]
         return [_Alone.of(self.calibration, camera, turn, rays) for camera, turn in lenses]
 
     def _beyond(self, left: FloatArray, at: Along) -> FloatArray:
         out = _propagated(self.departures.covariance, left)
-        for rival, away in self.away(at):
-            out += rival.likely * away[:, :, None] * away[:, None, :]
+        for away in self.away(at):
+            out += away[:, :, None] * away[:, None, :]
         return out
 
     def left_over(self, at: Along) -> FloatArray:
@@ -216,13 +229,17 @@ class FarProjection:
         left -= np.einsum("wj,iwm->ijm", self.hides_departures, at.design[:, len(self.sigmas) :])
         return left
 
-    def away(self, at: Along) -> list[tuple[Rival, FloatArray]]:
-        """Return how far each rival, followed where the boards were, projects the rays elsewhere, (M, 2) px."""
+    def away(self, at: Along) -> list[FloatArray]:
+        """Return how far other lenses that may be the true one project the rays elsewhere, (M, 2) px each, times the
+        root of how likely they are: each rival, followed where the boards were, and the lens with the terms that its
+        series leaves out."""
         out, p = [], len(self.sigmas)
         for rival, step, turn in self.rivals:
             there, seen = rival.camera.project(at.rays @ turn.T)
             moved = np.where(seen[:, None], there - at.pixels, 0.0) - np.einsum("ipm,p->mi", at.design[:, :p], step)
-            out.append((rival, moved))
+            out.append(np.sqrt(rival.likely) * moved)
+        if self.remainder is not None:
+            out += list(self.remainder.away(at.design))
         return out
 
     @cached_property
@@ -317,9 +334,7 @@ def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixel
     pixels = np.stack([u, v], axis=-1)
     if not valid.all():
         pixels[~valid] = np.nan
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        design[:, p + k] = ray[i] * by_x[:, j] - ray[j] * by_x[:, i]
+    design[:, p : p + 3] = turned_rays(ray, by_x)
     if count > p + 3:
         design[:, p + 3 :] = by_x / range_mm
     return pixels, design

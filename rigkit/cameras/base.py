@@ -95,6 +95,11 @@ class Camera(ABC):
     orders: ClassVar[tuple[int, ...]] = ()
     """The sizes that a model of several sizes can have: Brown's numbers of distortion terms, Scaramuzza's degrees."""
 
+    @property
+    def series(self) -> tuple[int, ...]:
+        """Which parameters are terms of a power series along the radius, the lowest first: none of a closed formula."""
+        return ()
+
     def __post_init__(self) -> None:
         _require_numbers(self.size_px, "camera size")
         size = as_array(self.size_px, (2,), "camera size")

@@ -70,6 +70,11 @@ class Brown(Camera):
         return camera
 
     @property
+    def series(self) -> tuple[int, ...]:
+        # The rational form is no power series.
+        return {8: (4, 5), 9: (4, 5, 8)}.get(self.parameters.size, ())
+
+    @property
     def max_angle_rad(self) -> float:
         return float(np.arctan(self._max_r))
 

@@ -46,6 +46,10 @@ class KannalaBrandt(CompiledCamera):
         return camera
 
     @property
+    def series(self) -> tuple[int, ...]:
+        return (4, 5, 6, 7)
+
+    @property
     def max_angle_rad(self) -> float:
         return self._max_angle
 

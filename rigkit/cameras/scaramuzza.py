@@ -75,6 +75,10 @@ class Scaramuzza(CompiledCamera):
         return int(self.parameters.size) - 4
 
     @property
+    def series(self) -> tuple[int, ...]:
+        return tuple(range(1, self.degree))
+
+    @property
     def max_angle_rad(self) -> float:
         return float(np.arctan2(self._max_rho, horner(self._polynomial, np.array([self._max_rho]))[0]))
 

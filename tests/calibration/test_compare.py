@@ -104,3 +104,36 @@ def test_a_moved_principal_point_is_found_in_either_model(in_other_models: dict[
         moved[2:4] += (MOVED_PX, 0.5 * MOVED_PX)
         result = compare_calibrations(replace(first, camera=first.camera.with_parameters(moved)), second)
         assert result.difference.rms_px < 0.5 * MOVED_PX and not result.same, (name, result.ratio, result.chance)
+
+
+def test_more_than_usual_is_a_chance_of_less_than_one_in_ten() -> None:
+    """Of several answers the chance takes the one that says most: what lay just beyond nineteen of twenty sizes stood
+    beyond "nine of ten cases" beside a chance of .15."""
+    sigma = np.array([2.0, 1.0, 0.8, 0.6])
+    null = sigma[:, None] * np.random.default_rng(0).normal(size=(4, 4000))
+    sizes = np.sqrt((null**2).sum(axis=0))
+
+    def asked(size: float) -> tuple[float, float]:
+        modes = compare._Modes(np.eye(4), np.array([size, 0.0, 0.0, 0.0]), null, sigma**2, 0.0)
+        return modes.chance([np.eye(4)[:, [k]] for k in (1, 2, 3)])
+
+    chance, unusual = asked(float(np.quantile(sizes, 0.952)))
+    assert chance > 0.13
+    assert 0.02 < unusual < 0.045
+    chance, _ = asked(float(np.quantile(sizes, 1.0 - unusual)) + 1e-3)
+    assert 0.08 < chance <= 0.1 + 1e-3
+
+
+def test_nine_of_ten_differences_are_usual(calibrations: list[Calibration]) -> None:
+    a, b = calibrations[:2]
+    # Errors as one camera's two calibrations have them, each as if it were found.
+    step = compare.drawn_errors(a.covariance, a.freedom, np.random.default_rng(1)).T
+    inside = 0
+    for k in range(100):
+        moved = replace(a, camera=b.camera.with_parameters(b.camera.parameters + np.sqrt(2.0) * step[k]))
+        result = compare_calibrations(moved, b, grid=(24, 18))
+        low, high = result.usual_px
+        assert low < result.predicted_px < high
+        inside += low <= result.difference.rms_px <= high
+        assert result.difference.rms_px <= high or result.chance <= 0.1 + 2e-3
+    assert 78 <= inside <= 99

@@ -149,7 +149,10 @@ def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
         float(np.linalg.norm(FarProjection.of(one).hides_departures @ lens_modes(one).modes))
         for one in (found, calibration)
     )
-    assert lens_modes(calibration).modes.size > lens_modes(found).modes.size > 0
+    rim = found.camera.unproject(np.array([[20.0, 20.0], [1600.0, 1220.0]]))[0]
+    stated = [np.trace(FarProjection.of(one).covariance(rim), axis1=1, axis2=2) for one in (found, calibration)]
+    assert (stated[1] > 1.5 * stated[0]).all()
+    assert lens_modes(calibration).modes.size > 0
     assert beside == pytest.approx(alone, rel=0.1)
     # One sigma of everything: what is left open at first order is what the moved cameras show.
     known = uncertain_camera(calibration)
