@@ -95,9 +95,11 @@ def _reason(view: BoardView, line_of: str | None) -> str | None:
     return None
 
 
-def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board]) -> str | None:
+def other_size(
+    detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board], about: Sequence[Board] = ()
+) -> str | None:
     """Return in words which size the boards of a session's images (name -> detections) have, where it is clearly none
-    of those listed.
+    of those listed. A board that is known to be `about`, as that of the calibration, need be seen only once.
 
     Where most images show a whole grid of one size that is not listed, and hardly any grid reaches from end to end of a
     listed board, the boards are of that size: a smaller board passes for part of a listed one. And where images show
@@ -111,7 +113,7 @@ def other_size(detections: Mapping[str, Sequence[BoardDetection]], boards: Seque
     counts = Counter((max(s.size), min(s.size)) for own in without for s in own if s.whole)
     size, count = counts.most_common(1)[0] if counts else ((0, 0), 0)
     words = f"{size[0]} x {size[1]} inner corners are seen in {count} of {len(found)} images, {sizes} are declared"
-    if count < OFTEN:
+    if count < (1 if any(frozenset(size) == frozenset(board.size) for board in about) else OFTEN):
         return None
     reaching = [own for own in found if any(frozenset(seen.reach) in listed for seen in own)]
     if len(reaching) <= MAX_SHARE_REACHING * len(found):

@@ -114,7 +114,7 @@ def check_pictures(
         if not boards:
             raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
         with about(source):
-            views = _views(watched, source, frames, boards, left_out, unreadable, progress)
+            views = _views(watched, source, frames, (boards, known), left_out, unreadable, progress)
             check = check_views(watched, views, cost)
             if not check.holds:
                 _require_right_order(check, views)
@@ -221,13 +221,15 @@ def _views(
     watched: Watched,
     source: Path,
     frames: Sequence[Sequence[Path]],
-    boards: Sequence[Board],
+    boards_known: tuple[Sequence[Board], Sequence[Board]],
     left_out: list[tuple[str, str]],
     unreadable: list[str],
     progress: Progress,
 ) -> list[FreshView]:
-    """Return the boards in all images; what has none goes to `left_out`, what cannot be used to `unreadable`."""
+    """Return the boards in all images, those listed, beside those that the calibration knows; what has none goes to
+    `left_out`, what cannot be used to `unreadable`."""
     out: list[FreshView] = []
+    boards, known = boards_known
     total = sum(len(frame) for frame in frames)
     seen: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in watched.cameras]
     for k, frame in enumerate(frames):
@@ -237,7 +239,7 @@ def _views(
             if image is not None:
                 seen[c][str(path)] = detect_boards(image, boards, camera=watched.cameras[c])
     progress("corners", total, total)
-    wrong = other_size({name: found for own in seen for name, found in own.items()}, boards)
+    wrong = other_size({name: found for own in seen for name, found in own.items()}, boards, known)
     if wrong is not None:
         raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
     own = [without_lookalikes(found, boards) for found in seen]

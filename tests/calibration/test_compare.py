@@ -9,6 +9,7 @@ from helpers.calibration_scenes import REACH_DEG, lens, random_views
 
 from rigkit.calibration import compare
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.clustered import drawn_errors
 from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.result import Calibration
 
@@ -127,7 +128,7 @@ def test_more_than_usual_is_a_chance_of_less_than_one_in_ten() -> None:
 def test_nine_of_ten_differences_are_usual(calibrations: list[Calibration]) -> None:
     a, b = calibrations[:2]
     # Errors as one camera's two calibrations have them, each as if it were found.
-    step = compare.drawn_errors(a.covariance, a.freedom, np.random.default_rng(1)).T
+    step = drawn_errors(a.covariance, a.freedom, np.random.default_rng(1)).T
     inside = 0
     for k in range(100):
         moved = replace(a, camera=b.camera.with_parameters(b.camera.parameters + np.sqrt(2.0) * step[k]))

@@ -164,9 +164,12 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
         (["{cam}", "{home}/nothing.png"], "does not exist"),
         (["{cam}", "{same}", "--board", "8x5x25"], "9 x 6 inner corners are seen in 3 of 3 images, 8 x 5 are declared"),
         (["{cam}", "{same}", "--fix", "{cam}", "--force"], "cam.json"),
+        # The calibration's own board, whole, in the only image: its pictures once held with a row more.
+        (["{cam}", "{one}", "--board", "9x7x25"], "9 x 6 inner corners are seen in 1 of 1 images, 9 x 7 are declared"),
     ],
 )
 def test_what_is_refused(command: list[str], words: str, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names = {"cam": str(home / "cam.json"), "same": str(home / "same"), "home": str(home)}
+    one = sorted((home / "same").iterdir())[0]
+    names = {"cam": str(home / "cam.json"), "same": str(home / "same"), "home": str(home), "one": str(one)}
     assert main(["check", *(part.format(**names) for part in command)]) == 2
     assert words in capsys.readouterr().err
