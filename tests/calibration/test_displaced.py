@@ -9,8 +9,10 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
 from rigkit.calibration.result import Calibration, Rival
+from rigkit.calibration.series import Remainder
 from rigkit.calibration.uncertainty import FarProjection, projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
@@ -82,11 +84,19 @@ def far_variance(known: UncertainCamera, calibration: Calibration, pixels: Float
     return np.asarray(np.einsum("ikm,kl,ilm->m", left, known.covariance / np.outer(sigmas, sigmas), left))
 
 
-def test_the_covariance_with_departures_is_that_of_the_projection() -> None:
+def test_the_covariance_with_departures_is_that_of_the_projection(monkeypatch: pytest.MonkeyPatch) -> None:
     found = departing(0)
-    known, pixels = uncertain_camera(found), grid_pixels(SIZE, (20, 15)).reshape(-1, 2)
+    pixels = grid_pixels(SIZE, (20, 15)).reshape(-1, 2)
     pixels = pixels[found.camera.unproject(pixels)[1]]
-    stated = FarProjection.of(found).covariance(found.camera.unproject(pixels)[0]).trace(axis1=1, axis2=2)
+    covered, rays = covered_by_boards(found, pixels), found.camera.unproject(pixels)[0]
+    # What a series leaves out is followed as rivals are: where boards were, as far as displacements can elsewhere.
+    whole = FarProjection.of(found).covariance(rays).trace(axis1=1, axis2=2)
+    followed = far_variance(uncertain_camera(found), found, pixels) / whole
+    assert np.median(followed[covered]) == pytest.approx(1.0, abs=0.05)
+    assert 0.15 < followed.min() < followed.max() < 1.6
+    monkeypatch.setattr(Remainder, "of", lambda *_: None)
+    known = uncertain_camera(found)
+    stated = FarProjection.of(found).covariance(rays).trace(axis1=1, axis2=2)
     assert far_variance(known, found, pixels) == pytest.approx(stated, rel=0.05)
     # The parameters alone say much less.
     alone = far_variance(UncertainCamera(found.camera, found.covariance), found, pixels)
