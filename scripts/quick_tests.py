@@ -310,7 +310,8 @@ def main() -> None:
             break
     left = {test for test, is_out in zip(reach.tests, out, strict=True) if is_out}
     if args.further:
-        left |= {line for line in CHOSEN.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+        before = {line for line in CHOSEN.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+        left |= before - set(reach.tests)
     names = sorted(left)
     CHOSEN.write_text(HEAD + "".join(f"{name}\n" for name in names), encoding="utf-8")
     failed = [test for test, (_, started) in zip(reach.tests, reach.seconds, strict=True) if not np.isfinite(started)]
