@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.data import REPOSITORY
+from helpers.stereo_pictures import CAMERA as BROWN
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
@@ -55,10 +57,14 @@ def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytes
         files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["opencv", "kalibr"])
     assert [path.name for path in files] == ["fish-opencv.yaml", "fish-kalibr.yaml"]
     assert "fish-kalibr.yaml: " in caplog.text
-    caplog.clear()
-    files = foreign_files(
-        load_calibration(CAMERAS / "mvca020_r61" / "calibration.json"), tmp_path / "brown.json", ["opencv", "ros"]
-    )
+
+
+def test_nothing_is_said_where_nothing_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    p = BROWN.parameters.size
+    unsure = {"covariance": np.eye(p), "frame_covariance": np.eye(p + 6)}
+    brown = replace(load_calibration(CALIBRATION), camera=BROWN, **unsure)
+    with caplog.at_level("INFO"):
+        files = foreign_files(brown, tmp_path / "brown.json", ["opencv", "ros"])
     assert len(files) == 2 and not caplog.text
 
 

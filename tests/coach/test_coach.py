@@ -98,6 +98,20 @@ def test_a_photo_that_is_there_needs_to_bring_less_than_a_frame_that_may_be_wait
     assert not guide.advise(photo).take and guide.advise(photo, photo=True).take
 
 
+def test_frames_are_offered_until_there_are_enough() -> None:
+    class Satisfied:
+        finished = None
+        offered = 0
+
+        def look(self, images: list[np.ndarray], **how: object) -> dict[str, bool]:
+            self.offered += 1
+            return {"enough": self.offered == 2}
+
+    coach = Satisfied()
+    coach_frames(coach, iter([([], None)] * 5), photos=True)  # type: ignore[arg-type]
+    assert coach.offered == 2
+
+
 def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[np.ndarray], tmp_path: Path) -> None:
     watched = tmp_path / "incoming"
     watched.mkdir()

@@ -24,6 +24,7 @@ from rigkit.io.board_file import load_board
 from rigkit.io.calibration_file import load_camera
 from rigkit.io.correspondences import read_correspondences
 from rigkit.io.images import announced_sizes, read_image
+from rigkit.io.json_reader import positive
 from rigkit.io.manifest import load_dataset
 from rigkit.io.ply import ply_bytes, read_ply
 from rigkit.io.reading import read_bytes, read_text
@@ -349,3 +350,10 @@ def test_one_pixel_less_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("rigkit.io.images.MAX_PIXELS", 40 * 60 - 1)
     with pytest.raises(InputError, match="60 x 40"):
         read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1e-300])
+def test_what_must_be_positive(value: float) -> None:
+    assert positive(0.5) == 0.5
+    with pytest.raises(ValueError, match="must be positive"):
+        positive(value)

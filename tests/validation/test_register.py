@@ -16,7 +16,7 @@ from helpers.sentinel_scenes import checked
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import save_calibration
-from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, load_history
+from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
 from rigkit.report.history_page import drift_svg, history_facts, history_page
 from rigkit.workflows.history import add_calibration, show_history
 
@@ -63,6 +63,15 @@ def test_a_register_of_months(calibration: Calibration, tmp_path: Path, caplog: 
     assert "of right/calibration.json is an alarm" in history_facts([*entries[:3], alarm, *entries[4:]]).headline
     # The amounts of one camera are no drift of another.
     assert page.count("<svg") == 18 and page.count("left/calibration.json: focus, %") == 1
+
+
+def test_a_register_that_the_work_reads_is_not_added_to(tmp_path: Path) -> None:
+    register = tmp_path / "cam.jsonl"
+    register.touch()
+    with pytest.raises(InputError, match="nothing in it"):
+        ensure_register(register, [tmp_path / "other.json"])
+    with pytest.raises(InputError, match="this command reads it"):
+        ensure_register(register, [tmp_path / "lab" / ".." / "cam.jsonl"])
 
 
 def test_every_entry_has_its_own_control_limits(calibration: Calibration) -> None:
