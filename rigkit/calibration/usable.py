@@ -205,12 +205,13 @@ def _reach(found: BoardDetection) -> tuple[int, int]:
 
 
 def views_of_image(
-    image: str, detections: Sequence[BoardDetection], boards: Sequence[Board]
+    image: str, detections: Sequence[BoardDetection], boards: Sequence[Board], camera: str | None = None
 ) -> tuple[list[BoardView], str | None]:
-    """Return the views that an image gives, or why it gives none.
+    """Return the views that an image gives, or why it gives none; `camera` is whose image it is, of several.
 
     A detection that could be several boards, or part of one, still is a flat grid of known points: it becomes a view of
-    a board of its own, called "<board> part of <image>".
+    a board of its own, called "<board> part of <image>", and after its camera: images of one name, of two cameras, show
+    different parts.
     """
     views: list[BoardView] = []
     other: list[str] = []
@@ -222,7 +223,8 @@ def views_of_image(
         if parent is None:
             other.append(f"{found.columns}x{found.rows}")
             continue
-        name = _part_name(parent.board_id, image, k + 1 if len(detections) > 1 else None)
+        of = image if camera is None else f"{image} of {camera}"
+        name = _part_name(parent.board_id, of, k + 1 if len(detections) > 1 else None)
         sides = parent.square_x_mm, parent.square_y_mm
         # Rows of circles keep their stagger, which a part is numbered by; all else needs a place on the board.
         pattern = parent.pattern if isinstance(parent.pattern, Circles) else Chessboard()

@@ -84,10 +84,14 @@ class Coach:
         self._last: list[Glance | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
         self._names: list[str] = []
+        self._called = keeper.names if len(keeper.names) > 1 else (None,)
         self._offered: tuple[Sequence[Image], bool] | None = None
         self._shown: dict[str, Any] = self.guide.state(None, None) | {"looks": 0}
         for name, images in keeper.images():
-            seen = [glance_at(image, options.boards, name) for image in images]
+            seen = [
+                glance_at(image, options.boards, name, camera=camera)
+                for image, camera in zip(images, self._called, strict=True)
+            ]
             if any(glance.view is not None for glance in seen):
                 self._add(name, seen)
 
@@ -140,11 +144,15 @@ class Coach:
     def _glances(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[Glance]:
         """Return what all cameras show; what is not `whole` is looked at quickly, and where that is slow, in a
         smaller picture."""
-        out = []
+        out, boards = [], self.guide.options.boards
+        # Until it is taken: then the part of a board that it shows is not that of the next.
+        frame = f"frame {len(self._names)}"
         for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
             shrink = 1 if whole else self._shrink[c]
             began = time.thread_time()
-            glance = glance_at(image, self.guide.options.boards, "frame", self._last[c], shrink=shrink, quick=not whole)
+            glance = glance_at(
+                image, boards, frame, self._last[c], shrink=shrink, quick=not whole, camera=self._called[c]
+            )
             if not whole:
                 # The work grows with the picture's area.
                 spent = (time.thread_time() - began) * shrink**2

@@ -104,16 +104,18 @@ def glance_at(
     *,
     shrink: int = 1,
     quick: bool = False,
+    camera: str | None = None,
 ) -> Glance:
     """Return what a frame shows, `last` having been seen before it; the board is looked for at a `shrink`-th of the
-    size, and quickly, which takes less time and places corners less well."""
+    size, and quickly, which takes less time and places corners less well. Parts of boards are called after the frame's
+    `name`, and after its `camera` where there are several."""
     size_px = (int(image.shape[1]), int(image.shape[0]))
     smaller = (
         image
         if shrink == 1
         else cv2.resize(image, None, fx=1.0 / shrink, fy=1.0 / shrink, interpolation=cv2.INTER_AREA)
     )
-    views, _ = views_of_image(name, detect_boards(smaller, boards, quick=quick), boards)
+    views, _ = views_of_image(name, detect_boards(smaller, boards, quick=quick), boards, camera)
     if not views:
         return Glance(size_px=size_px, view=None)
     view = max(views, key=lambda v: len(v.grid))

@@ -243,12 +243,13 @@ def _views(
     if wrong is not None:
         raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
     own = [without_lookalikes(found, boards) for found in seen]
+    whose = watched.names if len(watched.names) > 1 else (None,)
     for k, frame in enumerate(frames):
         name = f"{k:04d}"
         for c, path in enumerate(frame):
             if str(path) not in own[c]:
                 continue
-            views, reason = views_of_image(path.name, own[c][str(path)], boards)
+            views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
             out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))

@@ -81,7 +81,7 @@ def session_views(
                 (name, f"{width}x{height} px{turned}, most images with boards have {size_px[0]}x{size_px[1]}")
             )
             continue
-        own, reason = views_of_image(name, boards[name], session.boards)
+        own, reason = views_of_image(name, boards[name], session.boards, session.camera)
         views += own
         if reason is None and len(boards[name]) < len(item.detections):
             reason = BESIDE

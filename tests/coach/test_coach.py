@@ -177,6 +177,28 @@ def test_a_recording_is_gone_through_whole_and_what_it_lacks_is_said(
     assert lacks.startswith(". What it lacks: hold the board: ") and "two more pictures would bring" in lacks
 
 
+def _with_a_part(image: np.ndarray, columns: range) -> np.ndarray:
+    """Return the picture with something before the board from the first of the columns on that leaves a part of it of
+    which nothing tells which it is."""
+    for column in columns:
+        covered = image.copy()
+        covered[:, column:] = 120
+        view = glance_at(covered, [BOARD], "tried").view
+        if view is not None and view.board.board_id != BOARD.board_id:
+            return covered
+    pytest.fail("no part is seen")
+
+
+def test_parts_of_the_board_in_several_frames_are_different_parts(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    coach: Coach = open_coach(options(tmp_path))
+    narrow, wide = (_with_a_part(pictures[0], columns) for columns in (range(200, 640, 8), range(640, 200, -8)))
+    for image in (narrow, wide, *pictures[1:6]):
+        coach.look([image], take=Take.YES)
+    lens = coach.guide.lenses[0]
+    assert len({view.board.size for view in lens.views}) == 3 and len(lens.views) == 7
+    assert lens.calibration is not None and len(lens.calibration.views) >= 6
+
+
 def test_what_is_shown_can_be_taken_once_and_undone(pictures: list[np.ndarray], tmp_path: Path) -> None:
     coach = open_coach(options(tmp_path))
     with pytest.raises(InputError, match="no frame to undo"):

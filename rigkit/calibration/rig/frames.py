@@ -116,7 +116,7 @@ def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
         if not shared:
             raise InputError(
                 f"rig: camera '{names[j]}' shares no board in any frame with '{names[0]}' or the cameras that hang "
-                "together with it; take frames in which both see a board, and check the names of the frames"
+                "together with it; take frames in which both see a whole board, and check the names of the frames"
             )
         motion, rival = _motion([(targets[i][key], targets[j][key]) for key in shared])
         if rival is not None:
