@@ -46,7 +46,11 @@ def rig_scene(rig: RigCalibration) -> dict[str, Any]:
             if not any(np.abs(place - other).max() < SAME_PLACE * (1.0 + np.abs(place[:, 3]).max()) for other in known):
                 known.append(place)
                 views.append((view, rig_from_cam))
-    return _scene(cameras, views, rig.cameras[0].calibration.boards)
+    # Boards that all cameras saw have one shape; a part of one was seen by a single camera.
+    boards: dict[str, BoardShape] = {}
+    for camera in rig.cameras:
+        boards = {board.board_id: board for board in camera.calibration.boards} | boards
+    return _scene(cameras, views, list(boards.values()))
 
 
 def rounded(values: FloatArray, digits: int) -> list[list[float]]:
