@@ -12,7 +12,7 @@ from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.normal_equations import NormalEquations, Residuals
 from rigkit.calibration.observations import Observations
 from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
-from rigkit.calibration.poses import find_poses
+from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Convergence
 from rigkit.calibration.solver import solve, with_priors
 from rigkit.calibration.state import State, evaluate
@@ -160,7 +160,9 @@ def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settl
 
 
 def fit_other_lens(observations: Observations, state: State, kept: BoolArray) -> Fit:
-    """Return the least-squares solution on the kept corners from a lens that was found with others."""
+    """Return the least-squares solution on the kept corners from a lens that was found with other boards."""
+    # Poses that go with another lens may lead the lens away from where it was.
+    state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
     # The scatter that priors are weighed by is known after the first round.
     return fit_kept(observations, fit_kept(observations, state, kept).state, kept)
 

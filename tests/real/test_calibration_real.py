@@ -36,6 +36,7 @@ HELDOUT_REL = 0.1
 FISHEYE1_PX = 0.413
 """Held-out RMS of the best rivals on these captures."""
 BASELINE_MM = (99.81, 0.25)
+BOUGUET_FX = 533.5
 
 
 def detected(folder: Path, pattern: str, board: Board) -> tuple[list[BoardView], tuple[int, int]]:
@@ -149,3 +150,14 @@ def test_stereo_baseline() -> None:
 
 def _centre(camera: Camera) -> FloatArray:
     return camera.project(np.array([0.0, 0.0, 1.0]))[0]
+
+
+def test_pixels_twice_as_wide_as_high() -> None:
+    """As single fields of interlaced images have them. The other models, fitted to boards as one found them, strayed to
+    other lenses there, and the right one was refused as open."""
+    views, (width, height) = detected(shared_data("real/bouguet-stereo"), "left*.jpg", Board("b", 9, 6, 30.0, 30.0))
+    squeezed = [replace(view, pixels=(view.pixels + 0.5) * [1.0, 0.5] - 0.5) for view in views]
+    result = calibrate(squeezed, (width, height // 2), model="auto")
+    focal = dict(zip(result.camera.parameter_names(), result.camera.parameters, strict=True))
+    assert focal["fx"] / focal["fy"] == pytest.approx(2.0, abs=0.004)
+    assert focal["fx"] == pytest.approx(BOUGUET_FX, abs=2.0)
