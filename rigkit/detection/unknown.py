@@ -18,6 +18,7 @@ from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
 from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagSightings, guessed_grids
@@ -84,6 +85,8 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     Of a chessboard that no image shows whole, other images may show where one and the other side ends.
     `progress` is told after every image.
     """
+    # The pixels of a mosaic look like marks in every square.
+    images = [without_mosaic(image) for image in images]
     tags, markers = TagSightings(), MarkerSightings()
     plain: list[list[GridSeen]] = []
     sure: list[int] = []

@@ -124,7 +124,7 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     mirrored = _mirrored(paths, [board for board in boards if board.identified])
     if mirrored is not None:
         return mirrored
-    guess, _ = _guess(paths)
+    guess, *_ = _guess(paths)
     if guess is None or not guess.told:
         return None
     told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
@@ -232,7 +232,9 @@ class Suggestion:
 
 def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion:
     """Return the board that images show."""
-    guess, pictures = _guess(paths, progress)
+    guess, pictures, unreadable = _guess(paths, progress)
+    if unreadable is not None and not pictures:
+        return Suggestion(fault=str(unreadable))
     otherwise = _otherwise(pictures, guess)
     if otherwise is not None:
         return Suggestion(fault=otherwise)
@@ -269,20 +271,28 @@ def _untold(guess: BoardGuess) -> str:
     )
 
 
-def _guess(paths: Sequence[Path], progress: Progress = silent) -> tuple[BoardGuess | None, list[tuple[str, GreyImage]]]:
-    """Return the board that a few images show, or more of them where those do not tell, and what was looked at."""
-    guess, pictures = None, []
+def _guess(
+    paths: Sequence[Path], progress: Progress = silent
+) -> tuple[BoardGuess | None, list[tuple[str, GreyImage]], InputError | None]:
+    """Return the board that a few images show, or more of them where those do not tell, what was looked at, and why the
+    first of the others cannot be read."""
+    guess, pictures, unreadable = None, [], None
     for most in (EXPLAINING_IMAGES, ENOUGH_IMAGES):
+        pictures = []
+        for name, one in _pictures(paths, most):
+            if isinstance(one, InputError):
+                unreadable = unreadable or one
+            else:
+                pictures.append((name, one))
         try:
-            pictures = [(name, one) for name, one in _pictures(paths, most) if not isinstance(one, InputError)]
             guess = guess_board([image for _, image in pictures], progress)
         except (InputError, DegenerateError):
-            return None, []
+            return None, [], None
         # Where some do not show it, more are asked.
         told = guess is not None and guess.told and 1 < len(guess.images) == len(pictures)
         if told or (len(paths) <= most and not any(map(is_video, paths))):
             break
-    return guess, pictures
+    return guess, pictures, unreadable
 
 
 def _pictures(paths: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage | InputError]]:

@@ -88,7 +88,8 @@ def test_everything_but_the_scale_is_told(size: tuple[int, int], pattern: Patter
         assert found == pattern
 
 
-def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("mosaic", [False, True])
+def test_empty_squares_are_a_chessboard_without_reading_marks(mosaic: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten dictionaries in two polarities take longer than the board."""
 
     def asked(*_: object) -> bool:
@@ -97,6 +98,9 @@ def test_empty_squares_are_a_chessboard_without_reading_marks(monkeypatch: pytes
     monkeypatch.setattr(TagSightings, "look", asked)
     monkeypatch.setattr(MarkerSightings, "look", asked)
     image = shown(Board("b", 8, 6, 60.0, 60.0))
+    if mosaic:
+        image = image.copy()
+        image[::2, ::2] //= 2
     told: list[tuple[str, int, int]] = []
     guess = guess_board([image, image], lambda *what: told.append(what))
     assert guess is not None and guess.board.size == (8, 6)

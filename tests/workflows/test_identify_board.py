@@ -34,6 +34,13 @@ def test_two_boards_alike_are_told(pattern: Pattern, tmp_path: Path, capsys: pyt
         assert ("first_marker, first_tag" in err) == (name == "two.png")
 
 
+def test_images_that_cannot_be_read_are_not_without_a_board(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cv2.imwrite(str(tmp_path / "one.tif"), np.zeros((40, 60), np.float32))
+    for arguments in (["--square-mm", "40"], []):
+        assert main(["calibrate", str(tmp_path), *arguments]) == 2
+        assert "float32 pixels; save it with 8 or 16 bits" in capsys.readouterr().err
+
+
 def mirrored(image: np.ndarray) -> np.ndarray:
     return image[:, ::-1]
 
