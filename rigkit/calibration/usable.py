@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -37,6 +38,10 @@ BESIDE = "grids beside the whole board, which may be parts of another or somethi
 MIN_SPREAD = 1e-6
 """Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
 board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
+
+
+PART = re.compile(r" part (of .+|[0-9a-f]{8})$")
+"""How the name of a part of a board ends: see `views_of_image`."""
 
 
 def usable_views(
@@ -243,6 +248,11 @@ def _part_name(board_id: str, image: str, number: int | None) -> str:
     if len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) and ".." not in name:
         return name
     return f"{board_id[: MAX_IDENTIFIER - 20]} part {zlib.crc32(name.encode()):08x}"
+
+
+def without_parts(boards: Iterable[Board]) -> tuple[Board, ...]:
+    """Return the boards without those that are called parts: nobody has them to hold, and they are not to look for."""
+    return tuple(board for board in boards if PART.search(board.board_id) is None)
 
 
 def _parent(found: BoardDetection, boards: Sequence[Board]) -> tuple[Board | None, BoardDetection]:

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes
+from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.boards import Board
@@ -143,15 +143,15 @@ def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Pa
 
 
 def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
-    """Return what a file of a calibration or a rig says, and the boards it knows.
+    """Return what a file of a calibration or a rig says, and the whole boards it knows.
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
     known = load_saved_rig(source) if is_rig_file(source) else load_calibration(source)
     if isinstance(known, SavedRig):
-        return as_watched(known, source), known.boards
+        return as_watched(known, source), without_parts(known.boards)
     with about(source):
-        boards = tuple(shape.board for shape in known.boards)
+        boards = without_parts(shape.board for shape in known.boards)
     return as_watched(known, source), boards
 
 

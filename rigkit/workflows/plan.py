@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rigkit.calibration.usable import without_parts
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
@@ -118,7 +119,9 @@ def plan_session(
     else:
         calibration = load_calibration(source)
         with about(source):
-            boards = tuple(shape.board for shape in calibration.boards)
+            boards = without_parts(shape.board for shape in calibration.boards)
+        if not boards:
+            raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
     taken = calibration.corners.used[0]
     if options.check:
         return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)

@@ -11,6 +11,7 @@ from helpers.stereo_pictures import RIGHT_FROM_LEFT
 
 from rigkit.cli.main import main
 from rigkit.io.rig_file import load_rig
+from rigkit.workflows.check import load_watched
 
 COVERED = {"01": {"left": 240, "right": 138}, "02": {"left": 311, "right": 184}, "05": {"left": 294, "right": 259}}
 """Frames in which something stands before the board, for the left camera from this column on, for the right one up to
@@ -47,3 +48,12 @@ def test_parts_of_boards_are_no_change_of_the_rig(cut: Path, capsys: pytest.Capt
     sides = [str(cut / side / f"{number}.png") for number in ("02", "04") for side in ("left", "right")]
     assert main(["check", str(cut / "rig.json"), *sides]) == 0
     assert "Still holds" in capsys.readouterr().out
+
+
+def test_parts_are_no_boards_to_hold_or_to_look_for(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [cut / "rig.json", *(cut / f"rig-{side}.json" for side in ("left", "right"))]
+    for path in files:
+        _, boards = load_watched(path)
+        assert [board.board_id for board in boards] == ["board-9x6x30"]
+        assert main(["plan", str(path), "-n", "1"]) == 0
+        assert "part of" not in capsys.readouterr().out
