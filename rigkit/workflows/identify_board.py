@@ -276,7 +276,9 @@ def _guess(
 ) -> tuple[BoardGuess | None, list[tuple[str, GreyImage]], InputError | None]:
     """Return the board that a few images show, or more of them where those do not tell, what was looked at, and why the
     first of the others cannot be read."""
-    guess, pictures, unreadable = None, [], None
+    guess: BoardGuess | None = None
+    unreadable: InputError | None = None
+    pictures: list[tuple[str, GreyImage]] = []
     for most in (EXPLAINING_IMAGES, ENOUGH_IMAGES):
         pictures = []
         for name, one in _pictures(paths, most):
