@@ -80,6 +80,13 @@ def test_without_a_baseline_it_is_the_unit(rng):
     np.testing.assert_allclose(one.normal_sigma_rad, many.normal_sigma_rad, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("wrong", "warned"), [(0.5, False), (0.8, True)])
+def test_few_matches_on_one_pose_are_a_warning(rng, wrong, warned):
+    found, *_ = contaminated(rng, outliers=wrong, count=400)
+    told = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=200.0).reconstruction.notes
+    assert any("agree with this pose" in words for words in told) == warned
+
+
 def test_the_pose_type_is_chosen_and_contradicted(rng):
     found, *_ = contaminated(rng, "standard", outliers=0.3)
     auto = reconstruct_scene(found, REGULAR, REGULAR, pose_type="auto")
