@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -83,7 +84,10 @@ class BoardDetection:
         return BoardDetection(self.board_id, columns, rows, grid[order], self.pixels[order], self.sigma_px[order])
 
     def named(self, board_id: str) -> BoardDetection:
-        return replace(self, board_id=board_id)
+        # Its corners were looked at when it was made, and do not change.
+        out = copy(self)
+        object.__setattr__(out, "board_id", board_id)
+        return out
 
     def lattice(self) -> FloatArray:
         """Return the pixels as (rows, columns, 2), NaN where a corner was not found."""

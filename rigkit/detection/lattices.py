@@ -5,7 +5,7 @@ fit, and what is a board. No size need be known, no number of boards, no lens.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,9 +82,12 @@ def find_lattices(
     found = looked(seen)
     if _worth_another_look(seen, found, sizes):
         found = max(looked(seen.with_smeared()), found, key=_corners_of)
-    for coarser in seen.coarser():
+    for k in range(1, len(seen.levels)):
         # The squares of clutter do meet.
         if _whole(found, sizes) or promising.in_vain >= MAX_FRUITLESS:
+            break
+        coarser = seen.coarser(k)
+        if coarser is None:
             break
         found = max(found, looked(coarser, _corners_of(found)), key=_corners_of)
     if min_corners < MIN_BOARD_CORNERS:
@@ -107,19 +110,19 @@ class Seen:
         levels = pyramid(grey)
         return cls(grey, levels[0], levels, *find_corners(levels))
 
-    def coarser(self) -> Iterator[Seen]:
-        """Return this as the coarser levels alone show it, without one level more each time.
+    def coarser(self, without: int) -> Seen | None:
+        """Return this as the coarser levels alone show it, `without` so many of the finest; None where that is hardly
+        anything.
 
         Where bright squares run over into dark ones (too much light, thin print), or dark ones into bright ones (ink
         that spreads), these do not meet: near a corner, the borders of the quadrants lie aside of the lines, by an
         angle that falls with the radius of the ring. On coarser levels, dots look like squares, too: what lattices are
         is seen on the finest one.
         """
-        for k in range(1, len(self.levels)):
-            corners = each_once(self.saddles.by_level[k:])
-            if len(corners) < MIN_BOARD_CORNERS:
-                return
-            yield replace(self, levels=self.levels[k:], corners=corners)
+        corners = each_once(self.saddles.by_level[without:])
+        return (
+            replace(self, levels=self.levels[without:], corners=corners) if len(corners) >= MIN_BOARD_CORNERS else None
+        )
 
     def with_smeared(self) -> Seen:
         """Return this with what is a corner only if something moved among the corners."""

@@ -75,12 +75,15 @@ def relit(
 
     `refined` : the fits of the corners, on the same grid. `board` : which it is, if it is a ChArUco board.
     """
+    as_sure = TIMES_BETTER * upper_median(found.sigma_px)
+    if found.complete and np.count_nonzero(found.sigma_px >= as_sure) < MIN_SHADED:
+        return found
     pixels, relative = found.lattice(), refined.relative_residual
     known = np.isfinite(pixels[..., 0])
     own = np.full(known.shape, np.nan)
     own[found.grid[:, 1], found.grid[:, 0]] = found.sigma_px
     # What a shadow's edge leaves in the fit sigmas count: corners as sure as usual, or fitted as well, are beside none.
-    plain = own < TIMES_BETTER * upper_median(found.sigma_px)
+    plain = own < as_sure
     plain |= relative < TIMES_BETTER * upper_median(relative[np.isfinite(relative)])
     doubtful = ~plain & ((cv2.dilate(known.astype(np.uint8), CROSS) > 0) | known)
     if np.count_nonzero(doubtful) < MIN_SHADED:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -53,20 +54,32 @@ class Corners:
         return Corners(self.pixels[which], self.angles[which], self.contrast[which], self.scale[which])
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Saddles:
     """Saddle points, and corners that are not among those of the whole image.
 
     Attributes
     ----------
     pixels : (N, 2) full resolution.
-    smeared : those that are corners only if something moved.
-    by_level : the corners of each level, also those that a finer one has found, and the smeared ones.
+    by_level : the corners of each level, also those that a finer one has found, and those that are corners only if
+        something moved.
+    moved : which of each level are such.
+    still : the others, each once.
     """
 
     pixels: FloatArray
-    smeared: Corners
     by_level: tuple[Corners, ...]
+    moved: tuple[BoolArray, ...]
+    still: tuple[Corners, ...]
+
+    @cached_property
+    def smeared(self) -> Corners:
+        """The corners that are some only if something moved, each once; only images without boards need them."""
+        others: list[Corners] = []
+        for own, moved in zip(self.by_level, self.moved, strict=True):
+            # A coarser level may show what is smeared on a finer one as it should be.
+            others.append(_without_known(own, moved, [*self.still, *others]))
+        return joined(others)
 
 
 def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple[Corners, Saddles]:
@@ -76,28 +89,23 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
     """
     kept = [] if finer is None else [finer]
     own: list[Corners] = []
-    smeared: list[Corners] = []
+    smeared: list[BoolArray] = []
     saddles: list[FloatArray] = []
     for level in levels:
         local, which, angles, contrast, moved = _corners_of(level)
         full = level.to_full(local)
         saddles.append(full)
-        fresh = Corners(full[which], angles, contrast, np.full(len(which), level.scale))
-        own.append(fresh)
-        kept.append(_without_known(fresh.of(~moved), kept))
-        smeared.append(fresh.of(moved))
-    # A coarser level may show what is smeared on a finer one as it should be.
-    others: list[Corners] = []
-    for fresh in smeared:
-        others.append(_without_known(fresh, [*kept, *others]))
-    return joined(kept), Saddles(np.concatenate(saddles), joined(others), tuple(own))
+        own.append(Corners(full[which], angles, contrast, np.full(len(which), level.scale)))
+        smeared.append(moved)
+        kept.append(_without_known(own[-1], ~moved, kept))
+    return joined(kept), Saddles(np.concatenate(saddles), tuple(own), tuple(smeared), tuple(kept))
 
 
 def each_once(by_level: Iterable[Corners]) -> Corners:
     """Return the corners of several levels, the finest first, each once (the finest level wins)."""
     kept: list[Corners] = []
     for own in by_level:
-        kept.append(_without_known(own, kept))
+        kept.append(_without_known(own, np.ones(len(own), np.bool_), kept))
     return joined(kept)
 
 
@@ -108,13 +116,12 @@ def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatAr
     return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
 
 
-def _without_known(fresh: Corners, known: list[Corners]) -> Corners:
-    """Return those of `fresh` that no finer level has found already."""
-    if not len(fresh) or not any(len(k) for k in known):
-        return fresh
-    before = np.concatenate([k.pixels for k in known])
-    new = ~near_any(fresh.pixels, before, KNOWN_PX * float(fresh.scale[0]))
-    return fresh.of(new)
+def _without_known(found: Corners, which: BoolArray, known: list[Corners]) -> Corners:
+    """Return those of `found`, and `which` (N,), that no finer level has found already."""
+    before = [k.pixels for k in known if len(k)]
+    if before and which.any():
+        which = which & ~near_any(found.pixels, np.concatenate(before), KNOWN_PX * float(found.scale[0]))
+    return found.of(which)
 
 
 def joined(parts: Sequence[Corners]) -> Corners:

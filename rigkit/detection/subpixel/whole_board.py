@@ -16,7 +16,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
@@ -127,7 +127,7 @@ def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
     """Return `item` with its corners placed together where its squares are small against the blur, and the picture is
     as that of a board; else as it is."""
     lattice, known = item.lattice, item.lattice.known
-    start, blur = lattice.pixels, float(np.median(item.blur_px[known]))
+    start, blur = lattice.pixels, known_median(item.blur_px[known])
     few = min(known.shape) < MIN_ROWS or np.count_nonzero(~known) > MAX_HOLES * known.size
     if few or blur < MIN_BLUR_PX:
         return item

@@ -122,7 +122,10 @@ class TagSightings:
         image = 255 - image if self.inverted else image
         seen = Seen.of(image)
         # Where light or ink runs over, tags and the squares between them meet on coarser levels only.
-        for at in (seen, *seen.coarser()):
+        for k in range(len(seen.levels)):
+            at = seen.coarser(k) if k else seen
+            if at is None:
+                break
             lattices = build_lattices(at.corners, find_links(at.corners, at.levels[0], LENGTH_RATIO * WIDEST_RATIO))
             found = [self._read(index, image, lattice) for lattice in lattices if lattice.count >= 4 * MIN_TAGS_READ]
             if any(found):
