@@ -40,7 +40,7 @@ typedef struct {
 
 /* The constants of detection.subpixel.correlation, under their names there. */
 typedef struct {
-    double light_share, lost_error, least_left, covered_times, least_factor, least_blur, radius_px;
+    double light_share, lost_error, least_left, covered_times, least_factor, least_alike, uneven_times, least_blur, radius_px;
 } factor_rules_t;
 
 EXPORT void sigma_factors(
@@ -48,6 +48,11 @@ EXPORT void sigma_factors(
     ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
     ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
     int64_t boards, const factor_rules_t *rules, ARRAY(double, out, boards));
+EXPORT void uneven_factors(
+    ARRAY(const double, products, count, LAGS), ARRAY(const double, pairs, count, LAGS), ARRAY(const double, noise, count),
+    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
+    ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
+    int64_t boards, ARRAY(const double, usual, boards), const factor_rules_t *rules, ARRAY(double, out, count));
 
 /* bends.c */
 

@@ -25,7 +25,7 @@ EXPORT void shrink_floats(
     ARRAY(float, out, height / factor, width / factor));
 EXPORT void shrink_bytes(
     ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, int64_t factor,
-    ARRAY(uint16_t, sums, width), ARRAY(float, out, height / factor, width / factor));
+    ARRAY(uint16_t, sums, 2 * width), ARRAY(float, out, height / factor, width / factor));
 EXPORT void smooth_floats(
     ARRAY(const float, image, height, width), int64_t height, int64_t width, ARRAY(const float, kernel, 5),
     ARRAY(float, column, width + 4), ARRAY(float, out, height, width),
@@ -44,7 +44,8 @@ enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 EXPORT void typical_values(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width, int64_t step,
     int64_t few, ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
-    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
+    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
+    ARRAY(float, room, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
 EXPORT void fill_thresholds(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float floor, float least, float darkest,
     float brightest, ARRAY(float, out, height / STRIP_ROWS + 1, width / STRIP + 1));
@@ -171,21 +172,41 @@ EXPORT int64_t find_components(
 
 /* The constants of detection.subpixel.scatter. */
 typedef struct {
-    double unexplained, median_of_normal;
-    int64_t fewest_corners, fewest_differences, first_order, last_order;
+    double unexplained, median_of_normal, min_term;
+    int64_t fewest_corners, fewest_differences, first_order, last_order, degrees[2];
 } scatter_rules_t;
 
 EXPORT void uneven_steps(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns,
     ARRAY(double, scratch, 2 * rows * columns), int64_t inner, ARRAY(double, typical, inner),
     ARRAY(int64_t, seen, inner), ARRAY(double, every, 2));
+EXPORT void line_gaps(
+    ARRAY(const double, sides, count, 2, 2), ARRAY(const double, bends, count, 2, 2), int64_t count,
+    ARRAY(double, out, count, 2, 2));
 EXPORT void excess_scatter(
     ARRAY(const double, pixels, height, width, 2), ARRAY(const double, sigma, height, width), int64_t height,
     int64_t width, ARRAY(const int64_t, parts, count, 4), int64_t count, const scatter_rules_t *rules,
     ARRAY(double, scratch, 7 * height * width), ARRAY(double, out, count));
+EXPORT void surface_scatter(
+    ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns), int64_t rows, int64_t columns,
+    const scatter_rules_t *rules, ARRAY(double, scratch, 20 * rows * columns), ARRAY(double, out, 2));
 EXPORT void edge_shifts(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, double sign, image_t image, double scale,
     double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,
     ARRAY(double, sums, parts, steps + 1), ARRAY(double, out, parts));
+
+/* splits.c */
+
+/* The constants of detection.checks.discontinuity. */
+typedef struct {
+    int64_t window, min_beside, min_free;
+    double two_surfaces, jump, floor_cells, as_smooth, ridge;
+} split_rules_t;
+
+EXPORT int64_t splits_scratch(int64_t rows, int64_t columns);
+EXPORT void clearest_splits(
+    ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns), int64_t rows, int64_t columns,
+    int64_t several, const split_rules_t *rules, ARRAY(double, scratch, splits_scratch(rows, columns)),
+    ARRAY(double, out, 2, 3));
 
 #endif

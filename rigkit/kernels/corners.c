@@ -13,7 +13,7 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
     const double det = uu * vv - uv * uv;
     if (!(det < 0.0))
         return 0;
-    const double step_u = (uv * gv - vv * gu) / det, step_v = (uv * gu - uu * gv) / det;
+    const double inverse = 1.0 / det, step_u = (uv * gv - vv * gu) * inverse, step_v = (uv * gu - uu * gv) * inverse;
     pixel[0] = (double)u + step_u;
     pixel[1] = (double)v + step_v;
     return fabs(step_u) <= most_step && fabs(step_v) <= most_step;

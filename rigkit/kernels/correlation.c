@@ -190,3 +190,29 @@ void sigma_factors(
         out[board] = clear > 0 ? factor_of(&known, (double)clear, rules) : 1.0;
     }
 }
+
+/* Set `out` to the factors of the sigmas of corners beside those of their boards, `usual` (boards): 1 but for corners beside
+ * which there is more than noise (reference.correlation.uneven_factors). */
+void uneven_factors(
+    const double *products, const double *pairs, const double *noise, const double *pixels, const double *sides, const double *blur,
+    const double *used, const uint8_t *good, const int64_t *owner, int64_t count, int64_t boards, const double *usual,
+    const factor_rules_t *rules, double *out)
+{
+    (void)boards;
+    for (int64_t i = 0; i < count; i++) {
+        const double *own_products = products + LAGS * i, *own_pairs = pairs + LAGS * i, board = usual[owner[i]];
+        out[i] = 1.0;
+        if (!good[i] || !(own_pairs[0] > 0.0))
+            continue;
+        double alike = 0.0;
+        for (int k = 1; k < LAGS; k++)
+            alike += own_products[k] / (own_pairs[k] > 1.0 ? own_pairs[k] : 1.0);
+        if (!(alike / (double)(LAGS - 1) > rules->least_alike * board * board * noise[i] * noise[i]))
+            continue;
+        known_t known;
+        memset(&known, 0, sizeof known);
+        add_known(own_products, own_pairs, noise[i], pixels + 2 * i, sides + 4 * i, blur[i], used[i], &known);
+        const double times = factor_of(&known, 1.0, rules) / board;
+        out[i] = times > rules->uneven_times ? times : 1.0;
+    }
+}

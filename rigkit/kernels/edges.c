@@ -26,7 +26,7 @@ static void level(double *values, const window_t *window, double half)
 
 /* Factor the lower half of `matrix` (n rows of ROWS) in place, Cholesky, with one over the diagonal on the diagonal;
  * return whether it is positive definite. */
-static int factor(double *matrix, int n)
+INLINE int factor(double *matrix, const int n)
 {
     for (int j = 0; j < n; j++) {
         const double pivot = matrix[j * ROWS + j];
@@ -44,7 +44,7 @@ static int factor(double *matrix, int n)
     return 1;
 }
 
-static void forward(const double *lower, double *right, int n)
+INLINE void forward(const double *lower, double *right, const int n)
 {
     for (int i = 0; i < n; i++) {
         double sum = right[i];
@@ -54,7 +54,7 @@ static void forward(const double *lower, double *right, int n)
     }
 }
 
-static void backward(const double *lower, double *right, int n)
+INLINE void backward(const double *lower, double *right, const int n)
 {
     for (int i = n - 1; i >= 0; i--) {
         double sum = right[i];
@@ -62,6 +62,17 @@ static void backward(const double *lower, double *right, int n)
             sum -= lower[k * ROWS + i] * right[k];
         right[i] = sum * lower[i * ROWS + i];
     }
+}
+
+/* Set `step` to what the normal equations `matrix` of `n` unknowns make of it, and `matrix` to its factor; return whether it is
+ * positive definite. */
+INLINE int solved_step(double *matrix, double *step, const int n)
+{
+    if (!factor(matrix, n))
+        return 0;
+    forward(matrix, step, n);
+    backward(matrix, step, n);
+    return 1;
 }
 
 /* Return element (k, k) of the inverse of what `lower` is the factor of. */
@@ -144,11 +155,10 @@ FOR_EACH_PROCESSOR static void descend(
             products[k * ROWS + k] += prior->information[k] * variance + rules->ridge;
             step[k] = products[n * ROWS + k] + prior->information[k] * variance * (prior->mean[k] - values[k]);
         }
-        out->solved = factor(products, n);
+        /* Twice, so that the compiler knows how many unknowns there are. */
+        out->solved = n == FEWER ? solved_step(products, step, FEWER) : solved_step(products, step, PARAMETERS);
         if (!out->solved)
             return;
-        forward(products, step, n);
-        backward(products, step, n);
         for (int k = 0; k < n; k++)
             out->last[k] = -values[k];
         move(values, step, n, rules);

@@ -97,6 +97,29 @@ def sigma_factors(
     return out
 
 
+def uneven_factors(
+    products: FloatArray,
+    pairs: FloatArray,
+    noise: FloatArray,
+    pixels: FloatArray,
+    sides: FloatArray,
+    blur: FloatArray,
+    used: FloatArray,
+    good: BoolArray,
+    owner: IntArray,
+    usual: FloatArray,
+    rules: FactorRules,
+) -> FloatArray:
+    """Return what `detection.subpixel.correlation.uneven_factors` does."""
+    known = [np.ascontiguousarray(part, np.float64) for part in (products, pairs, noise, pixels, sides, blur, used)]
+    boards, out = np.ascontiguousarray(usual, np.float64), np.empty(len(pixels))
+    kernels().uneven_factors(
+        *(*known, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64)),
+        *(len(pixels), len(boards), boards, rules, out),
+    )
+    return out
+
+
 def line_bends(
     pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
 ) -> tuple[FloatArray, FloatArray]:

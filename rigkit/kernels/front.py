@@ -83,7 +83,7 @@ def shrunk(image: GreyImage, factor: int) -> Image:
     height, width = image.shape
     bytewise = image.dtype == np.uint8 and factor <= MAX_SUMMED
     image = image if bytewise else image.astype(np.float32, copy=False)
-    sums = np.empty(width, np.uint16 if bytewise else np.float32)
+    sums = np.empty(2 * width, np.uint16) if bytewise else np.empty(width, np.float32)
     out = np.empty((height // factor, width // factor), np.float32)
     shrink = kernels().shrink_bytes if bytewise else kernels().shrink_floats
     shrink(np.ascontiguousarray(image), height, width, factor, sums, out)
@@ -111,9 +111,9 @@ def typical(smooth: Image, step: int, extreme: float) -> tuple[float, float, flo
     """Return the upper median of |response|, and how bright all but the part `extreme` at either end are, at least and
     at most: at every `step`-th inner pixel of every `step`-th inner row."""
     height, width = smooth.shape
-    seen = np.empty((2, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
+    seen = np.empty((3, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
     out, few = np.empty(3, np.float32), int(extreme * seen.shape[1])
-    kernels().typical_values(smooth, height, width, step, few, seen[0], seen[1], out)
+    kernels().typical_values(smooth, height, width, step, few, *seen, out)
     response, darkest, brightest = out.tolist()
     return response, darkest, brightest
 

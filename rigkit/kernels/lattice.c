@@ -43,6 +43,22 @@ void uneven_steps(
     every[1] = uneven_columns(pixels, columns, rows, 2, 2 * columns, scratch, typical + inner, seen + inner);
 }
 
+/* Set `out` to how far the neighbouring column and row lines lie from those through `count` cells, before and after, from first
+ * and second derivatives along columns and rows (detection.lattice.local_fit.LocalFit.gaps). */
+void line_gaps(const double *sides, const double *bends, int64_t count, double *out)
+{
+    for (int64_t i = 0; i < count; i++, sides += 4, bends += 4, out += 4) {
+        const double area = sides[0] * sides[3] - sides[1] * sides[2];
+        const double row = 0.5 * (sides[0] * bends[3] - sides[1] * bends[2]);
+        const double column = 0.5 * (bends[0] * sides[3] - bends[1] * sides[2]);
+        const double along = hypot(sides[0], sides[1]), down = hypot(sides[2], sides[3]);
+        out[0] = fabs(area - row) / along;
+        out[1] = fabs(area + row) / along;
+        out[2] = fabs(area + column) / down;
+        out[3] = fabs(area - column) / down;
+    }
+}
+
 enum { MAX_ORDER = 8, PLANE = 8 };
 
 /* A part of a sheet, one row after the other: corners, their variance, and room for four numbers for each of them. */
@@ -79,6 +95,100 @@ static double roughness(const part_t part, int64_t order, const scatter_rules_t 
             }
     }
     return count >= rules->fewest_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
+}
+
+/* Return how many differences of the first order rows and columns have, both coordinates. */
+static int64_t difference_count(const double *pixels, int64_t rows, int64_t columns, int64_t order)
+{
+    int64_t count = 0;
+    for (int along_row = 0; along_row < 2; along_row++)
+        for (int64_t line = 0; line < (along_row ? rows : columns); line++) {
+            int64_t run = 0;
+            for (int64_t k = 0; k < (along_row ? columns : rows); k++) {
+                run = isfinite(pixels[2 * (along_row ? line * columns + k : k * columns + line)]) ? run + 1 : 0;
+                count += run > order ? 2 : 0;
+            }
+        }
+    return count;
+}
+
+INLINE double product(const double *a, const double *b, int64_t count)
+{
+    double sum = 0.0;
+    for (int64_t i = 0; i < count; i++)
+        sum += a[i] * b[i];
+    return sum;
+}
+
+/* Take from `values` what of them lies along the unit vector `along`. */
+INLINE void take_away(double *values, const double *along, int64_t count)
+{
+    const double part = product(values, along, count);
+    for (int64_t i = 0; i < count; i++)
+        values[i] -= part * along[i];
+}
+
+/* Set `out` to how far corners lie off surfaces of both degrees (the second one at most 4) over what their sigmas say (rms), NaN
+ * where these fit any (reference.lattice.surface_scatter), or where rows and columns have differences enough. `scratch` holds
+ * 20 numbers for each corner: the 15 terms are kept. */
+void surface_scatter(
+    const double *pixels, const double *sigma, int64_t rows, int64_t columns, const scatter_rules_t *rules, double *scratch,
+    double *out)
+{
+    const int64_t size = rows * columns;
+    double *places[2] = {scratch, scratch + size}, *weight = scratch + 2 * size;
+    double *x = scratch + 3 * size, *y = scratch + 4 * size, *terms = scratch + 5 * size;
+    int64_t count = 0, found = 0;
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, middle[2] = {0.0, 0.0};
+    out[0] = out[1] = NAN;
+    if (difference_count(pixels, rows, columns, rules->first_order) >= rules->fewest_differences)
+        return;
+    for (int64_t i = 0; i < size; i++) {
+        if (!isfinite(pixels[2 * i]) || !isfinite(sigma[i]))
+            continue;
+        const double at[2] = {(double)(i % columns), (double)(i / columns)};
+        for (int axis = 0; axis < 2; axis++) {
+            low[axis] = at[axis] < low[axis] ? at[axis] : low[axis];
+            high[axis] = at[axis] > high[axis] ? at[axis] : high[axis];
+            middle[axis] += at[axis];
+            places[axis][count] = pixels[2 * i + axis] / sigma[i];
+        }
+        x[count] = at[0];
+        y[count] = at[1];
+        weight[count++] = 1.0 / sigma[i];
+    }
+    for (int64_t i = 0; i < count; i++) {
+        x[i] = 2.0 * (x[i] - middle[0] / (double)count) / (high[0] - low[0] > 1.0 ? high[0] - low[0] : 1.0);
+        y[i] = 2.0 * (y[i] - middle[1] / (double)count) / (high[1] - low[1] > 1.0 ? high[1] - low[1] : 1.0);
+    }
+    const double least = rules->min_term * rules->min_term * product(weight, weight, count);
+    for (int64_t degree = 0; degree <= rules->degrees[1]; degree++) {
+        for (int64_t up = 0; up <= degree; up++) {
+            double *term = terms + found * size;
+            for (int64_t i = 0; i < count; i++) {
+                term[i] = weight[i];
+                for (int64_t k = 0; k < degree; k++)
+                    term[i] *= k < up ? y[i] : x[i];
+            }
+            /* Twice: once leaves rounding of what was large. */
+            for (int twice = 0; twice < 2; twice++)
+                for (int64_t k = 0; k < found; k++)
+                    take_away(term, terms + k * size, count);
+            const double left = product(term, term, count);
+            /* A term that few rows cannot tell from those before it. */
+            if (!(left > least))
+                continue;
+            for (int64_t i = 0; i < count; i++)
+                term[i] /= sqrt(left);
+            take_away(places[0], term, count);
+            take_away(places[1], term, count);
+            found++;
+        }
+        const double free = (double)(count - found);
+        for (int k = 0; k < 2; k++)
+            if (degree == rules->degrees[k] && 2.0 * free >= (double)rules->fewest_differences)
+                out[k] = sqrt((product(places[0], places[0], count) + product(places[1], places[1], count)) / (2.0 * free));
+    }
 }
 
 /* Solve `matrix` x = `right` for a positive definite matrix, of which the lower half is given, in place; return whether it

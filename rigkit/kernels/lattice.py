@@ -1,4 +1,4 @@
-"""Calls of the kernels in lattice.c: plain arrays in, plain arrays out; all tolerances come from the callers."""
+"""Calls of the kernels in lattice.c and splits.c: plain arrays in and out; all tolerances come from the callers."""
 
 from __future__ import annotations
 
@@ -12,13 +12,18 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.front import ImageOf
 
-ROOM_FOR_SCATTER = 7
+ROOM_FOR_SCATTER, ROOM_FOR_SURFACES = 7, 20
 """Numbers that lattice.c keeps for each corner."""
 
 
 @structure("scatter_rules_t")
 class ScatterRules(Struct):
     """The constants of `detection.subpixel.scatter`."""
+
+
+@structure("split_rules_t")
+class SplitRules(Struct):
+    """The constants of `detection.checks.discontinuity`."""
 
 
 def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[float, float]]:
@@ -36,6 +41,14 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
     return typical.tolist(), seen.tolist(), (along_rows, along_columns)
 
 
+def line_gaps(sides: FloatArray, bends: FloatArray) -> FloatArray:
+    """Return what `detection.lattice.local_fit.LocalFit.gaps` does of its `sides` and `bends`, (M, 2, 2)."""
+    sides, bends = np.ascontiguousarray(sides, np.float64), np.ascontiguousarray(bends, np.float64)
+    out = np.empty(sides.shape)
+    kernels().line_gaps(sides, bends, len(sides), out)
+    return out
+
+
 def excess_scatter(
     pixels: FloatArray,
     sigma_px: FloatArray,
@@ -51,6 +64,18 @@ def excess_scatter(
     scratch, out = np.empty(ROOM_FOR_SCATTER * sigma_px.size), np.empty(len(where))
     kernels().excess_scatter(pixels, sigma_px, *sigma_px.shape, where, len(where), rules, scratch, out)
     return out
+
+
+def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRules) -> tuple[float, float]:
+    """Return how far `pixels` (R, C, 2) lie off surfaces of both degrees over what `sigma_px` (R, C) says, rms.
+
+    NaN where these fit any, or where rows and columns have differences enough to tell (`excess_scatter`).
+    """
+    pixels, sigma_px = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
+    scratch, out = np.empty(ROOM_FOR_SURFACES * sigma_px.size), np.empty(2)
+    kernels().surface_scatter(pixels, sigma_px, *sigma_px.shape, rules, scratch, out)
+    lower, higher = out.tolist()
+    return lower, higher
 
 
 def shifts_of_edges(
@@ -74,3 +99,15 @@ def shifts_of_edges(
         *(places, len(places), steps, most, sums, out),
     )
     return out
+
+
+def clearest_splits(
+    pixels: FloatArray, sigma_px: FloatArray, several: bool, rules: SplitRules
+) -> list[tuple[float, int, int]]:
+    """Return the clearest split of `pixels` (R, C, 2), `sigma_px` (R, C), between columns, and that between rows: how
+    many times better the two sides fit alone, 0 where there is none, and the first and the last (exclusive) between
+    them. `detection.checks.discontinuity` says what that is."""
+    pixels, sigma_px = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
+    scratch, out = np.empty(kernels().splits_scratch(*sigma_px.shape)), np.empty((2, 3))
+    kernels().clearest_splits(pixels, sigma_px, *sigma_px.shape, several, rules, scratch, out)
+    return [(ratio, int(start), int(end)) for ratio, start, end in out.tolist()]

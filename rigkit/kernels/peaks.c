@@ -2,8 +2,8 @@
  * the numbers in rigkit.detection.saddles. */
 #include "kernels.h"
 
-/* So many bits of a number at a time are counted to rank it. */
-#define RANK_BITS 11
+/* Numbers are counted in so many bins to rank them, those of so many bits. */
+enum { RANK_BITS = 11, RANKS = 1 << RANK_BITS };
 
 /* Minus the determinant of the Hessian at one pixel. */
 INLINE float saddle_response(const float *at, int64_t width)
@@ -14,68 +14,93 @@ INLINE float saddle_response(const float *at, int64_t width)
     return uv * uv - uu * vv;
 }
 
-/* Return a number of the order of `value` among all floats: as integers of their bits positive ones are in order. */
-INLINE uint32_t order_of(float value)
+/* How values are counted, the smaller ones first: by their highest bits where they span magnitudes and are not negative, else
+ * by where they lie between `low` and the highest one, `per_bin` apart. */
+typedef struct {
+    float low, per_bin;
+    int by_bits;
+} bins_t;
+
+INLINE int32_t bin_of(float value, const bins_t bins)
 {
     uint32_t bits;
     memcpy(&bits, &value, sizeof bits);
-    return bits ^ (bits >> 31 ? UINT32_MAX : UINT32_C(1) << 31);
+    const float place = (value - bins.low) * bins.per_bin;
+    if (bins.by_bits)
+        return (int32_t)(bits >> (32 - RANK_BITS - 1)) & (RANKS - 1);
+    return place < (float)(RANKS - 1) ? (int32_t)place : RANKS - 1;
 }
 
-/* Return what `at` of `count` values are smaller than or equal to: its bits from the highest downwards, by counting the
- * values that share those found so far, which are moved to the front. */
-static float value_at_rank(float *values, int64_t count, int64_t at)
+INLINE void count_bins(const float *values, int64_t count, const bins_t bins, int32_t often[RANKS])
 {
-    uint32_t found = 0;
-    int32_t often[1 << RANK_BITS];
-    for (int left = 32; left > 0;) {
-        const int low = left > RANK_BITS ? left - RANK_BITS : 0;
-        const uint32_t mask = (UINT32_C(1) << (left - low)) - 1;
-        memset(often, 0, sizeof often);
-        for (int64_t k = 0; k < count; k++)
-            often[order_of(values[k]) >> low & mask]++;
-        uint32_t bits = 0;
-        for (; at >= often[bits] && bits < mask; bits++)
-            at -= often[bits];
-        found |= bits << low;
-        int64_t kept = 0;
-        for (int64_t k = 0; k < count; k++) {
-            const float value = values[k];
-            values[k] = values[kept];
-            values[kept] = value;
-            kept += (order_of(value) >> low & mask) == bits;
+    memset(often, 0, RANKS * sizeof(int32_t));
+    for (int64_t k = 0; k < count; k++)
+        often[bin_of(values[k], bins)]++;
+}
+
+/* Return what `at` of `count` values are smaller than or equal to, `often` being what `count_bins` says of them: those of its
+ * bin, gathered in `room` (count), are few. */
+INLINE float value_at_rank(
+    const float *values, int64_t count, const bins_t bins, const int32_t often[RANKS], int64_t at, float *room)
+{
+    int32_t bin = 0;
+    for (; at >= often[bin] && bin < RANKS - 1; bin++)
+        at -= often[bin];
+    int64_t few = 0;
+    for (int64_t k = 0; k < count; k++)
+        if (bin_of(values[k], bins) == bin)
+            room[few++] = values[k];
+    /* Hoare's FIND. */
+    int64_t low = 0, high = few - 1;
+    while (low < high) {
+        const float pivot = room[at];
+        int64_t i = low, j = high;
+        while (i <= j) {
+            while (room[i] < pivot)
+                i++;
+            while (pivot < room[j])
+                j--;
+            if (i <= j) {
+                const float swap = room[i];
+                room[i++] = room[j];
+                room[j--] = swap;
+            }
         }
-        count = kept;
-        left = low;
+        low = j < at ? i : low;
+        high = at < i ? j : high;
     }
-    const uint32_t sign = found >> 31 ? UINT32_C(1) << 31 : UINT32_MAX, back = found ^ sign;
-    float value;
-    memcpy(&value, &back, sizeof value);
-    return value;
+    return room[at];
 }
 
 /* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness
- * that `few` of them are darker and brighter than. */
-void typical_values(
+ * that `few` of them are darker and brighter than. `room` has a place for each of them. */
+FOR_EACH_PROCESSOR void typical_values(
     const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness,
-    float *out)
+    float *room, float *out)
 {
     int64_t count = 0;
+    float low = INFINITY, high = -INFINITY;
     for (int64_t v = 1; v < height - 1; v += step)
         for (int64_t u = 1; u < width - 1; u += step) {
             const float *at = smooth + v * width + u;
             response[count] = fabsf(saddle_response(at, width));
             brightness[count++] = *at;
+            low = *at < low ? *at : low;
+            high = *at > high ? *at : high;
         }
-    out[0] = value_at_rank(response, count, count / 2);
-    out[1] = value_at_rank(brightness, count, few);
-    out[2] = value_at_rank(brightness, count, count - 1 - few);
+    const bins_t sizes = {0.0f, 0.0f, 1}, levels = {low, high > low ? (float)(RANKS - 1) / (high - low) : 0.0f, 0};
+    int32_t often[RANKS];
+    count_bins(response, count, sizes, often);
+    out[0] = value_at_rank(response, count, sizes, often, count / 2, room);
+    count_bins(brightness, count, levels, often);
+    out[1] = value_at_rank(brightness, count, levels, often, few, room);
+    out[2] = value_at_rank(brightness, count, levels, often, count - 1 - few, room);
 }
 
 /* reference.front.thresholds: for each strip of each band `floor` times the square of how bright its brightest pixel is
  * between `darkest` and `brightest`, but not below `least`. Every fourth pixel is looked at: the edges of boards are wider
  * than the squares that could hide between them. */
-void fill_thresholds(
+FOR_EACH_PROCESSOR void fill_thresholds(
     const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest,
     float *out)
 {
@@ -84,46 +109,38 @@ void fill_thresholds(
     const float span = brightest > darkest ? brightest - darkest : 1.0f;
     for (int64_t band = 0; band < bands; band++)
         for (int64_t strip = 0; strip < strips; strip++) {
-            const int64_t left = STRIPS_FROM + strip * STRIP, right = left + STRIP < width ? left + STRIP : width;
+            const int64_t left = STRIPS_FROM + strip * STRIP, across = left + STRIP < width ? STRIP : width - left;
             const int64_t top = band * STRIP_ROWS, bottom = top + STRIP_ROWS < height ? top + STRIP_ROWS : height;
-            float most = darkest;
-            for (int64_t v = top; v < bottom; v += APART)
-                for (int64_t u = left; u < right; u += APART)
-                    most = smooth[v * width + u] > most ? smooth[v * width + u] : most;
+            float brightest_of[STRIP], most = darkest;
+            for (int64_t k = 0; k < STRIP; k++)
+                brightest_of[k] = darkest;
+            for (int64_t v = top; v < bottom; v += APART) {
+                const float *row = smooth + v * width + left;
+                /* Of all pixels, and twice, so that the compiler knows how many there are: it is done many at once. */
+                if (across == STRIP)
+                    for (int64_t k = 0; k < STRIP; k++)
+                        brightest_of[k] = row[k] > brightest_of[k] ? row[k] : brightest_of[k];
+                else
+                    for (int64_t k = 0; k < across; k++)
+                        brightest_of[k] = row[k] > brightest_of[k] ? row[k] : brightest_of[k];
+            }
+            for (int64_t k = 0; k < across; k += APART)
+                most = brightest_of[k] > most ? brightest_of[k] : most;
             const float part = most < brightest ? (most - darkest) / span : 1.0f, lower = floor * part * part;
             out[band * strips + strip] = lower > least ? lower : least;
         }
 }
 
-/* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row are peaks: not lower than the
- * neighbours that follow within two pixels, higher than those before (a corner between pixels makes two equal ones), and
- * above the threshold. */
+/* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row may be peaks: above the threshold, and not
+ * below any of the pixels beside, above and below (as `is_peak`). */
 INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
 {
-    float before[STRIP + 4], after[STRIP + 4];
     uint8_t peak[STRIP];
-    const float *above2 = rows[0] + u - 2, *above = rows[1] + u - 2, *here = rows[2] + u;
-    const float *below = rows[3] + u - 2, *below2 = rows[4] + u - 2;
-    for (int k = 0; k < STRIP + 4; k++) {
-        before[k] = above[k] > above2[k] ? above[k] : above2[k];
-        after[k] = below[k] > below2[k] ? below[k] : below2[k];
-    }
+    const float *above = rows[1] + u, *here = rows[2] + u, *below = rows[3] + u;
     for (int k = 0; k < STRIP; k++) {
-        float most = before[k];
-        most = before[k + 1] > most ? before[k + 1] : most;
-        most = before[k + 2] > most ? before[k + 2] : most;
-        most = before[k + 3] > most ? before[k + 3] : most;
-        most = before[k + 4] > most ? before[k + 4] : most;
-        most = here[k - 2] > most ? here[k - 2] : most;
-        most = here[k - 1] > most ? here[k - 1] : most;
+        float most = here[k - 1] > above[k] ? here[k - 1] : above[k];
         most = threshold > most ? threshold : most;
-        float least = after[k];
-        least = after[k + 1] > least ? after[k + 1] : least;
-        least = after[k + 2] > least ? after[k + 2] : least;
-        least = after[k + 3] > least ? after[k + 3] : least;
-        least = after[k + 4] > least ? after[k + 4] : least;
-        least = here[k + 1] > least ? here[k + 1] : least;
-        least = here[k + 2] > least ? here[k + 2] : least;
+        const float least = here[k + 1] > below[k] ? here[k + 1] : below[k];
         peak[k] = (uint8_t)((here[k] > most) & (here[k] >= least));
     }
     uint64_t bits = 0;
@@ -134,6 +151,20 @@ INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
         bits |= (eight * UINT64_C(0x0102040810204080)) >> 56 << k;
     }
     return bits;
+}
+
+/* Return whether pixel u of the middle row, one of `peaks_among`, is not lower than the neighbours that follow within two
+ * pixels, and higher than those before: a corner between pixels makes two equal ones. */
+INLINE int is_peak(float *const rows[5], int64_t u)
+{
+    const float here = rows[2][u];
+    if (!(here > rows[1][u - 1] && here > rows[1][u + 1] && here >= rows[3][u - 1] && here >= rows[3][u + 1]))
+        return 0;
+    int is = (here > rows[2][u - 2]) & (here >= rows[2][u + 2]) & (here > rows[1][u - 2]) & (here > rows[1][u + 2]) &
+             (here >= rows[3][u - 2]) & (here >= rows[3][u + 2]);
+    for (int k = -2; k <= 2; k++)
+        is &= (here > rows[0][u + k]) & (here >= rows[4][u + k]);
+    return is;
 }
 
 /* The saddle response at the `count` pixels from u on of a row, into `to`; whether any is above the threshold. */
@@ -184,6 +215,8 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
                 const int64_t at_u = u + __builtin_ctzll(left);
                 if (at_u >= width - 3)
                     break;
+                if (!is_peak(rows, at_u))
+                    continue;
                 at[2 * count] = (int32_t)at_u;
                 at[2 * count + 1] = (int32_t)(v - 2);
                 response[count++] = rows[2][at_u];

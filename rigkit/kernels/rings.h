@@ -53,7 +53,17 @@ INLINE void sample_ring(
     int32_t at[TURN];
     const int32_t width = (int32_t)image.width, right_most = width - 2, low_most = (int32_t)image.height - 2;
     const float most_u = (float)(width - 1), most_v = (float)(image.height - 1);
-    for (int64_t k = 0; k < TURN / apart; k++) {
+    /* A pixel more than the ring needs: circles of float32 are a little rounder or less. */
+    const float margin = radius + 1.0f;
+    const int inside = u > margin && v > margin && u < most_u - margin && v < most_v - margin;
+    for (int64_t k = 0; inside && k < TURN / apart; k++) {
+        const float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
+        const int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
+        right[k] = sample_u - (float)left;
+        below[k] = sample_v - (float)top;
+        at[k] = top * width + left;
+    }
+    for (int64_t k = 0; !inside && k < TURN / apart; k++) {
         float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
         sample_v = sample_v > 0.0f ? sample_v : 0.0f;

@@ -96,14 +96,13 @@ def test_independent_noise_changes_nothing(count: int, rng: np.random.Generator)
 def test_each_board_has_its_own(rng: np.random.Generator) -> None:
     """Corners of two kinds of noise, mixed; what a ruler covers, and failed fits, say nothing."""
     (alone, _, sides), (shared, _, _) = fitted(lambda white: white, rng, count=40), fitted(smoothed(1.0), rng, count=40)
-    names = EdgeFit.__slots__
-    both = EdgeFit(**{name: np.concatenate([getattr(alone, name), getattr(shared, name)]) for name in names})
+    both = EdgeFit(np.concatenate([alone.outcomes, shared.outcomes]))
     both.products[5] = 1e4 * both.pairs[5]
     both.noise[5] = 100.0
     both.pixels[6], both.blur[6], both.products[6], both.noise[6] = np.nan, np.nan, np.nan, np.nan
     good = np.arange(80) != 6
     order = rng.permutation(80)
-    mixed = EdgeFit(**{name: getattr(both, name)[order] for name in names})
+    mixed = both.of(order)
     owner = (order >= 40).astype(np.int64)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -23,6 +23,9 @@ from rigkit.synthetic.render import Optics
 NOISE_LEVELS = 2.0
 SUPERSAMPLED = 8
 CELL_PX, COLUMNS, ROWS = 30.0, 7, 5
+SAME_PX = 1e-9
+"""By which a corner moves that is fitted with others in one call: not at all."""
+
 MAX_PER_BLUR = 0.015
 """Of the blur, by which a corner may lie aside: where squares are cut at 3 blurs, half of it was measured."""
 
@@ -121,3 +124,14 @@ def test_real_boards_out_of_focus_are_found_whole(blur_px: float, every: int) ->
         found = detect_boards(cv2.GaussianBlur(read_image(path), (0, 0), blur_px))
         whole += any(sorted((b.columns, b.rows)) == [6, 9] and b.complete for b in found)
     assert whole == len(paths[::every])
+
+
+def test_what_is_blurred_beside_a_sharp_board_changes_none_of_its_corners() -> None:
+    """Whether what lies beyond the outer squares matters is asked of each board by itself."""
+    sharp, _ = cut_board((0.45, 1.0, 1.0, 1.0), 0.8, 200.0)
+    soft, corners = cut_board((1.0, 1.0, 1.0, 1.0), 2.5, 120.0)
+    alone, beside = detect_boards(np.hstack([sharp, np.full_like(soft, 90)])), detect_boards(np.hstack([sharp, soft]))
+    assert [len(alone), len(beside)] == [1, 2]
+    again = min(beside, key=lambda one: float(one.pixels[:, 0].max()))
+    assert len(corners) - ROWS <= len(again.pixels) == len(alone[0].pixels)
+    assert np.abs(again.pixels - alone[0].pixels).max() < SAME_PX

@@ -7,7 +7,7 @@ import pytest
 from kernels.reference import correlation as reference
 
 from rigkit.detection.subpixel.correlation import factor_rules
-from rigkit.kernels.edges import LAGS, sigma_factors
+from rigkit.kernels.edges import LAGS, sigma_factors, uneven_factors
 
 ROUNDING = 1e-9
 """Both solve 13 equations in double precision."""
@@ -35,3 +35,9 @@ def test_factors_are_those_of_numpy(shared: float, rng: np.random.Generator) -> 
     assert theirs[4] == 1.0
     assert not shared or np.count_nonzero(theirs != 1.0) >= 3
     assert np.abs(ours / theirs - 1.0).max() < ROUNDING
+    # Corners with so much more beside them than their boards that they have a factor of their own.
+    products[::7, 1:] = (noise[::7] ** 2)[:, None] * pairs[::7, 1:]
+    arguments = (*arguments[:-2], theirs, factor_rules(18.0))
+    mine, yours = uneven_factors(*arguments), reference.uneven_factors(*arguments)
+    assert 3 <= np.count_nonzero(yours != 1.0) < count
+    assert np.abs(mine / yours - 1.0).max() < ROUNDING

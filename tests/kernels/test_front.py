@@ -84,7 +84,7 @@ def test_shrinking(factor: int, depth: type, rng: np.random.Generator, in_numpy:
 def test_the_brightest_bytes_overflow_nothing() -> None:
     white = np.full((600, 530), 255, np.uint8)
     assert (pyramid(white)[0].smooth == 255.0).all()
-    for factor in (2, 256, 260):
+    for factor in (2, 3, 6, 16, 256, 260):
         assert np.abs(response._shrunk(white, factor) - 255.0).max() < SMOOTH_LEVELS
 
 

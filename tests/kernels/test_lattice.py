@@ -14,6 +14,7 @@ from rigkit.detection.checks import validate
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.lattices import find_lattices
 from rigkit.detection.saddles.response import grey_image, pyramid
+from rigkit.detection.subpixel import scatter
 from rigkit.detection.subpixel.scatter import excess_scatter
 from rigkit.kernels import lattice as native
 
@@ -85,6 +86,21 @@ def test_excess_scatter(
         # The calmest of four looks, of fifty corners each.
         truth = 100.0 * noise_px
         assert (compiled > 0.6 * truth).all() and (compiled < 1.2 * truth).all()
+
+
+def test_scatter_about_surfaces(rng: np.random.Generator) -> None:
+    told = 0
+    for _ in range(60):
+        rows, columns = (int(count) for count in rng.integers(2, 7, 2))
+        pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) * 25.0
+        pixels = pixels + 1e-3 * pixels[..., ::-1] ** 2 + rng.normal(0.0, 0.05, pixels.shape)
+        sigma = rng.uniform(0.01, 0.1, (rows, columns))
+        pixels[rng.random((rows, columns)) < rng.choice([0.0, 0.1])] = np.nan
+        rules = scatter._rules()
+        ours, theirs = native.surface_scatter(pixels, sigma, rules), reference.surface_scatter(pixels, sigma, rules)
+        assert np.allclose(ours, theirs, rtol=1e-9, atol=0.0, equal_nan=True)
+        told += np.count_nonzero(np.isfinite(theirs))
+    assert told >= 20
 
 
 def test_scatter_of_a_flat_board_is_no_perspective(rng: np.random.Generator) -> None:

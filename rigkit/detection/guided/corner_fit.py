@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
@@ -61,9 +59,7 @@ def fit_corners(
         fit = fitted_beside_paper(image, every, fit, fitted, signs, np.zeros(len(start), np.int64))
     if isinstance(board.pattern, Charuco):
         # What markers leave in the windows is no noise, but makes the corners uncertain all the same.
-        more = fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT)
-        products = fit.products * (more**2)[:, None]
-        fit = replace(fit, sigma_px=fit.sigma_px * more, noise=fit.residual, products=products)
+        fit = fit.less_sure(fit.residual / np.maximum(fit.noise, MIN_NOISE_LEFT), all_is_noise=True)
     return fit
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels.growth import FitRules, fit
+from rigkit.kernels.lattice import line_gaps
 
 
 class Prediction(NamedTuple):
@@ -93,21 +94,10 @@ class LocalFit:
     def gaps(self) -> FloatArray:
         """Return how far the neighbouring column and row lines lie from those through the cells, (M, 2, 2) px.
 
-        First index: the column line, the row line; second: before and after, in the direction of +90 degrees.
+        First index: the column line, the row line; second: before and after, in the direction of +90 degrees. A cell
+        without sides has no neighbours: NaN.
         """
-        (a, b), (c, d) = self.sides.transpose(1, 2, 0), self.bends.transpose(1, 2, 0)
-        area, row, column = _cross(a, b), 0.5 * _cross(a, d), 0.5 * _cross(c, b)
-        gaps = np.empty((2, 2, len(area)))
-        np.subtract(area, row, out=gaps[0, 0])
-        np.add(area, row, out=gaps[0, 1])
-        np.add(area, column, out=gaps[1, 0])
-        np.subtract(area, column, out=gaps[1, 1])
-        np.abs(gaps, out=gaps)
-        # A cell without sides has no neighbours: NaN.
-        with np.errstate(invalid="ignore"):
-            gaps[0] /= np.hypot(a[0], a[1])
-            gaps[1] /= np.hypot(b[0], b[1])
-        return gaps.transpose(2, 0, 1)
+        return line_gaps(self.sides, self.bends)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

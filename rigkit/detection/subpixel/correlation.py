@@ -14,7 +14,6 @@ corner changes (`edge_fit`) is noise alone, and says r, for all corners of a boa
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import numpy as np
 
@@ -70,17 +69,8 @@ def uneven_factors(
     The edge of a shadow, glare or a finger in the window leaves what is the same over many pixels, and what of it looks
     like a shift of the corner is in none of the residuals. Arguments else as of `sigma_factors`.
     """
-    factors = np.ones(len(owner))
-    seen = good & (fit.pairs[:, 0] > 0.0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        alike = (fit.products[:, 1:] / np.maximum(fit.pairs[:, 1:], 1.0)).mean(axis=1) / fit.noise**2
-        odd = seen & (alike > MIN_ALIKE * usual[owner] ** 2)
-    if odd.any():
-        count = int(np.count_nonzero(odd))
-        own = sigma_factors(fit.of(odd), np.ones(count, np.bool_), sides[odd], np.arange(count), count, radius_px)
-        times = own / usual[owner[odd]]
-        factors[odd] = np.where(times > UNEVEN_TIMES, times, 1.0)
-    return factors
+    corners = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
+    return edges.uneven_factors(*corners, good, owner, usual, factor_rules(radius_px))
 
 
 def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> EdgeFit:
@@ -90,7 +80,7 @@ def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bo
     """
     good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
     usual = np.ones(1) if marked else sigma_factors(fit, good, sides, owner, 1, radius_px)
-    return replace(fit, sigma_px=fit.sigma_px * uneven_factors(fit, good, sides, owner, usual, radius_px))
+    return fit.less_sure(uneven_factors(fit, good, sides, owner, usual, radius_px))
 
 
 @functools.cache
@@ -101,6 +91,8 @@ def factor_rules(radius_px: float) -> edges.FactorRules:
         least_left=MIN_LEFT,
         covered_times=COVERED_TIMES,
         least_factor=MIN_SIGMA_FACTOR,
+        least_alike=MIN_ALIKE,
+        uneven_times=UNEVEN_TIMES,
         least_blur=BLUR_RANGE[0],
         radius_px=radius_px,
     )

@@ -9,11 +9,11 @@ on both sides, and so do not move the corner.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_model import (
     END_SIGMAS,
@@ -62,12 +62,13 @@ VALID_MOVE_PX, VALID_MOVE_CELLS = 1.5, 0.2
 """A fit that ends further from its start, in px or in sides of its cell, has found something else."""
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class EdgeFit:
     """The fitted corners.
 
     Attributes
     ----------
+    outcomes : (N, 35) as of `kernels.edges`: what follows, side by side.
     pixels : (N, 2)
     sigma_px : (N,) predicted standard deviation per axis, from the noise and the curvature of the likelihood.
     blur : (N,) s, px.
@@ -80,44 +81,66 @@ class EdgeFit:
     valid : (N,) the fit converged near its start, with pixels on all sides.
     """
 
-    pixels: FloatArray
-    sigma_px: FloatArray
-    blur: FloatArray
-    contrast: FloatArray
-    residual: FloatArray
-    noise: FloatArray
-    used: FloatArray
-    products: FloatArray
-    pairs: FloatArray
-    valid: BoolArray
+    outcomes: FloatArray
 
-    @classmethod
-    def of_outcomes(cls, fitted: FloatArray) -> EdgeFit:
-        """Return the corners of `kernels.edges`' OUTCOMES (N, 35)."""
-        _, _, sigma_px, width, contrast, residual, noise, valid, used = fitted[:, : -2 * len(LAGS)].T
-        return cls(
-            pixels=fitted[:, :2],
-            sigma_px=sigma_px,
-            blur=width,
-            contrast=contrast,
-            residual=residual,
-            noise=noise,
-            used=used,
-            products=fitted[:, -2 * len(LAGS) : -len(LAGS)],
-            pairs=fitted[:, -len(LAGS) :],
-            valid=valid > 0.5,
-        )
+    @property
+    def pixels(self) -> FloatArray:
+        return self.outcomes[:, :2]
 
-    def of(self, which: BoolArray) -> EdgeFit:
+    @property
+    def sigma_px(self) -> FloatArray:
+        return self.outcomes[:, 2]
+
+    @property
+    def blur(self) -> FloatArray:
+        return self.outcomes[:, 3]
+
+    @property
+    def contrast(self) -> FloatArray:
+        return self.outcomes[:, 4]
+
+    @property
+    def residual(self) -> FloatArray:
+        return self.outcomes[:, 5]
+
+    @property
+    def noise(self) -> FloatArray:
+        return self.outcomes[:, 6]
+
+    @property
+    def valid(self) -> BoolArray:
+        return np.asarray(self.outcomes[:, 7] > 0.5)
+
+    @property
+    def used(self) -> FloatArray:
+        return self.outcomes[:, 8]
+
+    @property
+    def products(self) -> FloatArray:
+        return self.outcomes[:, -2 * len(LAGS) : -len(LAGS)]
+
+    @property
+    def pairs(self) -> FloatArray:
+        return self.outcomes[:, -len(LAGS) :]
+
+    def of(self, which: BoolArray | IntArray) -> EdgeFit:
         """Return the corners `which` (N,)."""
-        return EdgeFit(**{field.name: getattr(self, field.name)[which] for field in fields(self)})
+        return EdgeFit(self.outcomes[which])
 
     def with_part(self, which: BoolArray, part: EdgeFit) -> EdgeFit:
         """Return this with the corners `which` (N,) as in `part`."""
-        values = {field.name: getattr(self, field.name).copy() for field in fields(self)}
-        for name, value in values.items():
-            value[which] = getattr(part, name)
-        return EdgeFit(**values)
+        out = self.outcomes.copy()
+        out[which] = part.outcomes
+        return EdgeFit(out)
+
+    def less_sure(self, times: FloatArray, *, all_is_noise: bool = False) -> EdgeFit:
+        """Return this with sigmas `times` (N,) as large; `all_is_noise` : what the fit leaves counts as noise."""
+        out = EdgeFit(self.outcomes.copy())
+        out.sigma_px[:] *= times
+        if all_is_noise:
+            out.noise[:] = self.residual
+            out.products[:] *= (times**2)[:, None]
+        return out
 
 
 def fit_edges(
@@ -167,7 +190,7 @@ def fit_edges(
         expected,
         edge_rules(radius_px, iterations, converged_px, mirrored, image.dtype == np.uint8),
     )
-    return EdgeFit.of_outcomes(fitted)
+    return EdgeFit(fitted)
 
 
 @functools.cache

@@ -82,15 +82,20 @@ def fitted_beside_paper(
 def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray:
     """Return which of N corners may see what lies beyond their board; `owner` (N,) is the number of that."""
     good = fit.valid & (fit.contrast > 0.0)
-    if not good.any() or upper_median(fit.blur[good]) < MIN_PAPER_BLUR:
-        return np.zeros(len(good), np.bool_)
+    soft = np.zeros(int(owner.max(initial=-1)) + 1, np.bool_)
+    for k in range(len(soft)):
+        mine = fit.blur[good & (owner == k)]
+        soft[k] = len(mine) > 0 and upper_median(mine) >= MIN_PAPER_BLUR
+    good &= soft[owner]
+    if not good.any():
+        return good
     blurred = TAIL_SIGMAS * fit.blur[:, None] > (1.0 - WINDOW_REACH) * geometry.gaps.reshape(-1, 4)
     ends = geometry.ends.reshape(-1, 4)
     relative = fit.residual / np.where(good, fit.contrast, np.inf)
-    usual = np.full(int(owner.max(initial=-1)) + 1, np.inf)
+    usual = np.full(len(soft), np.inf)
     # Those that have corners on all sides; of a board that has none, all.
     inner = good & ~ends.any(axis=1)
-    for k in np.unique(owner[good]).tolist():
+    for k in np.flatnonzero(soft).tolist():
         mine = owner == k
         usual[k] = upper_median(relative[mine & (inner if (inner & mine).any() else good)])
     suspect = relative > SUSPECT_RESIDUAL * usual[owner]

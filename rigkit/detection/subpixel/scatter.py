@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from math import comb
 
@@ -74,34 +73,10 @@ def small_scatter(pixels: FloatArray, sigma_px: FloatArray) -> float:
     A cubic and a quartic surface through all its corners (R, C, 2) leave the same where they leave scatter; what a
     strong lens bends, the second one leaves much less of, and nothing is said.
     """
-    if _difference_count(pixels) >= MIN_DIFFERENCES or any(c.every > EVEN_STEPS for c in spacing_changes(pixels)):
+    cubic, quartic = native.surface_scatter(pixels, sigma_px, _rules())
+    if not (cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED):
         return 1.0
-    cubic, quartic = (_surface_roughness(pixels, sigma_px, degree) for degree in SURFACES)
-    return quartic if cubic < AS_ROUGH * quartic and quartic > UNEXPLAINED else 1.0
-
-
-def _difference_count(pixels: FloatArray) -> int:
-    """Return how many differences of the lower order `pixels` (R, C, 2) have."""
-    every = (np.diff(pixels, DIFFERENCES[0], axis=axis) for axis in (0, 1))
-    return sum(int(np.count_nonzero(np.isfinite(part))) for part in every)
-
-
-def _surface_roughness(pixels: FloatArray, sigma_px: FloatArray, degree: int) -> float:
-    """Return how far corners lie off a surface of `degree` over what their sigmas say (rms), NaN where it fits any."""
-    known = np.isfinite(pixels[..., 0]) & np.isfinite(sigma_px)
-    row, column = np.nonzero(known)
-    if not len(row):
-        return np.nan
-    y, x = (2.0 * (place - place.mean()) / max(np.ptp(place), 1) for place in (row, column))
-    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
-    weight = 1.0 / sigma_px[known]
-    surface, size, _ = np.linalg.svd(terms * weight[:, None], full_matrices=False)
-    surface = surface[:, size > MIN_TERM * size[0]]
-    free = len(row) - surface.shape[1]
-    if 2 * free < MIN_DIFFERENCES:
-        return np.nan
-    places = pixels[known] * weight[:, None]
-    return math.sqrt(float(((places - surface @ (surface.T @ places)) ** 2).sum()) / (2.0 * free))
+    return 1.0 if any(change.every > EVEN_STEPS for change in spacing_changes(pixels)) else quartic
 
 
 def _mixed_roughness(pixels: FloatArray, sigma_px: FloatArray, down: int, along: int) -> float:
@@ -125,4 +100,6 @@ def _rules() -> native.ScatterRules:
         fewest_differences=MIN_DIFFERENCES,
         first_order=DIFFERENCES[0],
         last_order=DIFFERENCES[-1],
+        degrees=SURFACES,
+        min_term=MIN_TERM,
     )

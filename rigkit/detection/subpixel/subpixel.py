@@ -7,7 +7,7 @@ corners are, and so gives a better lattice for a second pass, which also tries t
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -83,22 +83,33 @@ def refine(
         return []
     # All lattices lie on one sheet, so that each step is one call.
     sheet = LatticeStack.of(lattices)
-    start = Lattice(sheet.pixels, sheet.contrast, True)
-    first = _first_pass(image, start, sheet.signs)
+    first = _first_pass(image, Lattice(sheet.pixels, sheet.contrast, True), sheet.signs)
     start, holes = _with_holes(first.lattice, sheet.signs != 0.0)
-    blur = _typical_blur(first, sheet.parts)
-    last, reached, factors = _last_pass(image, start, sheet.signs, blur, first.sigma_px, sheet.parts, radius_px)
-    for part in sheet.parts if reached.any() else ():
-        # Clutter in the background is small, and would cost as much as the board.
-        mine = last.cut(*part)
-        reached[part] &= mine.lattice.count > 0 and may_be(mine)
-    if reached.any():
+    before, blur = replace(first, lattice=start), _typical_blur(first, sheet.parts)
+    shape = fit_cells(start.pixels, start.known)
+    gaps, clutter = shape.gaps(), np.zeros(holes.shape, np.bool_)
+    reached = _reached_by_others(start.known, gaps, blur, sheet.parts)
+    aslant = bool(reached.any())
+    if aslant:
         # It matters where exactly the neighbouring lines are, whose edges reach into the windows.
-        once = last.without(~reached)
-        blur = _typical_blur(once, sheet.parts)
-        again, _, others = _last_pass(image, once.lattice, sheet.signs, blur, once.sigma_px, sheet.parts, radius_px)
-        factors = np.where([reached[part].any() for part in sheet.parts], others, factors)
-        last = last.without(reached).filled(again)
+        theirs = reached[start.known]
+        lines = shape.sides[theirs], gaps[theirs]
+        windows = _Windows.of(before.without(~reached), *lines, blur, radius_px, aslant=True)
+        nearer = _nearer_pass(image, windows, sheet.signs)
+        for part in sheet.parts:
+            # Clutter in the background is small, and would cost as much as the board.
+            mine = nearer.cut(*part)
+            if mine.lattice.count == 0 or not may_be(mine):
+                clutter[part] = reached[part]
+        before = before.without(reached).filled(nearer)
+        blur = _typical_blur(before, sheet.parts)
+        before = before.without(clutter)
+        shape = fit_cells(before.lattice.pixels, before.lattice.known)
+        gaps = shape.gaps()
+    windows = _Windows.of(before, shape.sides, gaps, blur, radius_px, aslant=aslant)
+    last, factors = _last_pass(image, windows, sheet.signs, sheet.parts)
+    if clutter.any():
+        last = last.filled(nearer.without(~clutter))
     if holes.any():
         last = _confirmed(last, start, holes)
     checked = _checked(last, sheet.parts)
@@ -148,64 +159,107 @@ def _first_pass(image: GreyImage, start: Lattice, signs: FloatArray) -> RefinedL
     return _spread(start, fit, fit.sigma_px)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Windows:
+    """The windows around the corners of a sheet, N of them, and what is known of these before their last fit.
+
+    Attributes
+    ----------
+    lattice, geometry : where the corners are, (R, C), and what the lattice says of them, (N,).
+    curvature_sigma, blur : (N, 2) and (N,), as of `fit_edges`.
+    radius_px : of the largest window.
+    """
+
+    lattice: Lattice
+    geometry: Geometry
+    curvature_sigma: FloatArray
+    blur: FloatArray
+    radius_px: float
+
+    @classmethod
+    def of(
+        cls,
+        start: RefinedLattice,
+        sides: FloatArray,
+        gaps: FloatArray,
+        blur: FloatArray,
+        radius_px: float,
+        *,
+        aslant: bool,
+    ) -> _Windows:
+        """Return those of the corners of `start`, with `sides` and `gaps` (N, 2, 2), and `blur` (R, C); `aslant` where
+        it matters how neighbouring lines are turned."""
+        known, pixels = start.lattice.known, start.lattice.pixels
+        bends, bends_sigma = line_bends_to_fit(pixels, start.sigma_px, known, sides, radius_px)
+        geometry = Geometry(sides, bends, gaps, ends_of(known, known))
+        geometry = tilted(geometry, known) if aslant else geometry
+        return cls(start.lattice, geometry, bends_sigma, blur[known], radius_px)
+
+    def fit(
+        self, image: GreyImage, signs: FloatArray, which: BoolArray | slice, geometry: Geometry, most: tuple[int, float]
+    ) -> EdgeFit:
+        """Return the fit of the corners `which` (N,), with `geometry` instead of their own, in the `most` steps until
+        one is so short, px; `signs` (R, C)."""
+        known = self.lattice.known
+        return fit_edges(
+            image,
+            self.lattice.pixels[known][which],
+            geometry,
+            signs[known][which],
+            self.blur[which],
+            radius_px=self.radius_px,
+            iterations=most[0],
+            converged_px=most[1],
+            curvature_sigma=self.curvature_sigma[which],
+            contrast=self.lattice.contrast[known][which],
+        )
+
+
+def _nearer_pass(image: GreyImage, windows: _Windows, signs: FloatArray) -> RefinedLattice:
+    """Fit all corners in the `windows` of the last pass, to a few thousandths of a pixel; those that fail are left
+    out."""
+    fit = windows.fit(image, signs, slice(None), windows.geometry, FIRST_PASS[1:])
+    return _spread(windows.lattice, fit, fit.sigma_px)
+
+
 def _last_pass(
-    image: GreyImage,
-    start: Lattice,
-    signs: FloatArray,
-    blur: FloatArray,
-    sigma_px: FloatArray,
-    parts: Sequence[Part],
-    radius_px: float,
-) -> tuple[RefinedLattice, BoolArray, FloatArray]:
-    """Fit all corners of the sheet `start`, known to `sigma_px` (R, C); those that fail are left out. Say (R, C) which
-    are of boards whose neighbouring lines reach into the windows, and (P,) how correlated noise raises sigmas.
+    image: GreyImage, windows: _Windows, signs: FloatArray, parts: Sequence[Part]
+) -> tuple[RefinedLattice, FloatArray]:
+    """Fit all corners in their `windows`; those that fail are left out. Say (P,) how correlated noise raises sigmas.
 
     Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
-    known = start.known
-    shape = fit_cells(start.pixels, known)
-    _, iterations, converged_px = LAST_PASS
-    curvature, curvature_sigma = line_bends_to_fit(start.pixels, sigma_px, known, shape.sides, radius_px)
+    mine = _owners(windows.lattice.known, parts)
+
+    def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:
+        return windows.fit(image, signs, which, geometry, LAST_PASS[1:])
+
+    geometry, radius_px = windows.geometry, windows.radius_px
+    fit = fitted(slice(None), geometry)
+    fit = fitted_beside_paper(image, geometry, fit, fitted, signs[windows.lattice.known], mine)
+    good = fit.valid & (fit.contrast > 0.0)
+    factors = sigma_factors(fit, good, geometry.sides, mine, len(parts), radius_px)
+    uneven = uneven_factors(fit, good, geometry.sides, mine, factors, radius_px)
+    return _spread(windows.lattice, fit, fit.sigma_px * factors[mine] * uneven), factors
+
+
+def _owners(known: BoolArray, parts: Sequence[Part]) -> IntArray:
+    """Return the numbers (N,) of the `parts` that the N `known` corners of a sheet are in."""
     owner = np.zeros(known.shape, np.int64)
     for k, part in enumerate(parts):
         owner[part] = k
-    mine = owner[known]
-
-    def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:
-        return fit_edges(
-            image,
-            start.pixels[known][which],
-            geometry,
-            signs[known][which],
-            blur[known][which],
-            radius_px=radius_px,
-            iterations=iterations,
-            converged_px=converged_px,
-            curvature_sigma=curvature_sigma[which],
-            contrast=start.contrast[known][which],
-        )
-
-    geometry = Geometry(shape.sides, curvature, shape.gaps(), ends_of(known, known))
-    if _reached_by_others(geometry.gaps, blur[known], mine).any():
-        geometry = tilted(geometry, known)
-    fit = fitted(slice(None), geometry)
-    fit = fitted_beside_paper(image, geometry, fit, fitted, signs[known], mine)
-    good = fit.valid & (fit.contrast > 0.0)
-    factors = sigma_factors(fit, good, shape.sides, mine, len(parts), radius_px)
-    uneven = uneven_factors(fit, good, shape.sides, mine, factors, radius_px)
-    reached = np.zeros(known.shape, np.bool_)
-    reached[known] = _reached_by_others(geometry.gaps, fit.blur, mine)
-    return _spread(start, fit, fit.sigma_px * factors[mine] * uneven), reached, factors
+    return owner[known]
 
 
-def _reached_by_others(gaps: FloatArray, blur: FloatArray, owner: IntArray) -> BoolArray:
-    """Return which corners (N,) are of boards that blur brings the edges of neighbouring lines into REACHED windows of.
-
-    `gaps` (N, 2, 2) as of `Geometry`, `owner` (N,) the number of each corner's board.
-    """
-    reached = TAIL_SIGMAS * blur > (1.0 - WINDOW_REACH) * gaps.reshape(-1, 4).min(axis=1, initial=np.inf)
-    boards: BoolArray = np.bincount(owner, reached) > REACHED * np.bincount(owner)
-    return np.asarray(boards[owner])
+def _reached_by_others(known: BoolArray, gaps: FloatArray, blur: FloatArray, parts: Sequence[Part]) -> BoolArray:
+    """Return which of the `known` corners of a sheet (R, C) are of boards that blur (R, C) brings the edges of
+    neighbouring lines into REACHED windows of. `gaps` (N, 2, 2) as of `Geometry`."""
+    owner = _owners(known, parts)
+    near = TAIL_SIGMAS * blur[known] > (1.0 - WINDOW_REACH) * gaps.reshape(-1, 4).min(axis=1, initial=np.inf)
+    boards = np.bincount(owner, near) > REACHED * np.bincount(owner)
+    out = np.zeros(known.shape, np.bool_)
+    out[known] = boards[owner]
+    return out
 
 
 def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:

@@ -1,12 +1,20 @@
 """What `detection.subpixel.correlation` asks the kernel of correlation.c for, in numpy; arguments as of
-`rigkit.kernels.edges.sigma_factors`."""
+`rigkit.kernels.edges.sigma_factors` and `uneven_factors`."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.subpixel.correlation import COVERED_TIMES, LIGHT_SHARE, LOST_ERROR, MIN_LEFT, MIN_SIGMA_FACTOR
+from rigkit.detection.subpixel.correlation import (
+    COVERED_TIMES,
+    LIGHT_SHARE,
+    LOST_ERROR,
+    MIN_ALIKE,
+    MIN_LEFT,
+    MIN_SIGMA_FACTOR,
+    UNEVEN_TIMES,
+)
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE
 from rigkit.kernels.edges import LAGS, FactorRules
 
@@ -74,6 +82,33 @@ def sigma_factors(
     known = (alike, pairs, sides.reshape(-1, 4), blur[:, None], used[:, None], blend, both)
     mean: FloatArray = (member / count) @ np.concatenate(known, axis=1)[seen]
     return np.where(member.any(axis=1), factors(mean, count, rules.radius_px), 1.0)
+
+
+def uneven_factors(
+    products: FloatArray,
+    pairs: FloatArray,
+    noise: FloatArray,
+    pixels: FloatArray,
+    sides: FloatArray,
+    blur: FloatArray,
+    used: FloatArray,
+    good: BoolArray,
+    owner: IntArray,
+    usual: FloatArray,
+    rules: FactorRules,
+) -> FloatArray:
+    assert (rules.least_alike, rules.uneven_times) == (MIN_ALIKE, UNEVEN_TIMES)
+    out = np.ones(len(owner))
+    seen = good & (pairs[:, 0] > 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alike = (products[:, 1:] / np.maximum(pairs[:, 1:], 1.0)).mean(axis=1) / noise**2
+        odd = np.flatnonzero(seen & (alike > MIN_ALIKE * usual[owner] ** 2))
+    if len(odd):
+        known = (part[odd] for part in (products, pairs, noise, pixels, sides, blur, used))
+        own = sigma_factors(*known, np.ones(len(odd), np.bool_), np.arange(len(odd)), len(odd), rules)
+        times = own / usual[owner[odd]]
+        out[odd] = np.where(times > UNEVEN_TIMES, times, 1.0)
+    return out
 
 
 def factors(mean: FloatArray, count: FloatArray, radius_px: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from math import comb
 
@@ -12,7 +13,14 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.spacing import SpacingChange
 from rigkit.detection.saddles.response import FloatImage, Level, sample
-from rigkit.detection.subpixel.scatter import DIFFERENCES, MIN_DIFFERENCES, MIN_SCATTER_CORNERS, UNEXPLAINED
+from rigkit.detection.subpixel.scatter import (
+    DIFFERENCES,
+    MIN_DIFFERENCES,
+    MIN_SCATTER_CORNERS,
+    MIN_TERM,
+    SURFACES,
+    UNEXPLAINED,
+)
 from rigkit.kernels.lattice import ScatterRules
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 
@@ -27,6 +35,38 @@ def excess_scatter(
 ) -> FloatArray:
     assert rules.unexplained == UNEXPLAINED
     return np.array([_excess(pixels[part], sigma_px[part]) for part in parts])
+
+
+def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRules) -> tuple[float, float]:
+    assert (tuple(rules.degrees), rules.min_term) == (SURFACES, MIN_TERM)
+    if _difference_count(pixels) >= MIN_DIFFERENCES:
+        return np.nan, np.nan
+    lower, higher = (_surface_roughness(pixels, sigma_px, degree) for degree in SURFACES)
+    return lower, higher
+
+
+def _difference_count(pixels: FloatArray) -> int:
+    """Return how many differences of the lower order `pixels` (R, C, 2) have."""
+    every = (np.diff(pixels, DIFFERENCES[0], axis=axis) for axis in (0, 1))
+    return sum(int(np.count_nonzero(np.isfinite(part))) for part in every)
+
+
+def _surface_roughness(pixels: FloatArray, sigma_px: FloatArray, degree: int) -> float:
+    """Return how far corners lie off a surface of `degree` over what their sigmas say (rms), NaN where it fits any."""
+    known = np.isfinite(pixels[..., 0]) & np.isfinite(sigma_px)
+    row, column = np.nonzero(known)
+    if not len(row):
+        return np.nan
+    y, x = (2.0 * (place - place.mean()) / max(np.ptp(place), 1) for place in (row, column))
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
+    weight = 1.0 / sigma_px[known]
+    surface, size, _ = np.linalg.svd(terms * weight[:, None], full_matrices=False)
+    surface = surface[:, size > MIN_TERM * size[0]]
+    free = len(row) - surface.shape[1]
+    if 2 * free < MIN_DIFFERENCES:
+        return np.nan
+    places = pixels[known] * weight[:, None]
+    return math.sqrt(float(((places - surface @ (surface.T @ places)) ** 2).sum()) / (2.0 * free))
 
 
 def shifts_of_edges(

@@ -127,7 +127,7 @@ class _Fitter:
         fitted = fit_tag_corners(
             *self._corners(cells, surface, start), np.full(len(start), blur), self.window, self._rules(stage, mirrored)
         )
-        return EdgeFit.of_outcomes(fitted)
+        return EdgeFit(fitted)
 
     def _rules(self, stage: tuple[float, int, float], mirrored: bool) -> Rules:
         return edge_rules(*stage, mirrored and self.tags.pattern.corner_squares, self.image.dtype == np.uint8)
