@@ -37,7 +37,7 @@ def test_factors_are_those_of_numpy(shared: float, rng: np.random.Generator) -> 
     assert np.abs(ours / theirs - 1.0).max() < ROUNDING
     # Corners with so much more beside them than their boards that they have a factor of their own.
     products[::7, 1:] = (noise[::7] ** 2)[:, None] * pairs[::7, 1:]
-    arguments = (*arguments[:-2], theirs, factor_rules(18.0))
-    mine, yours = uneven_factors(*arguments), reference.uneven_factors(*arguments)
+    beside = (*arguments[:-2], theirs, factor_rules(18.0))
+    mine, yours = uneven_factors(*beside), reference.uneven_factors(*beside)
     assert 3 <= np.count_nonzero(yours != 1.0) < count
     assert np.abs(mine / yours - 1.0).max() < ROUNDING

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference import discontinuity as reference
 
+from rigkit.core.arrays import FloatArray
 from rigkit.detection.checks.discontinuity import _rules
 from rigkit.kernels.lattice import clearest_splits
 
@@ -18,7 +19,8 @@ def test_splits_are_those_of_numpy(several: bool, rng: np.random.Generator) -> N
     split = 0
     for _ in range(60):
         rows, columns = (int(count) for count in rng.integers(2, 15, 2))
-        pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) * rng.uniform(8.0, 40.0)
+        cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
+        pixels: FloatArray = cells * rng.uniform(8.0, 40.0)
         pixels += 2e-4 * (pixels - pixels.mean()) ** 2
         if rng.random() < 0.6:
             # Another board goes on where this one ends, turned and aside, and the other way round for rows.

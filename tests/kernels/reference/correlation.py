@@ -104,8 +104,8 @@ def uneven_factors(
         alike = (products[:, 1:] / np.maximum(pairs[:, 1:], 1.0)).mean(axis=1) / noise**2
         odd = np.flatnonzero(seen & (alike > MIN_ALIKE * usual[owner] ** 2))
     if len(odd):
-        known = (part[odd] for part in (products, pairs, noise, pixels, sides, blur, used))
-        own = sigma_factors(*known, np.ones(len(odd), np.bool_), np.arange(len(odd)), len(odd), rules)
+        corners = (products[odd], pairs[odd], noise[odd], pixels[odd], sides[odd], blur[odd], used[odd])
+        own = sigma_factors(*corners, np.ones(len(odd), np.bool_), np.arange(len(odd)), len(odd), rules)
         times = own / usual[owner[odd]]
         out[odd] = np.where(times > UNEVEN_TIMES, times, 1.0)
     return out
