@@ -138,10 +138,10 @@ INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
     uint8_t peak[STRIP];
     const float *above = rows[1] + u, *here = rows[2] + u, *below = rows[3] + u;
     for (int k = 0; k < STRIP; k++) {
-        float most = here[k - 1] > above[k] ? here[k - 1] : above[k];
-        most = threshold > most ? threshold : most;
-        const float least = here[k + 1] > below[k] ? here[k + 1] : below[k];
-        peak[k] = (uint8_t)((here[k] > most) & (here[k] >= least));
+        /* What is no number, beside what float32 does not hold, is above nothing. */
+        float most = here[k - 1] > threshold ? here[k - 1] : threshold;
+        most = above[k] > most ? above[k] : most;
+        peak[k] = (uint8_t)((here[k] > most) & !(here[k + 1] > here[k]) & !(below[k] > here[k]));
     }
     uint64_t bits = 0;
     for (int k = 0; k < STRIP; k += 8) {
@@ -158,13 +158,13 @@ INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
 INLINE int is_peak(float *const rows[5], int64_t u)
 {
     const float here = rows[2][u];
-    if (!(here > rows[1][u - 1] && here > rows[1][u + 1] && here >= rows[3][u - 1] && here >= rows[3][u + 1]))
+    if (rows[1][u - 1] >= here || rows[1][u + 1] >= here || rows[3][u - 1] > here || rows[3][u + 1] > here)
         return 0;
-    int is = (here > rows[2][u - 2]) & (here >= rows[2][u + 2]) & (here > rows[1][u - 2]) & (here > rows[1][u + 2]) &
-             (here >= rows[3][u - 2]) & (here >= rows[3][u + 2]);
+    int higher = (rows[2][u - 2] >= here) | (rows[2][u + 2] > here) | (rows[1][u - 2] >= here) | (rows[1][u + 2] >= here) |
+                 (rows[3][u - 2] > here) | (rows[3][u + 2] > here);
     for (int k = -2; k <= 2; k++)
-        is &= (here > rows[0][u + k]) & (here >= rows[4][u + k]);
-    return is;
+        higher |= (rows[0][u + k] >= here) | (rows[4][u + k] > here);
+    return !higher;
 }
 
 /* The saddle response at the `count` pixels from u on of a row, into `to`; whether any is above the threshold. */
