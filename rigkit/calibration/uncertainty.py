@@ -12,7 +12,7 @@ appears: the boards' solved motions, averaged, are the motion of the world (W, T
     dq = d q / d k  dk + d q / d x (W x x + T)
 
 has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`). To both is added
-what the lens may do beyond its model (`departures`): next to nothing where many boards were and the model fits.
+what the lens may do beyond its model (`departures`, `series`): next to nothing where many boards were and it fits.
 
 Reference: D. Kogan, mrcal, "Projection uncertainty" and "Projection differences" (the mean over the frames and the
 rotation that is taken out are the same; here in closed form).
