@@ -39,7 +39,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import DisplacedCamera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board

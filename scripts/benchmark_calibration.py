@@ -41,10 +41,10 @@ from calibrators.peers import (
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.initialise import initialise
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.solver import solve
+from rigkit.calibration.solving.initialise import initialise
+from rigkit.calibration.solving.solver import solve
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board

@@ -27,7 +27,7 @@ from honesty.sessions import IMAGES, sessions
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board

@@ -37,12 +37,12 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import drawn_errors, reduced_by_cluster
 from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations
 from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.linearise import view_products
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.linearise import view_products
+from rigkit.calibration.solving.state import State
 from rigkit.calibration.uncertainty import projection_design
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.convert import refit_camera

@@ -9,12 +9,12 @@ import numpy as np
 from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import Carried, GlobalCovariance
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal_equations import Residuals
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
-from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.normal_equations import Residuals
+from rigkit.calibration.solving.shape import ShapeModel
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError, InputError

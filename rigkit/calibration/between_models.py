@@ -24,12 +24,12 @@ import numpy as np
 
 from rigkit.calibration.choice import HeldOut, Option
 from rigkit.calibration.covariance import motion_of_world
-from rigkit.calibration.fit import Fit, fit_other_lens
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.poses import steps_between
 from rigkit.calibration.result import Candidate, Rival
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.fit import Fit, fit_other_lens
+from rigkit.calibration.solving.poses import steps_between
+from rigkit.calibration.solving.state import State
 from rigkit.calibration.uncertainty import followed
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import DegenerateError, InputError

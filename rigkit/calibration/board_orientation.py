@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import often_seen, released_sigma
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.shape import often_seen, released_sigma
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3
 from rigkit.core.boards import Board
 from rigkit.core.detections import grid_turned

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
+from rigkit.calibration.judging.moved import moved_lens
+from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.lens_choice import (
     Choice,
     Lenses,
@@ -24,14 +26,12 @@ from rigkit.calibration.lens_choice import (
     twins,
 )
 from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
-from rigkit.calibration.moved import moved_lens
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved, only, solved
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.calibration.usable import usable_views
-from rigkit.calibration.verdicts import judge
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.repeats import cluster_numbers
+from rigkit.calibration.views.usable import usable_views
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError

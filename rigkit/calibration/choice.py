@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.departures import SMALLEST_PX
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import pose_inverses
+from rigkit.calibration.solving.normal_equations import pose_inverses
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.kernels.linearise import chebyshev_series
 

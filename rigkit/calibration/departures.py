@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import pose_inverses
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.solving.normal_equations import pose_inverses
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Pixels
 from rigkit.kernels.departures import DISPLACEMENTS, POSE, LensCorners, averaged_amounts, displacements

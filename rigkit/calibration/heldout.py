@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.poses import refine_poses
-from rigkit.calibration.solver import FROM_OPTIMUM, solve
-from rigkit.calibration.state import weighted_squares
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.poses import refine_poses
+from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
+from rigkit.calibration.solving.state import weighted_squares
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray
 
 MIN_IMAGES_OF_FIT = 3

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, settled
-from rigkit.calibration.fit import fit_other_lens
 from rigkit.calibration.heldout import heldout_squares
 from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved
+from rigkit.calibration.solving.fit import fit_other_lens
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 
 SAME_FOCAL = 0.05

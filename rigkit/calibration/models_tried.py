@@ -9,11 +9,11 @@ import numpy as np
 
 from rigkit.calibration.assemble import identifiable, not_identifiable
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import Fit, fit_kept, fit_model, robust_sigma
 from rigkit.calibration.heldout import heldout_squares
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
-from rigkit.calibration.shape import SHAPES
+from rigkit.calibration.solving.fit import Fit, fit_kept, fit_model, robust_sigma
+from rigkit.calibration.solving.shape import SHAPES
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model, check_order
 from rigkit.core.arrays import BoolArray

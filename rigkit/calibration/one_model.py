@@ -8,13 +8,13 @@ import numpy as np
 
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.choice import SURELY, Option, choose, described
-from rigkit.calibration.evidence import fit_shapes
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.linearise import normal_equations
 from rigkit.calibration.models_tried import How, Wanted, agreeing, compared, fit_all, larger_sizes, reweighted
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Candidate
-from rigkit.calibration.shape import often_seen
+from rigkit.calibration.solving.evidence import fit_shapes
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.shape import often_seen
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.progress import Progress
 
 

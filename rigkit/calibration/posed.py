@@ -12,17 +12,18 @@ from numpy.typing import ArrayLike
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
 from rigkit.calibration.choice import Option
-from rigkit.calibration.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept
 from rigkit.calibration.heldout import heldout_squares
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.one_model import with_board_shape
-from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
-from rigkit.calibration.poses import find_poses, refine_poses
-from rigkit.calibration.result import Calibration, Candidate, Convergence
-from rigkit.calibration.state import State, evaluate
-from rigkit.calibration.usable import usable_views
-from rigkit.calibration.verdicts import judge
+from rigkit.calibration.result import Calibration, Candidate
+from rigkit.calibration.solving.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.outliers import OUTLIER_SIGMAS, inliers, sigma_of
+from rigkit.calibration.solving.poses import find_poses, refine_poses
+from rigkit.calibration.solving.solver import Convergence
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.usable import usable_views
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView

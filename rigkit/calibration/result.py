@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 
 from rigkit.calibration.clustered import effective_freedom, widening
+from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, keep_arrays, keep_indices
 from rigkit.core.boards import Board
@@ -137,21 +138,6 @@ class Rival:
     name: str
     camera: Camera
     likely: float
-
-
-@dataclass(frozen=True, slots=True)
-class Convergence:
-    """How the last solve ended.
-
-    Attributes
-    ----------
-    iterations : steps taken.
-    converged, reason : whether it ended where it should, and how in words.
-    """
-
-    iterations: int
-    converged: bool
-    reason: str
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,8 +10,8 @@ import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels

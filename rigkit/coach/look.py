@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.views.usable import views_of_image
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView

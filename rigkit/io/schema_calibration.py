@@ -3,7 +3,8 @@ here; results are described by the fields of their own classes."""
 
 from __future__ import annotations
 
-from rigkit.calibration.result import Calibration, Candidate, Convergence, Outlier
+from rigkit.calibration.result import Calibration, Candidate, Outlier
+from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.registry import MODELS
 from rigkit.core.findings import Severity
 from rigkit.io.board_file import DECLARED_BOARD

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rigkit.calibration.shape import SHAPES
+from rigkit.calibration.solving.shape import SHAPES
 from rigkit.cameras.registry import MODELS, check_order
 from rigkit.core.boards import Board
 from rigkit.core.printing import brief

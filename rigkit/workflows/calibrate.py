@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.judging.verdicts import judge_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
-from rigkit.calibration.verdicts import judge_session
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief

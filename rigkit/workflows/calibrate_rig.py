@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.verdicts import judge
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief

@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes, without_parts
+from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.boards import Board

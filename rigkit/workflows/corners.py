@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.usable import BESIDE, other_size, views_of_image, without_lookalikes
+from rigkit.calibration.views.usable import BESIDE, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import DegenerateError, InputError

@@ -141,7 +141,7 @@ def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Return in words why corners of boards with marks lie in wrong places; None where that is not known.
 
     Marks of another board may be at home on the one declared, and those of two boards alike are each other's. Of
-    chessboards the size of the grids tells (`rigkit.calibration.usable.other_size`).
+    chessboards the size of the grids tells (`rigkit.calibration.views.usable.other_size`).
     """
     if not any(board.identified for board in boards):
         return None

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.state import State
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.kannala_brandt import KannalaBrandt

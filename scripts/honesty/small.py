@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.captured import ASKED_DEG
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.judging.captured import ASKED_DEG
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.compare import compare_cameras, grid_pixels

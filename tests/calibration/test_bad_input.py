@@ -12,9 +12,9 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration import assemble
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import shape_model
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.shape import shape_model
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError

@@ -10,9 +10,9 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_differe
 
 from rigkit.calibration.board_orientation import board_turn, same_looks, with_views_turned
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView, grid_turned

@@ -14,10 +14,10 @@ from rigkit.calibration.assemble import assemble
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.clustered import clustered_covariance, with_block
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
-from rigkit.calibration.fit import fit_kept
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.fit import fit_kept
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.detections import BoardView
 
 RUNS, VIEWS = 40, 15

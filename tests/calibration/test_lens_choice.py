@@ -13,13 +13,14 @@ from rigkit.calibration import uncertainty
 from rigkit.calibration.between_models import rival_fits, rival_shapes
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
-from rigkit.calibration.fit import Fit, fit_model
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
 from rigkit.calibration.models_tried import How
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.one_model import Solved
-from rigkit.calibration.result import Convergence, Rival
+from rigkit.calibration.result import Rival
+from rigkit.calibration.solving.fit import Fit, fit_model
+from rigkit.calibration.solving.solver import Convergence
 from rigkit.calibration.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model
 from rigkit.core.progress import silent

@@ -9,10 +9,10 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.folds import folds_of
-from rigkit.calibration.mixed import two_cameras
-from rigkit.calibration.repeats import cluster_numbers
+from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.views.folds import folds_of
+from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

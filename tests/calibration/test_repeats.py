@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rigkit.kernels.close_pairs as kernel
-from rigkit.calibration.repeats import close_pairs
+from rigkit.calibration.views.repeats import close_pairs
 from rigkit.core.arrays import FloatArray
 
 

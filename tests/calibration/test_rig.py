@@ -9,18 +9,18 @@ import pytest
 from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
 
-from rigkit.calibration.camera_prior import camera_prior
 from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import GlobalCovariance
-from rigkit.calibration.normal_equations import SchurStep
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
-from rigkit.calibration.shape import shape_model
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.camera_prior import camera_prior
+from rigkit.calibration.solving.normal_equations import SchurStep
+from rigkit.calibration.solving.shape import shape_model
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError

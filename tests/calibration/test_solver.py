@@ -9,13 +9,13 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from scipy.optimize import least_squares
 
-from rigkit.calibration.initialise import initialise
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import SchurStep
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import shape_model
-from rigkit.calibration.solver import Linearised, minimise, solve, with_priors
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.initialise import initialise
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import SchurStep
+from rigkit.calibration.solving.shape import shape_model
+from rigkit.calibration.solving.solver import Linearised, minimise, solve, with_priors
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import RadialCurve
 from rigkit.cameras.scaramuzza import Scaramuzza
 from rigkit.core.errors import InputError

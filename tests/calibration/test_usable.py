@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigkit.calibration.usable import other_size, views_of_image, without_lookalikes
+from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.circles import Circles

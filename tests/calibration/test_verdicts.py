@@ -10,15 +10,15 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.fit import fit_model
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.judging.verdicts import judge_session
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solver import with_priors
-from rigkit.calibration.state import State
-from rigkit.calibration.usable import BESIDE
-from rigkit.calibration.verdicts import judge_session
+from rigkit.calibration.solving.fit import fit_model
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.solver import with_priors
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.usable import BESIDE
 from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError

@@ -11,12 +11,12 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.changing import MIN_NEIGHBOUR_CORRELATION, changing
+from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION, changing
+from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.view_evidence import view_evidence
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.verdicts import judge
-from rigkit.calibration.view_evidence import view_evidence
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
 from rigkit.cameras.pinhole import Pinhole

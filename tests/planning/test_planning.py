@@ -9,7 +9,7 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.shape import WARP_UNKNOWNS, warp_of_board
+from rigkit.calibration.solving.shape import WARP_UNKNOWNS, warp_of_board
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.cameras.pinhole import Pinhole

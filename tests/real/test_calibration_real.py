@@ -12,12 +12,12 @@ from helpers.data import shared_data
 from truth.cameras import published_corners
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.poses import find_poses, refine_poses
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.state import State, evaluate
-from rigkit.calibration.usable import views_of_image
+from rigkit.calibration.solving.poses import find_poses, refine_poses
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board

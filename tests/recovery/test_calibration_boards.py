@@ -18,9 +18,9 @@ from helpers.calibration_scenes import (
 )
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.evidence import fit_shapes
-from rigkit.calibration.fit import fit_model
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.solving.evidence import fit_shapes
+from rigkit.calibration.solving.fit import fit_model
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.brown import Brown
 
 BOW_LIMIT_PX = 0.38

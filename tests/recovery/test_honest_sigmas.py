@@ -16,10 +16,10 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 from helpers.reconstructions import BOARDS
 
 from rigkit.calibration.assemble import assemble
-from rigkit.calibration.fit import fit_kept
-from rigkit.calibration.initialise import initialise
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.solver import solve
+from rigkit.calibration.solving.fit import fit_kept
+from rigkit.calibration.solving.initialise import initialise
+from rigkit.calibration.solving.solver import solve
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS
 from rigkit.cameras.uncertain import UncertainCamera

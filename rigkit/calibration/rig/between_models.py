@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.between_models import same_model, spread_rays
-from rigkit.calibration.poses import steps_between
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
-from rigkit.calibration.solver import FROM_OPTIMUM
+from rigkit.calibration.solving.poses import steps_between
+from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.calibration.uncertainty import followed
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError

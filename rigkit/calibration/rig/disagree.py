@@ -17,7 +17,7 @@ import numpy as np
 
 from rigkit.calibration.rig.observations import FrameObservations
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
-from rigkit.calibration.solver import Solution
+from rigkit.calibration.solving.solver import Solution
 
 FAR_APART = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many

@@ -12,13 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.displaced import LensModes, telling_modes
-from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.solver import Solution
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.solver import Solution
+from rigkit.calibration.solving.state import State
 from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
 from rigkit.kernels.departures import displacements

@@ -12,7 +12,7 @@ import numpy as np
 
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.shape import SHAPES
+from rigkit.calibration.solving.shape import SHAPES
 from rigkit.core.arrays import FloatArray
 
 CHANCE_SIGMAS = 3.0

@@ -8,8 +8,8 @@ from rigkit.calibration.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations
-from rigkit.calibration.solver import FROM_OPTIMUM
-from rigkit.calibration.state import weighted_squares
+from rigkit.calibration.solving.solver import FROM_OPTIMUM
+from rigkit.calibration.solving.state import weighted_squares
 
 
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:

@@ -8,9 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.folds import folds_of
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_sizes import sizes_apart
 from rigkit.calibration.rig.disagree import (
@@ -32,7 +29,10 @@ from rigkit.calibration.rig.observations import FrameObservations, RigViews
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
-from rigkit.calibration.solver import Solution
+from rigkit.calibration.solving.solver import Solution
+from rigkit.calibration.views.folds import folds_of
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity

@@ -9,9 +9,10 @@ import numpy as np
 
 from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.displaced import LensModes, with_modes
-from rigkit.calibration.result import Calibration, Convergence
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, keep_arrays
 from rigkit.core.errors import InputError

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.evidence import MIN_SIZE
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
+from rigkit.calibration.solving.evidence import MIN_SIZE
+from rigkit.calibration.solving.shape import SHAPES, ShapeModel, released_groups, shape_model, warp_groups
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, Points
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.poses import refine_each
 from rigkit.calibration.rig.carried import carried
 from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.solver import COST_TOLERANCE, Linearised, Solution, minimise
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.poses import refine_each
+from rigkit.calibration.solving.solver import COST_TOLERANCE, Linearised, Solution, minimise
 from rigkit.core.arrays import Mat3, Points
 from rigkit.geometry.rotation import log_so3
 

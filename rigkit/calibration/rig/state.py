@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import SchurStep
-from rigkit.calibration.observations import Observations
 from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.shape import ShapeModel
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.normal_equations import SchurStep
+from rigkit.calibration.solving.shape import ShapeModel
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rigid3 import Rigid3

@@ -1,4 +1,4 @@
-"""What a person should know about a rig, in sentences, as `rigkit.calibration.verdicts` has it for a camera."""
+"""What a person should know about a rig, in sentences, as `rigkit.calibration.judging.verdicts` has it for a camera."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from itertools import combinations
 
 import numpy as np
 
+from rigkit.calibration.judging.verdicts import UNSURE_PX, with_headline
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.calibration.verdicts import UNSURE_PX, with_headline
 from rigkit.core.findings import Finding
 
 FEW_SHARED = 5

@@ -13,13 +13,13 @@ import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
 from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.linearise import view_products
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.outliers import inliers, sigma_of
-from rigkit.calibration.poses import refine_poses
 from rigkit.calibration.rig.carried import carried_by_mount, summed_products
 from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.linearise import view_products
+from rigkit.calibration.solving.outliers import inliers, sigma_of
+from rigkit.calibration.solving.poses import refine_poses
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points

@@ -12,10 +12,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.solver import FROM_OPTIMUM, solve
-from rigkit.calibration.state import State, weighted_squares
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
+from rigkit.calibration.solving.state import State, weighted_squares
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding
 

@@ -7,15 +7,14 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.initialise import initialise
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations, Residuals
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.outliers import OUTLIER_SIGMAS, inliers, sigma_of
-from rigkit.calibration.poses import find_poses, refine_poses
-from rigkit.calibration.result import Convergence
-from rigkit.calibration.solver import solve, with_priors
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.initialise import initialise
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations, Residuals
+from rigkit.calibration.solving.outliers import OUTLIER_SIGMAS, inliers, sigma_of
+from rigkit.calibration.solving.poses import find_poses, refine_poses
+from rigkit.calibration.solving.solver import Convergence, solve, with_priors
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError

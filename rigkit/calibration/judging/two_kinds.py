@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.judging.view_evidence import COMMON, WAY_COLUMNS, ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.view_evidence import COMMON, WAY_COLUMNS, ViewEvidence, columns_of
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.findings import Finding
 

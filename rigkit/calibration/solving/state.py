@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import Residuals, SchurStep
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.shape import ShapeModel, shape_model
+from rigkit.calibration.solving.normal_equations import Residuals, SchurStep
+from rigkit.calibration.solving.shape import ShapeModel, shape_model
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import exp_so3

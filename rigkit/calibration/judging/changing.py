@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, view_results
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.judging.turned import turned_pictures
+from rigkit.calibration.judging.two_kinds import two_kinds
+from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solver import solve
-from rigkit.calibration.turned import turned_pictures
-from rigkit.calibration.two_kinds import two_kinds
-from rigkit.calibration.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.solver import solve
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, median_of
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH

@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rigkit.calibration.captured import (
+from rigkit.calibration.judging.captured import (
     ASKED_DEG,
     SMALL_PX,
     Extent,
@@ -20,17 +20,17 @@ from rigkit.calibration.captured import (
     judge_capture,
     same_way_up,
 )
-from rigkit.calibration.changing import MOTION, changing
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.mixed import two_cameras
+from rigkit.calibration.judging.changing import MOTION, changing
+from rigkit.calibration.judging.mixed import two_cameras
+from rigkit.calibration.judging.two_kinds import APART, fewest_of_a_kind
 from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.neighbours import neighbour_correlation
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.repeats import cluster_numbers
 from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.calibration.two_kinds import APART, fewest_of_a_kind
+from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.calibration.usable import BESIDE
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.repeats import cluster_numbers
+from rigkit.calibration.views.usable import BESIDE
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.camera_prior import camera_prior
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.solving.camera_prior import camera_prior
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels.linearise import schur_step

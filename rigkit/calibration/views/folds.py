@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.repeats import close_pairs, joined, places_of
+from rigkit.calibration.views.repeats import close_pairs, joined, places_of
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
 NEARLY_ALIKE = 0.02

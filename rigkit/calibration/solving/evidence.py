@@ -14,14 +14,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.fit import Fit, fit_kept
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.outliers import inliers, sigma_of
-from rigkit.calibration.shape import released_groups, shape_model, warp_groups
-from rigkit.calibration.solver import solve, with_priors
-from rigkit.calibration.state import State, evaluate
+from rigkit.calibration.solving.fit import Fit, fit_kept
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.outliers import inliers, sigma_of
+from rigkit.calibration.solving.shape import released_groups, shape_model, warp_groups
+from rigkit.calibration.solving.solver import solve, with_priors
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 
 SIZE_ROUNDS = 2

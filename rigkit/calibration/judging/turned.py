@@ -13,14 +13,14 @@ import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.board_orientation import with_views_turned
-from rigkit.calibration.fit import Fit
-from rigkit.calibration.normal_equations import Residuals
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_in_two
+from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solver import solve
-from rigkit.calibration.state import State
-from rigkit.calibration.two_kinds import MIN_LEAD, split_in_two
-from rigkit.calibration.view_evidence import ViewEvidence, columns_of, view_evidence
+from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.normal_equations import Residuals
+from rigkit.calibration.solving.solver import solve
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.core.findings import Finding
 

@@ -14,11 +14,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations, SchurStep
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.result import Convergence
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations, SchurStep
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.optim import levenberg_marquardt
@@ -40,6 +39,21 @@ SOLVER_DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0,
 """Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more
 than 1e-13 would hold their combinations back, and with a shrink of 1/3 it would be dozens of steps. A step that goes
 too far is refused and the damping grows quickly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """How the last solve ended.
+
+    Attributes
+    ----------
+    iterations : steps taken.
+    converged, reason : whether it ended where it should, and how in words.
+    """
+
+    iterations: int
+    converged: bool
+    reason: str
 
 
 @dataclass(frozen=True, eq=False, slots=True)

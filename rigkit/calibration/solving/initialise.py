@@ -17,9 +17,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.radial_alignment import TURN_SIGMAS, Alignment, align, distortion_centre
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.radial_alignment import TURN_SIGMAS, Alignment, align, distortion_centre
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.core.arrays import FloatArray, Mat3, Points, median_of
 from rigkit.core.errors import InputError

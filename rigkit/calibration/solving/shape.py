@@ -2,7 +2,7 @@
 
 A shape is linear in its unknowns: points = flat points + basis @ unknowns, each unknown with a Gaussian prior around
 zero in its own unit, so that what the views do not determine stays at the flat board. How far released corners stray
-the views say themselves: see `rigkit.calibration.evidence`.
+the views say themselves: see `rigkit.calibration.solving.evidence`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.observations import Observations
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 
 SHAPES = ("flat", "warp", "released")

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.normal_equations import NormalEquations, Residuals
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.state import State, lost_px
+from rigkit.calibration.solving.normal_equations import NormalEquations, Residuals
+from rigkit.calibration.solving.state import State, lost_px
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels.linearise import BoardViews, ViewSums
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.linearise import normal_equations
-from rigkit.calibration.normal_equations import NormalEquations
-from rigkit.calibration.observations import Observations
-from rigkit.calibration.radial_alignment import align
-from rigkit.calibration.state import State
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.radial_alignment import align
+from rigkit.calibration.solving.state import State
+from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, Mat3, Points
 from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation
 from rigkit.optim.batched import BatchedProblem, minimise_each

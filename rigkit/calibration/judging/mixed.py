@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.repeats import close_pairs
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.views.repeats import close_pairs
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
 
