@@ -95,7 +95,7 @@ def refine(
         theirs = reached[start.known]
         lines = shape.sides[theirs], gaps[theirs]
         windows = _Windows.of(before.without(~reached), *lines, blur, radius_px, aslant=True)
-        nearer = _nearer_pass(image, windows, sheet.signs)
+        nearer = _nearer_pass(image, windows, sheet.signs, sheet.parts)
         for part in sheet.parts:
             # Clutter in the background is small, and would cost as much as the board.
             mine = nearer.cut(*part)
@@ -215,10 +215,20 @@ class _Windows:
         )
 
 
-def _nearer_pass(image: GreyImage, windows: _Windows, signs: FloatArray) -> RefinedLattice:
-    """Fit all corners in the `windows` of the last pass, to a few thousandths of a pixel; those that fail are left
-    out."""
-    fit = windows.fit(image, signs, slice(None), windows.geometry, FIRST_PASS[1:])
+def _fit_windows(image: GreyImage, windows: _Windows, signs: FloatArray, mine: IntArray) -> EdgeFit:
+    """Fit all corners in their `windows`, and what lies beyond the boards, `mine` (N,), that they are of: without it
+    the outermost corners of a blurred board move by tenths of a pixel, and with them the lines through the others."""
+
+    def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:
+        return windows.fit(image, signs, which, geometry, LAST_PASS[1:])
+
+    fit = fitted(slice(None), windows.geometry)
+    return fitted_beside_paper(image, windows.geometry, fit, fitted, signs[windows.lattice.known], mine)
+
+
+def _nearer_pass(image: GreyImage, windows: _Windows, signs: FloatArray, parts: Sequence[Part]) -> RefinedLattice:
+    """Return where the corners are, in the windows of the last pass; those that fail are left out."""
+    fit = _fit_windows(image, windows, signs, _owners(windows.lattice.known, parts))
     return _spread(windows.lattice, fit, fit.sigma_px)
 
 
@@ -230,13 +240,7 @@ def _last_pass(
     Noise is told from other residuals, and how that of neighbouring pixels is correlated on each of the `parts`.
     """
     mine = _owners(windows.lattice.known, parts)
-
-    def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:
-        return windows.fit(image, signs, which, geometry, LAST_PASS[1:])
-
-    geometry, radius_px = windows.geometry, windows.radius_px
-    fit = fitted(slice(None), geometry)
-    fit = fitted_beside_paper(image, geometry, fit, fitted, signs[windows.lattice.known], mine)
+    fit, geometry, radius_px = _fit_windows(image, windows, signs, mine), windows.geometry, windows.radius_px
     good = fit.valid & (fit.contrast > 0.0)
     factors = sigma_factors(fit, good, geometry.sides, mine, len(parts), radius_px)
     uneven = uneven_factors(fit, good, geometry.sides, mine, factors, radius_px)
