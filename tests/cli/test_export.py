@@ -61,8 +61,8 @@ def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytes
 
 def test_nothing_is_said_where_nothing_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     p = BROWN.parameters.size
-    unsure = {"covariance": np.eye(p), "frame_covariance": np.eye(p + 6)}
-    brown = replace(load_calibration(CALIBRATION), camera=BROWN, **unsure)
+    calibration = load_calibration(CALIBRATION)
+    brown = replace(calibration, camera=BROWN, covariance=np.eye(p), frame_covariance=np.eye(p + 6))
     with caplog.at_level("INFO"):
         files = foreign_files(brown, tmp_path / "brown.json", ["opencv", "ros"])
     assert len(files) == 2 and not caplog.text

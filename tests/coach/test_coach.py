@@ -23,7 +23,7 @@ from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import WORTH_OF_PHOTO, WORTH_TAKING, CaptureGuide, GuideOptions
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
-from rigkit.coach.sources import device_frames, watched_frames
+from rigkit.coach.sources import Frame, device_frames, watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -108,7 +108,7 @@ def test_frames_are_offered_until_there_are_enough() -> None:
             return {"enough": self.offered == 2}
 
     coach = Satisfied()
-    coach_frames(coach, iter([([], None)] * 5), photos=True)  # type: ignore[arg-type]
+    coach_frames(coach, iter([Frame([])] * 5), photos=True)  # type: ignore[arg-type]
     assert coach.offered == 2
 
 
