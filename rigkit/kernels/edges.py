@@ -3,6 +3,8 @@ how the lines of a lattice bend."""
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,49 +76,46 @@ def scratch_of(rules: Rules) -> NDArray[np.float32]:
     return np.empty(kernels().edges_scratch(rules), np.float32)
 
 
-def sigma_factors(
-    products: FloatArray,
-    pairs: FloatArray,
-    noise: FloatArray,
-    pixels: FloatArray,
-    sides: FloatArray,
-    blur: FloatArray,
-    used: FloatArray,
-    good: BoolArray,
-    owner: IntArray,
-    boards: int,
-    rules: FactorRules,
-) -> FloatArray:
+class NoiseOfCorners(NamedTuple):
+    """What the fits of N corners leave, and how they went: rows of `fit_edges`, N first in all.
+
+    Attributes
+    ----------
+    products, pairs : (N, 13) sums of products of what is left in two pixels LAGS apart, and of how many.
+    noise, blur, used : (N,) what is left, grey levels; px; pixels of the window.
+    pixels, sides : (N, 2) and (N, 2, 2), of the corners and of their cells, px.
+    good : (N,) those to rely on.
+    owner : (N,) the number of the board of each.
+    """
+
+    products: FloatArray
+    pairs: FloatArray
+    noise: FloatArray
+    pixels: FloatArray
+    sides: FloatArray
+    blur: FloatArray
+    used: FloatArray
+    good: BoolArray
+    owner: IntArray
+
+    def arguments(self) -> tuple[NDArray[Any], ...]:
+        """Return them as the kernels take them."""
+        *known, good, owner = self
+        numbers = (np.ascontiguousarray(part, np.float64) for part in known)
+        return (*numbers, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64))
+
+
+def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.sigma_factors` does."""
-    known = [np.ascontiguousarray(part, np.float64) for part in (products, pairs, noise, pixels, sides, blur, used)]
     out = np.empty(boards)
-    kernels().sigma_factors(
-        *(*known, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64)),
-        *(len(pixels), boards, rules, out),
-    )
+    kernels().sigma_factors(*corners.arguments(), len(corners.pixels), boards, rules, out)
     return out
 
 
-def uneven_factors(
-    products: FloatArray,
-    pairs: FloatArray,
-    noise: FloatArray,
-    pixels: FloatArray,
-    sides: FloatArray,
-    blur: FloatArray,
-    used: FloatArray,
-    good: BoolArray,
-    owner: IntArray,
-    usual: FloatArray,
-    rules: FactorRules,
-) -> FloatArray:
+def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.uneven_factors` does."""
-    known = [np.ascontiguousarray(part, np.float64) for part in (products, pairs, noise, pixels, sides, blur, used)]
-    boards, out = np.ascontiguousarray(usual, np.float64), np.empty(len(pixels))
-    kernels().uneven_factors(
-        *(*known, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64)),
-        *(len(pixels), len(boards), boards, rules, out),
-    )
+    boards, out = np.ascontiguousarray(usual, np.float64), np.empty(len(corners.pixels))
+    kernels().uneven_factors(*corners.arguments(), len(corners.pixels), len(boards), boards, rules, out)
     return out
 
 

@@ -7,7 +7,7 @@ import pytest
 from kernels.reference import correlation as reference
 
 from rigkit.detection.subpixel.correlation import factor_rules
-from rigkit.kernels.edges import LAGS, sigma_factors, uneven_factors
+from rigkit.kernels.edges import LAGS, NoiseOfCorners, sigma_factors, uneven_factors
 
 ROUNDING = 1e-9
 """Both solve 13 equations in double precision."""
@@ -30,14 +30,13 @@ def test_factors_are_those_of_numpy(shared: float, rng: np.random.Generator) -> 
     blur, used, good = rng.uniform(0.2, 2.0, count), rng.uniform(30.0, 900.0, count), rng.random(count) < 0.9
     good[0] = True
     products[~good], pixels[~good], noise[~good] = np.nan, np.nan, np.nan
-    arguments = (products, pairs, noise, pixels, sides, blur, used, good, owner, boards, factor_rules(18.0))
-    ours, theirs = sigma_factors(*arguments), reference.sigma_factors(*arguments)
+    corners, rules = NoiseOfCorners(products, pairs, noise, pixels, sides, blur, used, good, owner), factor_rules(18.0)
+    ours, theirs = sigma_factors(corners, boards, rules), reference.sigma_factors(corners, boards, rules)
     assert theirs[4] == 1.0
     assert not shared or np.count_nonzero(theirs != 1.0) >= 3
     assert np.abs(ours / theirs - 1.0).max() < ROUNDING
     # Corners with so much more beside them than their boards that they have a factor of their own.
     products[::7, 1:] = (noise[::7] ** 2)[:, None] * pairs[::7, 1:]
-    beside = (*arguments[:-2], theirs, factor_rules(18.0))
-    mine, yours = uneven_factors(*beside), reference.uneven_factors(*beside)
+    mine, yours = uneven_factors(corners, theirs, rules), reference.uneven_factors(corners, theirs, rules)
     assert 3 <= np.count_nonzero(yours != 1.0) < count
     assert np.abs(mine / yours - 1.0).max() < ROUNDING

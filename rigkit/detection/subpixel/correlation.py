@@ -56,8 +56,7 @@ def sigma_factors(
     owner : (N,) the board of each corner.
     radius_px : of the fit.
     """
-    corners = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
-    return edges.sigma_factors(*corners, good, owner, boards, factor_rules(radius_px))
+    return edges.sigma_factors(_noise_of(fit, good, sides, owner), boards, factor_rules(radius_px))
 
 
 def uneven_factors(
@@ -69,8 +68,11 @@ def uneven_factors(
     The edge of a shadow, glare or a finger in the window leaves what is the same over many pixels, and what of it looks
     like a shift of the corner is in none of the residuals. Arguments else as of `sigma_factors`.
     """
-    corners = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
-    return edges.uneven_factors(*corners, good, owner, usual, factor_rules(radius_px))
+    return edges.uneven_factors(_noise_of(fit, good, sides, owner), usual, factor_rules(radius_px))
+
+
+def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray) -> edges.NoiseOfCorners:
+    return edges.NoiseOfCorners(fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used, good, owner)
 
 
 def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> EdgeFit:

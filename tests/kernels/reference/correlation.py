@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import FloatArray
 from rigkit.detection.subpixel.correlation import (
     COVERED_TIMES,
     LIGHT_SHARE,
@@ -16,7 +16,7 @@ from rigkit.detection.subpixel.correlation import (
     UNEVEN_TIMES,
 )
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE
-from rigkit.kernels.edges import LAGS, FactorRules
+from rigkit.kernels.edges import LAGS, FactorRules, NoiseOfCorners
 
 _ROW, _COLUMN = np.array(LAGS, dtype=np.float64).T
 _LENGTH = np.hypot(_ROW, _COLUMN)
@@ -46,19 +46,8 @@ def _blends() -> tuple[FloatArray, FloatArray]:
 _WHOLE, _BETWEEN = _blends()
 
 
-def sigma_factors(
-    products: FloatArray,
-    pairs: FloatArray,
-    noise: FloatArray,
-    pixels: FloatArray,
-    sides: FloatArray,
-    blur: FloatArray,
-    used: FloatArray,
-    good: BoolArray,
-    owner: IntArray,
-    boards: int,
-    rules: FactorRules,
-) -> FloatArray:
+def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
+    products, pairs, noise, pixels, sides, blur, used, good, owner = corners
     assert (rules.light_share, rules.lost_error, rules.least_left) == (LIGHT_SHARE, LOST_ERROR, MIN_LEFT)
     assert (rules.covered_times, rules.least_factor, rules.least_blur) == (
         COVERED_TIMES,
@@ -84,19 +73,8 @@ def sigma_factors(
     return np.where(member.any(axis=1), factors(mean, count, rules.radius_px), 1.0)
 
 
-def uneven_factors(
-    products: FloatArray,
-    pairs: FloatArray,
-    noise: FloatArray,
-    pixels: FloatArray,
-    sides: FloatArray,
-    blur: FloatArray,
-    used: FloatArray,
-    good: BoolArray,
-    owner: IntArray,
-    usual: FloatArray,
-    rules: FactorRules,
-) -> FloatArray:
+def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
+    products, pairs, noise, _, _, _, _, good, owner = corners
     assert (rules.least_alike, rules.uneven_times) == (MIN_ALIKE, UNEVEN_TIMES)
     out = np.ones(len(owner))
     seen = good & (pairs[:, 0] > 0.0)
@@ -104,8 +82,8 @@ def uneven_factors(
         alike = (products[:, 1:] / np.maximum(pairs[:, 1:], 1.0)).mean(axis=1) / noise**2
         odd = np.flatnonzero(seen & (alike > MIN_ALIKE * usual[owner] ** 2))
     if len(odd):
-        corners = (products[odd], pairs[odd], noise[odd], pixels[odd], sides[odd], blur[odd], used[odd])
-        own = sigma_factors(*corners, np.ones(len(odd), np.bool_), np.arange(len(odd)), len(odd), rules)
+        alone = NoiseOfCorners._make(part[odd] for part in corners)
+        own = sigma_factors(alone._replace(owner=np.arange(len(odd))), len(odd), rules)
         times = own / usual[owner[odd]]
         out[odd] = np.where(times > UNEVEN_TIMES, times, 1.0)
     return out
