@@ -91,20 +91,30 @@ def load_camera(path: str | Path) -> Camera:
 
     Raises InputError for a missing or damaged file, another schema, an unknown key or model, or wrong parameters.
     """
+    return _camera_in(_read(path), path)
+
+
+def load_calibration(path: str | Path) -> Calibration:
+    """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
+    return _calibration_in(_read(path), path)
+
+
+def load_calibration_or_camera(path: str | Path) -> Calibration | Camera:
+    """Return the whole calibration, or the camera of a file that has no more, as one that came from another tool.
+
+    Raises InputError like `load_camera`.
+    """
     data = _read(path)
+    return _calibration_in(data, path) if "covariance" in data else _camera_in(data, path)
+
+
+def _camera_in(data: dict[str, Any], path: str | Path) -> Camera:
     if "camera" not in data:
         raise InputError(f"'{path}': 'camera' is missing; calibrate again")
     return camera_from_json(data["camera"], path)
 
 
-def is_calibration(path: str | Path) -> bool:
-    """Say whether the file has more than a camera, as one that came from another tool."""
-    return "covariance" in _read(path)
-
-
-def load_calibration(path: str | Path) -> Calibration:
-    """Return the whole calibration; raises InputError like `load_camera`, also where the file has the camera alone."""
-    data = _read(path)
+def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
     missing = sorted(CALIBRATION_KEYS - LATER_KEYS - set(data))
     if missing:
         raise InputError(f"'{path}': no {', '.join(missing)}: a camera without its calibration; calibrate again")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from rigkit.io.reading import MAX_NUMBER, MIN_POSITIVE, read_text
 
 MAX_JSON_DIGITS = 18
 """Of a whole number: what 64 bits hold."""
+_BEGINS = re.compile(r'\A\s*\{\s*"schema":\s*"([^"\\]*)"')
+"""How the program writes its files: what they are stands first."""
 
 
 def parse_json(text: str) -> Any:
@@ -34,9 +37,15 @@ def json_text(data: Any) -> str:
 
 
 def json_schema(path: str | Path) -> str | None:
-    """Return the schema that the file states; None for a file that is no JSON, states none or cannot be read."""
+    """Return the schema that the file states; None for one that states none, is no JSON or cannot be read.
+
+    A damaged file that begins as the program writes it is of its schema: what reads it says what is wrong.
+    """
     try:
-        data = parse_json(read_text(path))
+        text = read_text(path)
+        if begins := _BEGINS.match(text):
+            return begins[1]
+        data = parse_json(text)
     except (InputError, ValueError):
         return None
     schema = data.get("schema") if isinstance(data, dict) else None

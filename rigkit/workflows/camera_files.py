@@ -16,7 +16,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.opencv_stereo import read_opencv_stereo
-from rigkit.io.calibration_file import is_calibration, load_calibration, load_camera
+from rigkit.io.calibration_file import load_calibration_or_camera
 from rigkit.io.reading import read_text
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
 from rigkit.workflows.formats import READ_FORMATS
@@ -44,9 +44,11 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     if kind not in READ_FORMATS:
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
     if kind == "rigkit":
-        camera = load_camera(source)
-        warn_if_bad(source)
-        return camera
+        known = load_calibration_or_camera(source)
+        if not isinstance(known, Calibration):
+            return known
+        warn_if_bad(source, known.verdicts)
+        return known.camera
     return FOREIGN_FORMATS[kind].read(text, name, size_px)
 
 
@@ -58,8 +60,10 @@ def camera_format(text: str) -> str | None:
 
 def own_calibration(path: str | Path) -> Calibration | None:
     """Return a calibration of rigkit's, None for another file; raises InputError for one that cannot be read."""
-    ours = camera_format(read_text(path, "camera file")) == "rigkit"
-    return load_calibration(path) if ours and is_calibration(path) else None
+    if camera_format(read_text(path, "camera file")) != "rigkit":
+        return None
+    known = load_calibration_or_camera(path)
+    return known if isinstance(known, Calibration) else None
 
 
 def called_bad(path: str | Path) -> Finding | None:

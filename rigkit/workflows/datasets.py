@@ -25,7 +25,7 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError
 from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibration_file import calibration_text, is_calibration, load_calibration, load_camera
+from rigkit.io.calibration_file import calibration_text, load_calibration_or_camera
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
@@ -203,10 +203,8 @@ def _file_of(camera_id: str, index: int) -> str:
 
 
 def _load(path: Path) -> LoadedCamera:
-    if not is_calibration(path):
-        return LoadedCamera(load_camera(path), None)
-    calibration = load_calibration(path)
-    return LoadedCamera(calibration.camera, calibration)
+    known = load_calibration_or_camera(path)
+    return LoadedCamera(known.camera, known) if isinstance(known, Calibration) else LoadedCamera(known, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
