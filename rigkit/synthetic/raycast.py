@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -268,23 +269,29 @@ def _paint_discs(target: Float32, axes: Float32, cells: list[_Cells], surface: S
 def _paint_marks(target: Float32, axes: Float32, cells: list[_Cells], surface: Surface) -> None:
     """Blacken the rectangles of a surface in `target`; they touch, but do not overlap."""
     marks = np.zeros((0, 4)) if surface.marks is None else surface.marks
+    per_pixel = cells[0].per_pixel
+    least, most = (_of_pixels(axes, extent, per_pixel) for extent in (np.minimum, np.maximum))
     reach = [c.reach for c in cells]
     low, high = marks[:, :2] - reach, marks[:, :2] + marks[:, 2:] + reach
-    seen = (high > axes.min(axis=(1, 2))).all(axis=1) & (low < axes.max(axis=(1, 2))).all(axis=1)
+    seen = (high > least.min(axis=(1, 2))).all(axis=1) & (low < most.max(axis=(1, 2))).all(axis=1)
     for n in np.flatnonzero(seen):
-        near = (axes[0] > low[n, 0]) & (axes[0] < high[n, 0]) & (axes[1] > low[n, 1]) & (axes[1] < high[n, 1])
+        near = (most[0] > low[n, 0]) & (least[0] < high[n, 0]) & (most[1] > low[n, 1]) & (least[1] < high[n, 1])
         rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
         if not len(rows):
             continue
-        per_pixel = cells[0].per_pixel
         # In whole pixels, as the cells' sides are.
-        first, end = [rows[0] // per_pixel, columns[0] // per_pixel], [rows[-1] // per_pixel, columns[-1] // per_pixel]
-        pixels = tuple(slice(a, b + 1) for a, b in zip(first, end, strict=True))
-        box = tuple(slice(a * per_pixel, (b + 1) * per_pixel) for a, b in zip(first, end, strict=True))
+        pixels = tuple(slice(k[0], k[-1] + 1) for k in (rows, columns))
+        box = tuple(slice(k[0] * per_pixel, (k[-1] + 1) * per_pixel) for k in (rows, columns))
         across, down = (
             _inside(axes[k][box], cells[k].of(pixels), marks[n, k], marks[n, k] + marks[n, k + 2]) for k in (0, 1)
         )
         target[box] += np.float32(surface.black - surface.white) * across * down
+
+
+def _of_pixels(axes: Float32, extent: np.ufunc, per_pixel: int) -> Float32:
+    """Return the least or the most of every pixel's sub-samples."""
+    across = functools.reduce(extent, [axes[..., k::per_pixel] for k in range(per_pixel)])
+    return np.asarray(functools.reduce(extent, [across[:, k::per_pixel] for k in range(per_pixel)]))
 
 
 def _bounding_box(cx: FloatArray, cy: FloatArray, surface: Surface, per_pixel: int) -> tuple[slice, slice] | None:
