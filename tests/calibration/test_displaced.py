@@ -13,7 +13,7 @@ from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
 from rigkit.calibration.result import Calibration, Rival
 from rigkit.calibration.series import Remainder
-from rigkit.calibration.uncertainty import FarProjection, projection_design
+from rigkit.calibration.uncertainty import FarProjection, _projected, projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
@@ -173,3 +173,27 @@ def test_a_rival_is_followed_without_a_turn_and_by_small_amounts() -> None:
     design = known.camera.project_with_jacobians(rays)[3]
     linear = np.einsum("nip,pq,niq->n", design, known.covariance, design)
     assert (shown**2).sum(axis=(0, 2)) == pytest.approx(linear, rel=0.2)
+
+
+def test_what_no_ray_reaches_has_no_pixel() -> None:
+    camera = lens("reg")
+    shown, design = _projected(camera, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]), np.inf)
+    assert np.isfinite(shown[0]).all() and np.isnan(shown[1]).all()
+    assert design.shape == (2, camera.parameters.size + 3, 2)
+
+
+def test_amounts_that_no_camera_has_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the penalties with which a rival is followed the softest ask for most; the others serve."""
+    views, _, _ = random_views(lens("reg"), 6, np.random.default_rng(5), reach_deg=24.0, noise_px=0.1)
+    found = calibrate(views, SIZE, model="brown", degree=4, board="flat", folds=0)
+    other = found.camera.with_parameters(found.camera.parameters * (1.0 + 1e-4))
+    calibration, asked = replace(found, rivals=(Rival("other", other, LIKELY),)), []
+
+    def refused(*given: object) -> DisplacedCamera:
+        asked.append(given)
+        if len(asked) == 1:
+            raise InputError("beyond")
+        return DisplacedCamera(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("rigkit.calibration.displaced.DisplacedCamera", refused)
+    assert np.isfinite(lens_modes(calibration).modes).all() and len(asked) > 1

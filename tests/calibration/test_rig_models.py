@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.verdicts import _worse
 
 LIKELY = 0.25
 FIRST_ORDER = 0.1
@@ -43,3 +47,15 @@ def test_a_rival_widens_the_baseline_by_its_own_difference(
     assert apart > 0.01
     assert alone.baseline_mm("reg", "wide")[1] == pytest.approx(np.sqrt(LIKELY) * apart, rel=FIRST_ORDER)
     assert not between_rig_models(joint, sigmas).any()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("alone", "together", "said"), [((0.1, 0.2), 0.3, True), ((0.1, 0.2), 0.16, False), ((0.1, None), 0.3, False)]
+)
+def test_frames_that_took_no_part_against_the_cameras_alone(
+    alone: tuple[float | None, ...], together: float, said: bool
+) -> None:
+    """What a camera alone comes to is not known where its images were too few to hold some out."""
+    single = [SimpleNamespace(heldout_rms_px=value) for value in alone]
+    rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=together)
+    assert bool(_worse(cast(RigCalibration, rig))) == said

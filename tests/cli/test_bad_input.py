@@ -235,9 +235,10 @@ def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
     hull = cv2.convexHull(lost.pixels.astype(np.float32)).astype(np.int32)
     cv2.imwrite(str(tmp_path / "two.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
     folder = write(image2="two.png")
-    code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "--no-pictures", "-j", "1"])
+    code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "-j", "1"])
     said = capsys.readouterr()
     assert code == 0
+    assert len(list((folder / "out").rglob("*.png"))) == 3
     assert "96 points, 2 boards" in said.out
     assert "seen in image 1 only" in said.err
 

@@ -67,11 +67,16 @@ def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: py
             "remedy": "fix it",
         }
         rig.write_text(json.dumps(data | {"verdicts": [said]}))
-        assert main([*asked, "--report", str(rig.with_suffix(".html")), "--force"]) == code
+        assert main(asked) == code
         words = capsys.readouterr().out.splitlines()
         called = "  The calibration was called bad: held-out RMS 0.1 px, but the focal length differs; fix it."
         assert (words[1] == called) == (severity == "bad")
-        assert ("not to be trusted" in rig.with_suffix(".html").read_text()) == (severity == "bad")
+        page = rig.with_suffix(".html")
+        drawn = ["--report", str(page)] if severity == "bad" else []
+        assert main([*asked, *drawn, "--json"]) == code
+        told = json.loads(capsys.readouterr().out)["page"]
+        assert ("not to be trusted" in json.dumps(told)) == (severity == "bad")
+    assert "not to be trusted" in page.read_text()
 
 
 @pytest.mark.parametrize("quantity", ["depth", "plane", "angle"])

@@ -6,6 +6,8 @@ import json
 import os
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -26,10 +28,13 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.board_words import board_of_words
 from rigkit.io.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.images import read_image
+from rigkit.report.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.check import CheckOptions, check_pictures
+from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.power import Power
+from rigkit.workflows.check import CheckOptions, _frames, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -173,3 +178,28 @@ def test_what_is_refused(command: list[str], words: str, home: Path, capsys: pyt
     names = {"cam": str(home / "cam.json"), "same": str(home / "same"), "home": str(home), "one": str(one)}
     assert main(["check", *(part.format(**names) for part in command)]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_folders_of_a_rig_are_its_cameras_by_their_names_or_in_its_order(tmp_path: Path) -> None:
+    rig = cast(Watched, SimpleNamespace(cameras=(CAMERA, CAMERA), names=("left", "right")))
+    folders = [tmp_path / name for name in ("right", "left", "day")]
+    for folder in folders:
+        folder.mkdir()
+        for k in range(2):
+            (folder / f"{k}.png").touch()
+    right, left, day = folders
+    by_name = [[left / f"{k}.png", right / f"{k}.png"] for k in range(2)]
+    assert _frames(rig, [right, left]) == by_name == _frames(rig, [path for pair in by_name for path in pair])
+    assert _frames(rig, [right, day]) == [[right / f"{k}.png", day / f"{k}.png"] for k in range(2)]
+    with pytest.raises(InputError, match="2 folders, got 3"):
+        _frames(rig, folders)
+    (left / "2.png").touch()
+    with pytest.raises(InputError, match=r"3 in '.*left'"):
+        _frames(rig, [left, right])
+
+
+def test_what_would_have_been_found_needs_no_more_pictures() -> None:
+    sure = Power(
+        kind="focal length", camera="left", size=0.1, unit="px", chance=0.97, found_from=0.08, frames=3, both=None
+    )
+    assert _could_have_found(sure).endswith("on).") and "pictures like these" not in _could_have_found(sure)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import camera_model
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.colmap_model import _names
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
 from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
 from rigkit.interop.opencv import read_opencv, write_opencv
@@ -123,3 +126,10 @@ REST = "'imagersize': [640, 480], 'intrinsics': [1, 2, 3, 4], 'extrinsics': [0, 
 def test_damaged_models_of_mrcal(text: str) -> None:
     with pytest.raises(InputError, match="cameramodel"):
         read_cameramodel(text)
+
+
+def test_names_for_colmap_are_two_and_have_no_blanks(tmp_path: Path) -> None:
+    names, notes = _names((tmp_path / "left" / "1.png", tmp_path / "right" / "1.png"))
+    assert names == ["left/1.png", "right/1.png"] and not notes
+    names, notes = _names((tmp_path / "my left" / "1.png", tmp_path / "right" / "1.png"))
+    assert names == ["my_left/1.png", "right/1.png"] and "'my left/1.png'" in notes[0]

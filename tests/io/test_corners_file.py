@@ -148,3 +148,14 @@ def test_kept_corners_of_a_calibration(tmp_path: Path) -> None:
         path.with_name("d.json").write_text(text.replace(old, new))
         with pytest.raises(InputError, match=r"d\.json"):
             read_corners(path.with_name("d.json"))
+
+
+def test_corners_of_an_earlier_detector_go_when_new_ones_come(tmp_path: Path) -> None:
+    """Both in one file would be taken for one detector's."""
+    cache = CornerCache(tmp_path / "corners.json", [Board("a", 4, 3, 30.0, 30.0)])
+    found = FoundCorners((640, 480), detections()["two.png"])
+    cache.put("old.png", "0" * 64, found)
+    cache.current = False
+    assert cache.images == ["old.png"] and cache.get("old.png", "0" * 64) is None
+    cache.put("new.png", "1" * 64, found)
+    assert cache.images == ["new.png"] and cache.current

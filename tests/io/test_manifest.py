@@ -209,3 +209,10 @@ def test_planes_are_of_all_pairs_or_of_one(tmp_path: Path) -> None:
     assert load_dataset(write(tmp_path, own)).pairs[0].planes == "lattice"
     with pytest.raises(InputError, match="free, coplanar, lattice"):
         load_dataset(write(tmp_path, whole.replace('"coplanar"', '"flat"')))
+
+
+def test_a_camera_is_found_by_its_name() -> None:
+    dataset = load_dataset(REPO / "datasets" / "lab-a")
+    assert dataset.camera("fisheye").camera_id == "fisheye"
+    with pytest.raises(InputError, match="regular"):
+        dataset.camera("wide")

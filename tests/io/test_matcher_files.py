@@ -132,3 +132,9 @@ def test_bare_points_get_their_affinities_from_the_images() -> None:
     flat = [np.full_like(image, 90) for image in images]
     with pytest.raises(DegenerateError, match="could be aligned"):
         with_affinities(Correspondences(known.pixels1, rough), *flat)
+
+
+def test_images_without_texture_align_nothing(rng: np.random.Generator) -> None:
+    flat, places = np.full((64, 64), 90, dtype=np.uint8), rng.uniform(20.0, 44.0, (8, 2))
+    with pytest.raises(DegenerateError, match="none of 8 matches could be aligned"):
+        with_affinities(Correspondences(places, places), flat, flat)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from rigkit.io.corner_cache import source_hash
+from rigkit.io.toml_reader import toml_text
 from rigkit.kernels import building
 
 
@@ -23,3 +25,8 @@ def test_an_editor_s_lock_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for name in ("module.py", "kernel.h"):
         (tmp_path / name).write_text("other content")
     assert source_hash.__wrapped__() != before[0] and building.source_hash(tmp_path) != before[1]
+
+
+def test_a_table_goes_into_a_line_of_toml() -> None:
+    said = {"a": 1, "words": ["x", "y"]}
+    assert tomllib.loads(f"one = {toml_text(said)}") == {"one": said}

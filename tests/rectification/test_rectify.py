@@ -20,7 +20,7 @@ from rigkit.rectification.panorama import (
     Equirectangular,
     Panorama,
 )
-from rigkit.rectification.rectify import rectify_map, rotation_from_view_angles
+from rigkit.rectification.rectify import _Sampler, rectify_map, rotation_from_view_angles
 
 FISHEYE = sample_cameras()["kannala_brandt"]
 PANORAMAS: dict[str, Panorama] = {
@@ -186,3 +186,15 @@ def test_antialias_averages_what_a_small_target_shows(rng: np.random.Generator) 
     remap = rectify_map(source, target)
     assert remap.image(noise).std() < 0.3
     assert remap.image(noise, antialias=False).std() > 0.6
+
+
+def test_an_image_by_its_spline_is_the_image_where_its_pixels_are(rng: np.random.Generator) -> None:
+    """And cubic between them: a parabola comes back from its samples, away from the border."""
+    image = rng.integers(0, 255, (9, 11)).astype(np.uint8)
+    v, u = np.mgrid[:9, :11].astype(np.float64)
+    here = np.stack([u.ravel(), v.ravel()], axis=-1)
+    assert np.allclose(_Sampler(image, "spline")(here), image.ravel(), atol=1e-9)
+    line = (10.0 + 3.0 * v - 2.0 * u).astype(np.float64)
+    between = np.array([[5.25, 4.5], [5.5, 3.75]])
+    # The border mirrors the picture, whose slope ends there: a tenth of it is left three pixels away.
+    assert np.allclose(_Sampler(line, "spline")(between), 10.0 + 3.0 * between[:, 1] - 2.0 * between[:, 0], atol=0.1)

@@ -18,6 +18,8 @@ from rigkit.core.findings import Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
+from rigkit.report.certificate_page import bound_figure
+from rigkit.report.figures import _drawn
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import OF_CORNERS, OF_LENSES, OF_MOUNTS, measured_points
@@ -217,3 +219,11 @@ def test_refusals(rng: np.random.Generator) -> None:
         Task(quantity=Quantity.LENGTH, size_mm=0.0, distance_mm=1000.0)
     with pytest.raises(InputError, match="two different cameras of left, right"):
         Instrument.of(known_rig("brown", rig_covariance(camera, rng)), ("left", "left"))
+
+
+def test_the_bound_is_drawn_with_and_without_places_where_it_is_a_lower_one(rng: np.random.Generator) -> None:
+    """There it is hatched: less of the picture is plain."""
+    rig = rig_of("brown", rig_covariance(lens("brown"), rng))
+    sure = certify(rig, Task(quantity=Quantity.LENGTH, size_mm=200.0, distance_mm=1500.0), cells=(9, 7))
+    drawn = [_drawn(bound_figure(replace(sure, coarse=np.full(sure.bound.shape, coarse)))) for coarse in (False, True)]
+    assert drawn[0].shape == drawn[1].shape and (drawn[0] != drawn[1]).mean() > 0.01

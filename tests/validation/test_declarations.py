@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from statistics import NormalDist
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +18,9 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredAngle, PairTruth
 from rigkit.geometry.rotation import exp_so3
 from rigkit.identification.board_ids import BOARD_SIDES
+from rigkit.reconstruction.geometry import PoseTypeDecision
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
+from rigkit.relative_pose.refinement.select import PoseTypeEvidence, TypeEvidence
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.validation.checks import validate, validate_each
 from rigkit.validation.declarations import contradicted_boards, declaration_checks
@@ -74,6 +79,26 @@ def test_a_type_whose_pose_sees_nothing_in_front_is_not_checked(rng: np.random.G
     checks, unchecked = declaration_checks(replace(found, geometry=geometry))
     assert not checks
     assert [words.split(":")[0] for words in unchecked] == ["pose type forward", "level"]
+
+
+def test_a_chance_is_told_as_that_many_standard_deviations() -> None:
+    """Half a level off, a chance of 0.3, holds; 40 degrees off, one in 10^30, fails by as many sigmas."""
+    level = np.deg2rad(0.2)
+    types = tuple(
+        TypeEvidence(pose_type=name, log_evidence=log, probability=0.5, deviation_rad=np.deg2rad(off), p_value=chance)
+        for name, log, off, chance in ((PoseType.PLANAR, 0.0, 0.1, 0.3173), (PoseType.STANDARD, -60.0, 40.0, 1e-30))
+    )
+    decision = PoseTypeDecision(PoseType.STANDARD, PoseType.STANDARD, level, PoseTypeEvidence(types, level), ())
+    found = SimpleNamespace(geometry=SimpleNamespace(decision=decision), cloud=range(144))
+    (standard, planar), unchecked = declaration_checks(cast(Reconstruction, found))
+    assert not unchecked and (standard.name, planar.name) == ("pose type standard", "level")
+    assert planar.passed and planar.ours == pytest.approx(0.1) and planar.count == 144
+    # One standard deviation has a chance of 0.3173 to be exceeded: that of the level itself, not less.
+    assert planar.k == pytest.approx(1.0, abs=1e-3) and planar.measured_sigma == pytest.approx(0.2)
+    assert not standard.passed and standard.ours == pytest.approx(40.0)
+    # Both tails of the normal distribution.
+    assert 2.0 * NormalDist().cdf(-standard.k) == pytest.approx(1e-30, rel=1e-6)
+    assert standard.combined_sigma == pytest.approx(40.0 / standard.k)
 
 
 def test_nothing_declared_is_nothing_to_check(rng: np.random.Generator) -> None:

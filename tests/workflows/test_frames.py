@@ -26,7 +26,7 @@ from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.folder_session import boards_seen
 from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.frames import frames_of_video, frames_of_videos
+from rigkit.workflows.frames import _FrameFolder, frames_of_video, frames_of_videos
 from rigkit.workflows.identify_board import identify_board
 
 BOARD = Board("b", 7, 5, 20.0, 20.0)
@@ -147,3 +147,13 @@ def test_the_board_of_a_video_is_identified(tmp_path: Path) -> None:
     assert boards_seen([path], 12.5) == (f"{BOARD.columns}x{BOARD.rows}x12.5",)
     with pytest.raises(InputError, match="how large are the squares in the video"):
         calibrate_folders([path], FolderOptions(), CalibrateOptions())
+
+
+def test_a_frame_that_is_not_kept_is_not_written(tmp_path: Path) -> None:
+    """A view that is there already, and is no sharper, leaves what is there."""
+    folder, place = _FrameFolder(tmp_path, FrameChoice(10)), {"": np.arange(8.0)}
+    for number, sigma_px in ((3, 0.05), (7, 0.2)):
+        folder.offer(KeptFrame(number, place, sigma_px), {"": np.full((4, 6), number, dtype=np.uint8)})
+    assert len(folder.finish()[""]) == 1
+    (written,) = tmp_path.iterdir()
+    assert (read_image(written) == 3).all()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
@@ -18,7 +20,9 @@ from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel
+from rigkit.validation.checks import ValidationReport
 from rigkit.workflows.pairs import find_boards
+from rigkit.workflows.validation_files import PairValidation
 
 CAMERA = KannalaBrandt((800, 600), np.array([400.0, 400.0, 405.0, 295.0, -0.02, 0.002, 0.0, 0.0]))
 BOARDS = tuple(Board(name, 11, 8, 30.0, 30.0) for name in ("plane1", "plane2", "plane3"))
@@ -66,3 +70,9 @@ def test_boards_behind_a_pole_are_found_as_the_camera_sees_them(tmp_path: Path) 
         off = np.linalg.norm(detection.pixels[:, None] - truth, axis=2).min(axis=1)
         assert off.max() < 6.0 * detection.sigma_px[off.argmax()]
         assert off.max() < 0.1
+
+
+def test_a_validated_pair_is_called_as_its_best_report() -> None:
+    best = cast(ValidationReport, SimpleNamespace(pair_id="left-right"))
+    done = PairValidation(reports=(best,), best=best, crosscheck=None, causes=(), files={}, section=None)
+    assert done.pair_id == "left-right"

@@ -89,3 +89,9 @@ def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
 def test_boards_that_are_as_declared_are_not_misread(folder: Path) -> None:
     assert misread(sorted(folder.glob("*.png")), [BOARD]) is None
     assert misread([folder / "0.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
+
+
+def test_images_that_show_nothing_are_not_misread(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((120, 160), 90, dtype=np.uint8))
+    assert misread([tmp_path / "grey.png"], [BOARD]) is None
+    assert misread([tmp_path / "grey.png"], [Board("plain", 7, 7, 30.0, 30.0)]) is None
