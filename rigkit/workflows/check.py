@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -114,7 +114,13 @@ def check_pictures(
         if not boards:
             raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
         with about(source):
-            views = _views(watched, source, frames, (boards, known), left_out, unreadable, progress)
+            seen = _boards_seen(watched, source, frames, boards, unreadable, progress)
+            wrong = other_size({name: found for own in seen for name, found in own.items()}, boards, known)
+            if wrong is not None:
+                raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
+            views = _views(watched, frames, seen, boards, left_out)
+            if not views:
+                raise InputError(f"check: {_nothing_to_check(left_out, unreadable)}")
             check = check_views(watched, views, cost)
             if not check.holds:
                 _require_right_order(check, views)
@@ -217,19 +223,15 @@ def _image_of(camera: Camera, source: Path, path: Path, unreadable: list[str]) -
         return None
 
 
-def _views(
+def _boards_seen(
     watched: Watched,
     source: Path,
     frames: Sequence[Sequence[Path]],
-    boards_known: tuple[Sequence[Board], Sequence[Board]],
-    left_out: list[tuple[str, str]],
+    boards: Sequence[Board],
     unreadable: list[str],
     progress: Progress,
-) -> list[FreshView]:
-    """Return the boards in all images, those listed, beside those that the calibration knows; what has none goes to
-    `left_out`, what cannot be used to `unreadable`."""
-    out: list[FreshView] = []
-    boards, known = boards_known
+) -> list[dict[str, Sequence[BoardDetection]]]:
+    """Return of every camera what each of its images shows; why one cannot be used goes to `unreadable`."""
     total = sum(len(frame) for frame in frames)
     seen: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in watched.cameras]
     for k, frame in enumerate(frames):
@@ -239,9 +241,18 @@ def _views(
             if image is not None:
                 seen[c][str(path)] = detect_boards(image, boards, camera=watched.cameras[c])
     progress("corners", total, total)
-    wrong = other_size({name: found for own in seen for name, found in own.items()}, boards, known)
-    if wrong is not None:
-        raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
+    return seen
+
+
+def _views(
+    watched: Watched,
+    frames: Sequence[Sequence[Path]],
+    seen: Sequence[Mapping[str, Sequence[BoardDetection]]],
+    boards: Sequence[Board],
+    left_out: list[tuple[str, str]],
+) -> list[FreshView]:
+    """Return the boards in all images; one without any goes to `left_out`, with the reason."""
+    out: list[FreshView] = []
     own = [without_lookalikes(found, boards) for found in seen]
     whose = watched.names if len(watched.names) > 1 else (None,)
     for k, frame in enumerate(frames):
@@ -253,14 +264,16 @@ def _views(
             out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
-    if not out:
-        if not left_out:
-            raise InputError(f"check: {unreadable[0]}")
-        where = "the image" if total == 1 else f"any of {total} images"
-        raise InputError(
-            f"check: no board was found in {where}: {left_out[0][1]}; take sharp pictures of the whole board"
-        )
     return out
+
+
+def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[str]) -> str:
+    """Return in words why no image shows a board."""
+    if not left_out:
+        return unreadable[0]
+    total = len(left_out) + len(unreadable)
+    where = "the image" if total == 1 else f"any of {total} images"
+    return f"no board was found in {where}: {left_out[0][1]}; take sharp pictures of the whole board"
 
 
 def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:
