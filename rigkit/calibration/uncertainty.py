@@ -389,10 +389,8 @@ def _spread(corners: CalibrationCorners) -> IntArray:
     return chosen[np.linspace(0, len(chosen) - 1, min(CORNERS, len(chosen))).astype(np.int64)]
 
 
-def uncertainty_map(
-    calibration: Calibration, *, grid: tuple[int, int] = (40, 30), range_mm: float = np.inf
-) -> Uncertainty:
-    """Return the uncertainty over the image at `grid` (columns, rows) pixels, as arrays (rows, columns, ...)."""
+def uncertainty_map(calibration: Calibration, *, grid: tuple[int, int] = (40, 30)) -> Uncertainty:
+    """Return how sure far points are at `grid` (columns, rows) pixels of the image, as arrays (rows, columns, ...)."""
     width, height = calibration.camera.size_px
     u, v = np.meshgrid(np.linspace(0.0, width - 1.0, grid[0]), np.linspace(0.0, height - 1.0, grid[1]))
-    return projection_uncertainty(calibration, np.stack([u, v], axis=-1), range_mm=range_mm)
+    return projection_uncertainty(calibration, np.stack([u, v], axis=-1))

@@ -9,16 +9,15 @@ import numpy as np
 
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.rig_file import is_rig_file
 from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.camera_files import called_bad
-from rigkit.workflows.check import as_watched
+from rigkit.workflows.check import load_watched
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
@@ -84,12 +83,10 @@ def load_instrument(
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
-    if not is_rig_file(path):
-        if cameras is not None:
-            raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
-        known = as_watched(load_calibration(path), Path(path))
-    else:
-        known = as_watched(load_saved_rig(path), Path(path))
-        if len(known.names) < 2:
-            raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
+    rig = is_rig_file(path)
+    if cameras is not None and not rig:
+        raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
+    known, _ = load_watched(Path(path))
+    if rig and len(known.names) < 2:
+        raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
     return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)

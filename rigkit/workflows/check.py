@@ -13,7 +13,6 @@ import numpy as np
 
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
@@ -153,21 +152,17 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
-    known = load_saved_rig(source) if is_rig_file(source) else load_calibration(source)
-    if isinstance(known, SavedRig):
-        return as_watched(known, source), without_parts(known.boards)
-    with about(source):
-        boards = without_parts(shape.board for shape in known.boards)
-    return as_watched(known, source), boards
+    if not is_rig_file(source):
+        known = load_calibration(source)
+        with about(source):
+            boards = without_parts(shape.board for shape in known.boards)
+        return watched_camera(known, source.stem), boards
+    rig = load_saved_rig(source)
+    return _watched_rig(rig, source), without_parts(rig.boards)
 
 
-def as_watched(known: Calibration | SavedRig, source: Path) -> Watched:
-    """Return what the file `source` of a calibration or a rig says of cameras and mounts.
-
-    Raises InputError for a rig's that does not say how sure it is.
-    """
-    if isinstance(known, Calibration):
-        return watched_camera(known, source.stem)
+def _watched_rig(known: SavedRig, source: Path) -> Watched:
+    """Return what a rig's file says; raises InputError for one that does not say how sure it is."""
     lenses, covariance, sigma_px = known.stated(source)
     return Watched(
         names=tuple(known.cameras),

@@ -81,7 +81,7 @@ class RigDifference:
         return None if self.chance is None else self.chance >= SAME_CHANCE
 
 
-def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
+def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
     """Compare the mounts of two rigs after the rotations of their lenses; of one camera alone nothing can differ.
 
     Raises InputError where the rigs have other cameras, or cameras of other image sizes; DegenerateError where two
@@ -109,7 +109,7 @@ def compare_mounts(a: Mounted, b: Mounted, *, seed: int = 0) -> RigDifference:
     known = None
     if a.covariance is not None and b.covariance is not None:
         parts = _moved(a, a.covariance, weights), _moved(b, b.covariance, weights)
-        known = _known(parts, (a.freedom, b.freedom), seed)
+        known = _known(parts, (a.freedom, b.freedom))
     found = _difference(list(a.cameras)[1:], off(1.0), known)
     return replace(found, scale=_scale(off, known)) if known is not None and found.same is False else found
 
@@ -145,7 +145,7 @@ Known = tuple[FloatArray, FloatArray]
 """Covariance (n, n) of what may differ, and errors (n, N) drawn from what both parts of it say."""
 
 
-def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int) -> Known:
+def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int = 0) -> Known:
     rng = np.random.default_rng(seed)
     first, second = (drawn_errors(part, degrees, rng) for part, degrees in zip(parts, freedom, strict=True))
     return parts[0] + parts[1], first - second
