@@ -101,3 +101,11 @@ def test_a_step_leads_from_one_motion_to_another(rng: np.random.Generator) -> No
     one, other = random_motion(rng), random_motion(rng)
     assert one.moved(other.step_from(one)).allclose(other, translation_tol_mm=1e-12)
     assert not one.moved(one.step_from(other)).allclose(other)
+
+
+def test_a_matrix_that_was_rounded_is_made_a_rotation_again(rng: np.random.Generator) -> None:
+    motion = random_motion(rng)
+    matrix = np.round(motion.matrix(), 5)
+    found = Rigid3.from_matrix(matrix)
+    assert np.abs(found.rotation.T @ found.rotation - np.eye(3)).max() < ROUNDING
+    assert np.abs(found.rotation - motion.rotation).max() < 1e-5

@@ -14,12 +14,14 @@ from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.progress import silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_both_ways
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
+from rigkit.workflows.reconstruct_scene import _grown
 
 SIZE = (480, 360)
 LENSES = {
@@ -156,3 +158,14 @@ def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
     assert in_sigmas[True][0] < 2.0 < in_sigmas[False][0]
     assert 0.2 < in_sigmas[True][1] < 2.0
     assert in_sigmas[False][1] > 2.0 * in_sigmas[True][1]
+
+
+def test_where_nothing_grows_the_sparse_cloud_stays_and_says_why() -> None:
+    _, images, seeds = matched_corner("pinhole")
+    camera = LENSES["pinhole"]
+    sparse = reconstruct_scene(seeds, camera, camera, baseline_mm=BASELINE_MM, image1=images[0])
+    flat = [np.full(images[0].shape[:2], 90, dtype=np.uint8)] * 2
+    scene, left, maps = _grown(sparse, seeds, (flat[0], flat[1]), silent, pose_is_known=False, of=None)
+    assert left is seeds and not maps
+    assert scene.reconstruction.cloud is sparse.reconstruction.cloud
+    assert "no dense cloud: only 0 pairs grow" in scene.reconstruction.notes[-1]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -19,8 +21,8 @@ from rigkit.core.matches import DirectionPairs
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
-from rigkit.reconstruction.scene import reconstruct_scene
-from rigkit.reconstruction.scene_pose import KnownPose
+from rigkit.reconstruction.scene import _notes, reconstruct_scene
+from rigkit.reconstruction.scene_pose import KnownPose, ScenePose
 from rigkit.relative_pose.refinement.refine import refine_pose
 
 NOISE_PX, NOISE_A = 0.5, 0.05
@@ -220,3 +222,11 @@ def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_kno
     for observed, stated in (np.sum(moves, axis=0), np.sum(tilts, axis=0)):
         # Twenty draws of four parameters know a standard deviation to a quarter.
         assert 0.6 < np.sqrt(observed / stated) < 1.6
+
+
+@pytest.mark.parametrize(("agree", "said"), [(29, True), (31, False)])
+def test_a_pose_that_few_correspondences_agree_with_is_doubted(agree: int, said: bool) -> None:
+    fit = cast(ScenePose, SimpleNamespace(notes=("first",), inliers=np.arange(100) < agree))
+    notes = _notes(fit, np.ones(100, dtype=bool), 100.0)
+    assert notes[0] == "first"
+    assert any(f"only {agree} of 100 correspondences agree" in note for note in notes) == said
