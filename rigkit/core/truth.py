@@ -109,13 +109,22 @@ class MeasuredDistance:
 
 @dataclass(frozen=True, slots=True)
 class PairTruth:
-    """Everything that a person measured of one pair; empty where nobody did."""
+    """Everything that a person measured of one pair, each once; empty where nobody did."""
 
     baseline: MeasuredLength | None = None
     angles: tuple[MeasuredAngle, ...] = ()
     distances: tuple[MeasuredDistance, ...] = ()
 
     __repr__ = brief
+
+    def __post_init__(self) -> None:
+        # Of a copied row one measurement would count as two facts that hold.
+        known: set[object] = set()
+        for one in (*self.angles, *self.distances):
+            ends = frozenset((str(one.a), str(one.b)))
+            if (type(one), ends) in known:
+                raise InputError(f"{one.name} is stated twice; keep one")
+            known.add((type(one), ends))
 
     @property
     def count(self) -> int:
@@ -129,4 +138,9 @@ def _check(what: str, value: float, sigma: float, unit: str) -> None:
     if not (np.isfinite(sigma) and sigma > 0.0):
         raise InputError(
             f"{what}: sigma must be positive, got {sigma} {unit}; say how far off the measurement may well be"
+        )
+    if sigma >= value:
+        # Any result would agree with it: a check that cannot fail. Angles across faces are never near 0.
+        raise InputError(
+            f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement; were both exchanged?"
         )

@@ -158,14 +158,31 @@ def images_of_folder(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS and is_file_or_lost_link(p))
 
 
+def no_images(folder: Path) -> str:
+    """Return that a folder has no images, and what it holds instead: pictures that are not read, folders that have some."""
+    words = f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)})"
+    unread = _unread(folder)
+    if unread:
+        return f"{words}, but pictures of formats that are not read, '{unread[0]}' the first; convert them to PNG or JPEG"
+    inside = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
+    if not inside:
+        return f"{words}; give another"
+    others = len({path.parent for path in inside}) - 1
+    those = f"'{inside[0].parent}' has some" if others == 0 else f"'{inside[0].parent}' and {others} more below it have"
+    return f"{words}, but {those}; give one folder a camera, or a session: images = \"{folder}/**/*{inside[0].suffix}\""
+
+
 def name_unread(folder: Path) -> None:
     """Say which files of a folder are pictures that are not read: of a raw picture beside its JPEG nothing is lost."""
     read = {path.stem for path in images_of_folder(folder)}
-    others = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNREAD_ENDINGS)
-    lost = [name for name in others if Path(name).stem not in read]
+    lost = [name for name in _unread(folder) if Path(name).stem not in read]
     if lost:
         count = f"{len(lost)} pictures, '{lost[0]}' the first, are" if len(lost) > 1 else f"picture '{lost[0]}' is"
         _log.warning("'%s': %s of a format that is not read, and left out: convert to PNG or JPEG", folder, count)
+
+
+def _unread(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.suffix.lower() in UNREAD_ENDINGS)
 
 
 def to_grey(image: Image) -> Image:

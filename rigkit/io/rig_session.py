@@ -185,6 +185,7 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
             words = ", ".join(f"{n} of '{name}'" for name, n in counts.items())
             raise InputError(f'frames = "order" needs as many images of every camera, there are {words}')
         return {name: {image: f"{k:04d}" for k, image in enumerate(own)} for name, own in images.items()}
+    alike = None
     for key in (how,) if how else ("name", "number"):
         frames = {name: {image: FRAME_KEYS[key](image) for image in own} for name, own in images.items()}
         twice = _twice(frames)
@@ -193,6 +194,12 @@ def frames_of_images(images: Mapping[str, Sequence[str]], how: str | None = None
             return frames
         if how and twice is not None:
             raise InputError(f'frames = "{how}": {twice} are of one frame; rename them, or use frames = "order"')
+        alike = alike or twice
+    if alike is not None:
+        raise InputError(
+            f"{alike} would be of one moment by their names, so that nothing says what was taken at the same moment; "
+            'rename the images, or write frames = "order" if the sorted lists belong together one by one'
+        )
     raise InputError(
         "no two cameras have an image of the same name or number, so nothing says what was taken at the same moment; "
         'rename the images, or write frames = "order" if the sorted lists belong together one by one'

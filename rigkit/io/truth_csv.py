@@ -8,7 +8,7 @@
     first,distance,plane1.centre,plane2,412.5,1,,,steel rule
 
 Lengths may be in mm, cm or m and angles in deg, but value and sigma must be in one unit. Columns may be separated by
-commas or semicolons; numbers have a decimal point.
+commas, semicolons or tabs; numbers have a decimal point.
 """
 
 from __future__ import annotations
@@ -71,13 +71,22 @@ def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> d
         except InputError as error:
             raise InputError(f"{source}: line {line}: {error}") from error
     named = dict.fromkeys([*baselines, *angles, *distances])
-    return {p: PairTruth(baselines.get(p), tuple(angles.get(p, ())), tuple(distances.get(p, ()))) for p in named}
+    truths = {}
+    for name in named:
+        try:
+            truths[name] = PairTruth(
+                baselines.get(name), tuple(angles.get(name, ())), tuple(distances.get(name, ()))
+            )
+        except InputError as error:
+            raise InputError(f"{source}: pair '{name}': {error}") from error
+    return truths
 
 
 def _read(source: Path) -> tuple[list[str], list[tuple[int, Row]]]:
     """Return the head and the rows that are not empty, each with its line."""
-    first = read_text(source, "truth table").partition("\n")[0]
-    delimiter = ";" if first.count(";") > first.count(",") else ","
+    text = read_text(source, "truth table")
+    first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    delimiter = max(",;\t", key=first.count)
     head, rows = csv_table(source, "truth table", delimiter=delimiter)
     if not rows:
         raise InputError(f"{source}: no measurements; start with the head {EXAMPLE} and add a row each")

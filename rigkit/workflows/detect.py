@@ -26,7 +26,7 @@ from rigkit.detection.twins import alike_boards
 from rigkit.io.board_words import board_of_words
 from rigkit.io.corners_file import write_corners
 from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import IMAGE_ENDINGS, Image, images_of_folder, name_unread, read_image, read_image_of
+from rigkit.io.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
 from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.camera_files import import_camera
@@ -160,7 +160,7 @@ def images_in(paths: Sequence[Path]) -> Iterator[Path]:
         if path.is_dir():
             inside = images_of_folder(path)
             if not inside:
-                raise InputError(f"folder '{path}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
+                raise InputError(no_images(path))
             name_unread(path)
         elif not path.exists():
             raise InputError(f"image '{path}' does not exist; check the path")

@@ -14,7 +14,7 @@ from rigkit.core.identifiers import check_identifier, natural_key
 from rigkit.core.progress import Progress, silent
 from rigkit.io.board_file import board_text
 from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
-from rigkit.io.images import IMAGE_ENDINGS, images_of_folder, name_unread
+from rigkit.io.images import images_of_folder, name_unread, no_images
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
@@ -211,10 +211,7 @@ def cameras_in(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
         return _by_names(folder, images)
     inside = [p for p in folder.iterdir() if p.is_dir() and SIDE_FOLDER.fullmatch(p.name) and _images(p)]
     if len(inside) < 2:
-        raise InputError(
-            f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}), nor folders left and right with "
-            "some; give the folder of a camera's images, or one folder a camera"
-        )
+        raise InputError(no_images(folder))
     return _one_each(sorted(inside, key=lambda p: natural_key(p.name)))
 
 
@@ -232,7 +229,7 @@ def _one_each(folders: Sequence[Path]) -> dict[str, list[tuple[Path, str]]]:
             raise InputError(f"two folders are called '{name}', which names a camera; rename one")
         images = _images(folder)
         if not images:
-            raise InputError(f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)}); give another")
+            raise InputError(no_images(folder))
         out[name] = [(folder, f"*{suffix}") for suffix in _suffixes(images)]
     return out
 

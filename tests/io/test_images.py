@@ -10,7 +10,7 @@ import PIL.Image
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import quiet_opencv, read_image, to_grey
+from rigkit.io.images import no_images, quiet_opencv, read_image, to_grey
 from rigkit.workflows.detect import images_in
 
 
@@ -199,3 +199,15 @@ def test_pictures_of_a_format_that_is_not_read_are_named(tmp_path: Path, caplog:
         (tmp_path / name).write_bytes(b"")
     assert list(images_in([tmp_path])) == [tmp_path / "1.jpg"]
     assert "2 pictures, '2.heic' the first, are of a format that is not read" in caplog.text
+
+
+def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> None:
+    assert no_images(tmp_path).endswith("; give another")
+    for day in ("monday", "tuesday"):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "a.PNG").touch()
+    words = no_images(tmp_path)
+    assert f"but '{tmp_path / 'monday'}' and 1 more below it have" in words
+    assert f'images = "{tmp_path}/**/*.PNG"' in words
+    (tmp_path / "a.jp2").touch()
+    assert "formats that are not read, 'a.jp2' the first" in no_images(tmp_path)

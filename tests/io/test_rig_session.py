@@ -100,6 +100,11 @@ def test_frames() -> None:
     assert by_order["l"]["y"] == by_order["r"]["q"] != by_order["r"]["p"]
 
 
+def test_images_of_one_name_in_many_folders_are_named() -> None:
+    with pytest.raises(InputError, match=r"'mon/a/img.jpg' and 'tue/a/img.jpg' of camera 'a' would be of one moment"):
+        frames_of_images({"a": ["mon/a/img.jpg", "tue/a/img.jpg"], "b": ["mon/b/img.jpg", "tue/b/img.jpg"]})
+
+
 def test_frames_that_nothing_tells() -> None:
     with pytest.raises(InputError, match='frames = "order"'):
         frames_of_images({"l": ["a.jpg", "b.jpg"], "r": ["c.jpg", "d.jpg"]})

@@ -39,6 +39,10 @@ def test_every_kind_of_row(tmp_path: Path) -> None:
 def test_as_spreadsheets_save_it(tmp_path: Path) -> None:
     plain = load(tmp_path)
     excel = "\ufeff" + TEXT.replace('"steel rule, 1 m"', "steel rule; 1 m").replace(";", "").replace(",", ";")
+    commented = "# rule, tape, set square, level\r\n" + excel.removeprefix("\ufeff").replace("\n", "\r\n")
+    tabbed = TEXT.replace('"steel rule, 1 m"', "steel rule").replace(",", "\t")
+    for text in (commented, tabbed):
+        assert load(tmp_path, text)["second"] == plain["second"]
     found = load(tmp_path, excel.replace("\n", "\r\n"))
     assert found["first"].baseline.value_mm == plain["first"].baseline.value_mm
     assert found["second"] == plain["second"]
@@ -64,6 +68,9 @@ WRONG = [
     (",300,2,", ",300,,", "line 2: .*'sigma .mm.' is empty"),
     (",300,2,", ",300,0,", "must be positive"),
     (",300,2,", ",nan,2,", "nan"),
+    (",300,2,", ",2,300,", "line 2: .*were both exchanged"),
+    (",90,0.3,", ",0.3,90,", "line 3: .*were both exchanged"),
+    ("set square\n", "set square\nfirst,angle,plane2,plane1,,,90,1,eye\n", "'first': angle plane2-plane1 is stated twice"),
     (",,90,0.3,", ",90,90,0.3,", "leave it empty"),
     ("set square", "", "line 3: 'how' is empty"),
     ("first,angle", "third,angle", "pair 'third' is not in the manifest; known: first, second"),
