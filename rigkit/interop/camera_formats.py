@@ -20,6 +20,7 @@ from rigkit.interop.kalibr import read_kalibr, write_kalibr
 from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
 from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib, write_ocamcalib
 from rigkit.interop.opencv import read_opencv, write_opencv
+from rigkit.interop.opencv_storage import STORAGE
 from rigkit.interop.ros import read_camera_info, write_camera_info
 
 SizePx = tuple[int, int]
@@ -83,7 +84,7 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
         lambda c, outline: write_kalibr([c], outlines=[outline]).cameras[0],
     ),
     "opencv": CameraFormat(
-        re.compile(r"!!opencv-matrix|<opencv_storage>|\A%YAML"),
+        STORAGE,
         lambda text, name, _: read_opencv(text, name),
         write_opencv,
     ),

@@ -1,7 +1,8 @@
-"""COLMAP's cameras.txt, without COLMAP. Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that."""
+"""COLMAP's cameras.txt and cameras.bin, without COLMAP. Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -32,6 +33,15 @@ LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "OPENCV_FISHEYE": ("kannala_brandt", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
     "EUCM": ("eucm", ("fx", "fy", "cx", "cy", "alpha", "beta")),
 }
+
+COUNT, HEAD = struct.Struct("<Q"), struct.Struct("<iiQQ")
+MODEL_IDS = (
+    ("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8), ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12), ("FOV", 5), ("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5), ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16), ("SIMPLE_DIVISION", 4), ("DIVISION", 5), ("SIMPLE_FISHEYE", 3), ("FISHEYE", 4),
+    ("EUCM", 6),
+)  # fmt: skip
+"""COLMAP's models by number, and how many numbers each has (src/colmap/sensor/models.h)."""
 
 
 def write_colmap_cameras(
@@ -90,6 +100,31 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
     if not cameras:
         raise InputError(f"'{name}': no camera in it; is it COLMAP's cameras.txt?")
     return cameras
+
+
+def colmap_cameras_text(data: bytes) -> str | None:
+    """Return the cameras.txt of a cameras.bin; None for bytes that are none.
+
+    It has a count, then of each camera id and model (int32), width and height (uint64) and the model's numbers, all
+    little-endian; so much is wrong of any text that no text is taken for one.
+    """
+    lines, at = [], COUNT.size
+    if len(data) < at or not 0 < COUNT.unpack_from(data)[0] <= len(data) // HEAD.size:
+        return None
+    for _ in range(COUNT.unpack_from(data)[0]):
+        if len(data) < at + HEAD.size:
+            return None
+        camera_id, model, width, height = HEAD.unpack_from(data, at)
+        at += HEAD.size
+        if not 0 <= model < len(MODEL_IDS):
+            return None
+        name, count = MODEL_IDS[model]
+        if len(data) < at + 8 * count:
+            return None
+        values = struct.unpack_from(f"<{count}d", data, at)
+        at += 8 * count
+        lines.append(f"{camera_id} {name} {width} {height} {' '.join(map(repr, values))}\n")
+    return "".join(lines) if at == len(data) else None
 
 
 def _whole(word: str) -> int:

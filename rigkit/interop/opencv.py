@@ -1,4 +1,4 @@
-"""OpenCV's calibration YAML: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir).
+"""OpenCV's calibration files: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir).
 
 The keys are those that OpenCV's own calibration samples write. Pixels as ours.
 """
@@ -26,7 +26,7 @@ from rigkit.interop.exchange import (
     unified_with_xi,
     written_size,
 )
-from rigkit.interop.yaml_text import parse_yaml
+from rigkit.interop.opencv_storage import parse_storage
 
 OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
 
@@ -50,12 +50,12 @@ def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
 
 
 def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
-    """Return the camera of OpenCV's YAML; `name` is how errors call the file.
+    """Return the camera of OpenCV's YAML, XML or JSON; `name` is how errors call the file.
 
     Raises InputError for a file without the keys, or terms that no model here has (thin prism, tilt, skew, distortion
     on top of omnidir's sphere).
     """
-    data = parse_yaml(text, name)
+    data = parse_storage(text, name)
     size = written_size(data, name)
     K = read_opencv_matrix(data, "camera_matrix", name)
     key = next((k for k in ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D") if k in data), None)
@@ -110,6 +110,9 @@ def _core(K: FloatArray, name: str) -> FloatArray:
     """Return fx, fy, cx, cy."""
     if K.size != 9 or K[1] != 0.0:
         raise InputError(f"'{name}': camera_matrix must be 3x3 without skew, which no model has; calibrate without it")
+    if K[3] != 0.0 or K[6:].tolist() != [0.0, 0.0, 1.0]:
+        # Of MATLAB's older matrices, for row vectors, the principal point would be read as (0, 0).
+        raise InputError(f"'{name}': camera_matrix must be fx 0 cx, 0 fy cy, 0 0 1, row by row; transpose it")
     return K[[0, 4, 2, 5]]
 
 

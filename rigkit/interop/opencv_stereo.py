@@ -20,7 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import skew
 from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, written_size
 from rigkit.interop.opencv import camera_from_arrays, opencv_arrays, opencv_matrix, read_opencv_matrix
-from rigkit.interop.yaml_text import parse_yaml
+from rigkit.interop.opencv_storage import parse_storage
 
 FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
 """The models that one call of OpenCV takes together: of calib3d, and of fisheye."""
@@ -76,7 +76,7 @@ def opencv_stereo(
 
 def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Camera, Camera], Rigid3]:
     """Return both cameras and cam2_from_cam1 (mm) of a pair's file; raises InputError for one without the keys."""
-    data = parse_yaml(text, name)
+    data = parse_storage(text, name)
     size = written_size(data, name)
     found = {key: read_opencv_matrix(data, key, name) for key in KEYS}
     for key, count in (("R", 9), ("T", 3)):

@@ -6,7 +6,9 @@ matrix the camera matrix.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -63,8 +65,11 @@ def write_camera_info(
 
 
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:
-    """Return the camera of a camera_info file; raises InputError for other distortion models and damaged files."""
-    data = parse_yaml(text, name)
+    """Return the camera of a camera_info file, or of a message as `ros2 topic echo` and `rostopic echo` print it.
+
+    Raises InputError for other distortion models and damaged files.
+    """
+    data = _as_stored(parse_yaml(_first_message(text), name), name)
     size = written_size(data, name)
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
     distortion = numbers(field(field(data, "distortion_coefficients", name), "data", name), name, "distortion")
@@ -76,6 +81,27 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
         raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}; is the file whole?")
     distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
     return camera_from_arrays(size, K, distortion, fisheye=model == "equidistant", name=name)
+
+
+def _first_message(text: str) -> str:
+    """Return the text up to the line that ends a message; more of one camera's say the same."""
+    return next((part for part in re.split(r"^---\s*$", text, flags=re.MULTILINE) if part.strip()), text)
+
+
+def _as_stored(data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a message's K and D (of ROS 2 k and d), width and height under the names that files have for them."""
+    if "camera_matrix" in data:
+        return data
+    K, D = (next((data[key] for key in (big, big.lower()) if key in data), None) for big in "KD")
+    if K is None or D is None:
+        return data
+    return {
+        **data,
+        "image_width": field(data, "width", name),
+        "image_height": field(data, "height", name),
+        "camera_matrix": {"data": K},
+        "distortion_coefficients": {"data": D},
+    }
 
 
 def _matrix(array: FloatArray) -> str:

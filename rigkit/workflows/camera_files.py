@@ -13,19 +13,21 @@ from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.interop.colmap_cameras import colmap_cameras_text
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.io.calibration_file import load_calibration_or_camera
-from rigkit.io.reading import read_text
+from rigkit.io.reading import read_bytes, read_text
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
 from rigkit.workflows.formats import READ_FORMATS
 
 _log = logging.getLogger(__name__)
 
 OURS = re.compile(r'\A\s*\{\s*["}]')
-"""How our files begin, and py-OCamCalib's."""
-STEREO = re.compile(r"^M1\s*:", re.MULTILINE)
+"""How our files begin, and those of other programs that write JSON."""
+JSON_TOO = ("mrcal", "py-ocamcalib", "opencv")
+STEREO = re.compile(r'^\s*["<]?M1\b', re.MULTILINE)
 """What OpenCV's files of pairs have."""
 
 
@@ -37,7 +39,7 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
     """
     source = Path(path)
-    text, name = read_text(source, "camera file"), str(source)
+    text, name = camera_text(source), str(source)
     kind = kind or camera_format(text)
     if kind is None:
         raise InputError(f"'{name}': none of the known camera formats ({', '.join(READ_FORMATS)}); check the file")
@@ -52,15 +54,21 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     return FOREIGN_FORMATS[kind].read(text, name, size_px)
 
 
+def camera_text(path: str | Path) -> str:
+    """Return the text of a camera file, of COLMAP's binary one that of the same cameras; raises as `read_text`."""
+    data = read_bytes(path, "camera file")
+    return colmap_cameras_text(data) or read_text(path, "camera file")
+
+
 def camera_format(text: str) -> str | None:
     """Return the format of a camera file's content, one of `READ_FORMATS`; None where none of them looks so."""
     found = next((kind for kind, known in FOREIGN_FORMATS.items() if known.sign.search(text)), None)
-    return "rigkit" if OURS.search(text) and found not in ("mrcal", "py-ocamcalib") else found
+    return "rigkit" if OURS.search(text) and found not in JSON_TOO else found
 
 
 def own_calibration(path: str | Path) -> Calibration | None:
     """Return a calibration of rigkit's, None for another file; raises InputError for one that cannot be read."""
-    if camera_format(read_text(path, "camera file")) != "rigkit":
+    if camera_format(camera_text(path)) != "rigkit":
         return None
     known = load_calibration_or_camera(path)
     return known if isinstance(known, Calibration) else None

@@ -17,10 +17,11 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
-from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
+from rigkit.interop.colmap_cameras import MODEL_IDS, read_colmap_cameras, write_colmap_cameras
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
+from rigkit.workflows.camera_files import camera_format, import_camera, import_rig, is_rig
 from rigkit.workflows.formats import FOREIGN_ENDINGS, READ_FORMATS
 
 CAMERAS = sample_cameras()
@@ -107,23 +108,75 @@ def test_opencv_reads_what_we_write(label: str, tmp_path: Path, rng: np.random.G
     assert np.abs(theirs - camera.project(points)[0]).max() < SAME_PX
 
 
-def test_we_read_what_opencv_writes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", ["yml", "xml", "json"])
+@pytest.mark.parametrize("keys", [("image_width", "camera_matrix"), ("image_Width", "Camera_Matrix")])
+def test_we_read_what_opencv_writes(ending: str, keys: tuple[str, str], tmp_path: Path) -> None:
+    """Every form that cv2.FileStorage has, and the names that OpenCV's sample wrote until version 4."""
     camera = CAMERAS["brown"]
     p = camera.parameters
-    path = tmp_path / "camera.yml"
+    path = tmp_path / f"camera.{ending}"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write("calibration_time", "Sat Nov 21 2026")
-    storage.write("image_width", 1280)
-    storage.write("image_height", 960)
+    storage.write(keys[0], 1280)
+    storage.write(keys[0].replace("Width", "Height").replace("width", "height"), 960)
     storage.write("flags", 0)
     storage.write("fisheye_model", 0)
-    storage.write("camera_matrix", np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]]))
-    storage.write("distortion_coefficients", p[4:].reshape(5, 1))
+    storage.write(keys[1], np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]]))
+    old = keys[1][0] == "C"
+    storage.write("Distortion_Coefficients" if old else "distortion_coefficients", p[4:].reshape(5, 1))
     storage.write("avg_reprojection_error", 0.2)
+    storage.startWriteStruct("images", cv2.FileNode_SEQ)
+    storage.write("", "left 1.jpg")
+    storage.write("", "left 2.jpg")
+    storage.endWriteStruct()
+    storage.write("image_points", np.zeros((2, 54, 2), np.float32))
     storage.release()
-    again = read_opencv(path.read_text())
+    assert camera_format(path.read_text()) == "opencv"
+    again = import_camera(path)
     assert again.model == "brown"
     assert np.allclose(again.parameters, p, rtol=1e-14)
+
+
+@pytest.mark.parametrize("ending", ["yml", "xml", "json"])
+def test_a_pair_in_every_form_of_opencv_is_a_rig(ending: str, tmp_path: Path) -> None:
+    path = tmp_path / f"stereo.{ending}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    K = np.array([[500.0, 0.0, 320.0], [0.0, 501.0, 240.0], [0.0, 0.0, 1.0]])
+    storage.write("image_width", 640)
+    storage.write("image_height", 480)
+    for key, value in {"M1": K, "D1": np.zeros((1, 5)), "M2": K, "D2": np.zeros((1, 5)), "R": np.eye(3)}.items():
+        storage.write(key, value)
+    storage.write("T", np.array([[-120.0], [0.0], [0.0]]))
+    storage.release()
+    assert is_rig(path)
+    assert import_rig(path)["right"][1].translation_mm.tolist() == [-120.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<?xml version='1.0'?>\n<opencv_storage><camera_matrix>", "not readable as XML"),
+        ("<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage><a>&a;</a></opencv_storage>", "entities"),
+        ("<other><opencv_storage/></other>", "none of OpenCV's"),
+        ("<opencv_storage><a>1</a><a>2</a></opencv_storage>", "'a' is given twice"),
+        (f"<opencv_storage>{'<a>' * 30}{'</a>' * 30}</opencv_storage>", "nested more"),
+        ("<opencv_storage><image_width>640</image_width></opencv_storage>", "'image_height' is missing"),
+    ],
+)
+def test_damaged_xml_is_refused_with_a_reason(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words) as caught:
+        read_opencv(text)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_transposed_matrix_is_not_a_camera_with_its_centre_at_the_first_pixel() -> None:
+    text = write_opencv(CAMERAS["pinhole"]).text
+    fx, fy, cx, cy = (repr(v) for v in CAMERAS["pinhole"].parameters.tolist())
+    turned = text.replace(f"{fx}, 0.0, {cx}, 0.0, {fy}, {cy}, 0.0", f"{fx}, 0.0, 0.0, 0.0, {fy}, 0.0, {cx}, {cy}")
+    turned = turned.replace(f"{cx}, {cy}, 0.0, 1.0", f"{cx}, {cy}, 1.0")
+    assert turned != text
+    with pytest.raises(InputError, match="transpose it"):
+        read_opencv(turned)
 
 
 @pytest.mark.parametrize("label", ["pinhole", "brown", "brown_rational", "kannala_brandt", "eucm", "ucm"])
@@ -242,6 +295,29 @@ projection_matrix:
     assert camera.parameters.tolist() == [500.5, 501.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0]
 
 
+@pytest.mark.parametrize("keys", ["DKRP", "dkrp"])
+def test_a_message_of_ros_as_echo_prints_it(keys: str, tmp_path: Path) -> None:
+    D, K, R, P = keys
+    message = f"""header:
+  frame_id: camera
+height: 480
+width: 640
+distortion_model: plumb_bob
+{D}: [-0.2, 0.05, 0.001, -0.002, 0.0]
+{K}: [500.5, 0.0, 320.25, 0.0, 501.5, 240.75, 0.0, 0.0, 1.0]
+{R}: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+{P}: [500.5, 0.0, 320.25, 0.0, 0.0, 501.5, 240.75, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+roi:
+  x_offset: 0
+---
+"""
+    (tmp_path / "topic.yaml").write_text(message * 2)
+    camera = import_camera(tmp_path / "topic.yaml")
+    assert camera.size_px == (640, 480)
+    assert camera.parameters.tolist() == [500.5, 501.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0]
+
+
 @pytest.mark.parametrize("name", sorted(FORMATS))
 @pytest.mark.parametrize(
     "text", ["", "nonsense", "a: [1, 2", "cam0:\n  x: 1\n", "1 PINHOLE 640\n", "{'lensmodel': 'X'}"]
@@ -250,6 +326,24 @@ def test_damaged_files_are_refused_with_a_reason(name: str, text: str) -> None:
     with pytest.raises(InputError) as caught:
         FORMATS[name][1](text)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_we_read_binary_cameras_of_colmap(tmp_path: Path) -> None:
+    model = pycolmap.Reconstruction()
+    numbers = {1: ("OPENCV", [500.0, 501.0, 320.5, 240.5, -0.2, 0.05, 0.001, -0.002])}
+    for camera_id, (name, values) in numbers.items():
+        camera = pycolmap.Camera(camera_id=camera_id, model=name, width=640, height=480, params=values)
+        model.add_camera_with_trivial_rig(camera)
+    model.write_binary(tmp_path)
+    ours = import_camera(tmp_path / "cameras.bin")
+    assert (ours.model, ours.size_px) == ("brown", (640, 480))
+    assert ours.parameters.tolist() == [500.0, 501.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002]
+    for number, (name, count) in enumerate(MODEL_IDS):
+        theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
+        assert (int(theirs.model), len(theirs.params)) == (number, count)
+    (tmp_path / "cameras.bin").write_bytes((tmp_path / "cameras.bin").read_bytes()[:-3])
+    with pytest.raises(InputError, match="not UTF-8|none of the known"):
+        import_camera(tmp_path / "cameras.bin")
 
 
 @pytest.mark.parametrize("name", sorted(FORMATS))
