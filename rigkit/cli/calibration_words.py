@@ -46,14 +46,16 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 
 def describe(calibration: Calibration) -> str:
     """Return the result for a person: the headline first."""
+    from rigkit.report.calibration_facts import training_note
     from rigkit.report.tables import rounded_parameters
 
     camera = calibration.camera
     held = calibration.heldout_rms_px
     headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
+    note = training_note(calibration.rms_px, held)
     lines = [
         f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
-        f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
+        f"training RMS {calibration.rms_px:.4f} px{note} (2-D per corner, {calibration.corner_count} corners in "
         f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {calibration.images_left_out} images "
         "dropped",
     ]

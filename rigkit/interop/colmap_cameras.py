@@ -1,4 +1,7 @@
-"""COLMAP's cameras.txt and cameras.bin, without COLMAP. Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that."""
+"""COLMAP's cameras.txt and cameras.bin, without COLMAP.
+
+Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that.
+"""
 
 from __future__ import annotations
 

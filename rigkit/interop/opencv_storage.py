@@ -57,7 +57,7 @@ def _value(element: Element, name: str, depth: int) -> Any:
     if not inside:
         words = (element.text or "").split()
         values = [_number(word) for word in words]
-        if element.tag == "data" or len(values) > 1 and not any(isinstance(v, str) for v in values):
+        if element.tag == "data" or (len(values) > 1 and not any(isinstance(v, str) for v in values)):
             return values
         return values[0] if len(values) == 1 else " ".join(words)
     if all(one.tag == "_" for one in inside):

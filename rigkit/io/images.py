@@ -159,17 +159,19 @@ def images_of_folder(folder: Path) -> list[Path]:
 
 
 def no_images(folder: Path) -> str:
-    """Return that a folder has no images, and what it holds instead: pictures that are not read, folders that have some."""
+    """Return that a folder has no images, and what it holds instead: pictures that are not read, folders with some."""
     words = f"folder '{folder}' has no images ({' '.join(IMAGE_ENDINGS)})"
     unread = _unread(folder)
     if unread:
-        return f"{words}, but pictures of formats that are not read, '{unread[0]}' the first; convert them to PNG or JPEG"
+        return (
+            f"{words}, but pictures of formats that are not read, '{unread[0]}' the first; convert them to PNG or JPEG"
+        )
     inside = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
     if not inside:
         return f"{words}; give another"
     others = len({path.parent for path in inside}) - 1
     those = f"'{inside[0].parent}' has some" if others == 0 else f"'{inside[0].parent}' and {others} more below it have"
-    return f"{words}, but {those}; give one folder a camera, or a session: images = \"{folder}/**/*{inside[0].suffix}\""
+    return f'{words}, but {those}; give one folder a camera, or a session: images = "{folder}/**/*{inside[0].suffix}"'
 
 
 def name_unread(folder: Path) -> None:

@@ -74,9 +74,7 @@ def load_truth_csv(path: str | Path, boards: Mapping[str, Sequence[Board]]) -> d
     truths = {}
     for name in named:
         try:
-            truths[name] = PairTruth(
-                baselines.get(name), tuple(angles.get(name, ())), tuple(distances.get(name, ()))
-            )
+            truths[name] = PairTruth(baselines.get(name), tuple(angles.get(name, ())), tuple(distances.get(name, ())))
         except InputError as error:
             raise InputError(f"{source}: pair '{name}': {error}") from error
     return truths

@@ -47,6 +47,7 @@ class Video:
     ----------
     source : as it was named.
     count : frames announced, 0 where that is not known.
+    rate_hz : frames per second announced, 0 where that is not known.
     live : whether it is a camera, which has no end.
     size_px : width and height of its frames.
     next_number : of the frame that comes next, from 0.
@@ -63,16 +64,21 @@ class Video:
         with quiet_opencv():
             self._capture = cv2.VideoCapture(int(number[1])) if number else cv2.VideoCapture(str(source))
         if not self._capture.isOpened():
-            what = (
-                "is not connected, or another program has it" if self.live else "cannot be decoded; convert it to MP4"
+            if self.live:
+                raise InputError(f"camera '{source}' is not connected, or another program has it")
+            # The index of an MP4 is at its end: without it there is nothing to convert.
+            raise InputError(
+                f"video '{source}' cannot be decoded: cut off, or of a format that is not read; copy it again, or "
+                "convert it to MP4"
             )
-            raise InputError(f"{'camera' if self.live else 'video'} '{source}' {what}")
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         width, height = (int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         self.size_px = width, height
         require_pixels(self.size_px, f"video '{source}'")
         count = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.count = 0 if self.live or not np.isfinite(count) else max(int(count), 0)
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        self.rate_hz = 0.0 if self.live or not np.isfinite(rate) else max(float(rate), 0.0)
         self.next_number = 0
 
     def __enter__(self) -> Video:

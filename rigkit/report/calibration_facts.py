@@ -71,6 +71,13 @@ def next_words(plan: Plan) -> str:
     return f"Take these {len(plan.views)} next: they would bring {100.0 * plan.gain:.0f} %"
 
 
+def training_note(rms_px: float, heldout_rms_px: float | None) -> str:
+    """Return why the training RMS is above the held-out RMS, which readers take for a mistake; "" where it is not."""
+    if heldout_rms_px is None or rms_px <= heldout_rms_px:
+        return ""
+    return " (every corner alike; in the held-out RMS blurred ones count less)"
+
+
 def _basis(c: Calibration) -> str:
     width, height = c.camera.size_px
     return (

@@ -18,7 +18,15 @@ from rigkit.io.images import Image
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.calibration_facts import IMAGES_KEY, LEFT_OUT_KEY, NEXT_KEY, camera_facts, next_words, rig_facts
+from rigkit.report.calibration_facts import (
+    IMAGES_KEY,
+    LEFT_OUT_KEY,
+    NEXT_KEY,
+    camera_facts,
+    next_words,
+    rig_facts,
+    training_note,
+)
 from rigkit.report.page_facts import PageFacts, told
 from rigkit.report.plan_page import shown_views
 from rigkit.report.render import data_uri, drawing, render, shown_table
@@ -139,7 +147,7 @@ def _said(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict
     held = c.heldout_rms_px
     return {
         "heldout": f"not available (too few {taken})" if held is None else f"{held:.3f} px",
-        "training": f"{c.rms_px:.3f} px",
+        "training": f"{c.rms_px:.3f} px{training_note(c.rms_px, held)}",
         "findings": [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(c.verdicts)],
         "told": told(facts),
         "basis": facts.basis,

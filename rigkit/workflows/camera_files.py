@@ -13,8 +13,8 @@ from rigkit.cameras.base import Camera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.interop.colmap_cameras import colmap_cameras_text
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
+from rigkit.interop.colmap_cameras import colmap_cameras_text
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.io.calibration_file import load_calibration_or_camera

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -29,6 +30,8 @@ from rigkit.io.session import Session, beside_session
 from rigkit.io.video import Video, is_video, read_timestamps
 from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
 from rigkit.workflows.identify_board import explained
+
+_log = logging.getLogger(__name__)
 
 MAX_FRAMES = 40
 """Frames kept of a video: a calibration gains little from more that are spread as well."""
@@ -113,6 +116,8 @@ def frames_of_videos(
     with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
         _take_folder(folder, live)
+        if moments is None:
+            _warn_of_clocks(videos)
         total = min((v.count for v in videos.values() if v.count), default=0) if moments is None else len(moments)
         # Who calibrates a live camera says so when there is enough.
         with suppress(*((KeyboardInterrupt,) if live else ())):
@@ -144,6 +149,20 @@ def frames_of_videos(
     if not live:
         _record(done, asked)
     return done
+
+
+def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
+    """Say where lengths or rates of videos contradict that frames of one number are of one moment."""
+    for what, told in (("frames", "count"), ("frames per second", "rate_hz")):
+        known = {name: value for name, video in videos.items() if (value := getattr(video, told))}
+        if len({round(value, 2) for value in known.values()}) > 1:
+            words = ", ".join(f"{value:.6g} of '{name}'" for name, value in known.items())
+            _log.warning(
+                "the videos differ in %s, %s: frames of one number are taken as of one moment, which they may not be; "
+                "--timestamps tells which are",
+                what,
+                words,
+            )
 
 
 def _moments(

@@ -342,7 +342,7 @@ def test_we_read_binary_cameras_of_colmap(tmp_path: Path) -> None:
         theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
         assert (int(theirs.model), len(theirs.params)) == (number, count)
     (tmp_path / "cameras.bin").write_bytes((tmp_path / "cameras.bin").read_bytes()[:-3])
-    with pytest.raises(InputError, match="not UTF-8|none of the known"):
+    with pytest.raises(InputError, match=r"not UTF-8|none of the known"):
         import_camera(tmp_path / "cameras.bin")
 
 

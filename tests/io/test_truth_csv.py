@@ -70,7 +70,11 @@ WRONG = [
     (",300,2,", ",nan,2,", "nan"),
     (",300,2,", ",2,300,", "line 2: .*were both exchanged"),
     (",90,0.3,", ",0.3,90,", "line 3: .*were both exchanged"),
-    ("set square\n", "set square\nfirst,angle,plane2,plane1,,,90,1,eye\n", "'first': angle plane2-plane1 is stated twice"),
+    (
+        "set square\n",
+        "set square\nfirst,angle,plane2,plane1,,,90,1,eye\n",
+        "'first': angle plane2-plane1 is stated twice",
+    ),
     (",,90,0.3,", ",90,90,0.3,", "leave it empty"),
     ("set square", "", "line 3: 'how' is empty"),
     ("first,angle", "third,angle", "pair 'third' is not in the manifest; known: first, second"),

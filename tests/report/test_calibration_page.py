@@ -16,6 +16,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
+from rigkit.cli.calibration_words import describe
 from rigkit.core.findings import Finding
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
@@ -97,6 +98,15 @@ def test_tables_sort_pictures_enlarge_and_the_view_turns(calibration: Calibratio
     images = sorted((v.image for v in calibration.views), key=lambda n: int(re.sub(r"\D", "", n)))
     assert names.split(",") == images
     assert view.split()[:2] == ["0.000", "1.571"]
+
+
+def test_a_training_rms_above_the_heldout_one_is_explained(calibration: Calibration) -> None:
+    odd = replace(calibration, heldout_rms_px=0.5 * calibration.rms_px)
+    for text in (describe(odd), page(odd)):
+        assert re.search(
+            r"training RMS [\d.]+ px \(every corner alike; in the held-out RMS blurred ones count less", text
+        )
+    assert "every corner alike" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
 
 
 def test_says_what_the_calibration_says(calibration: Calibration) -> None:

@@ -77,7 +77,7 @@ def test_each_view_is_kept_once_and_sharp(tmp_path: Path) -> None:
         frames_of_video(video(tmp_path / "b.avi", [empty, empty]), tmp_path / "other")
 
 
-def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path) -> None:
+def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shots = [picture((0.1 * k, 0.1, 0.0), 12.0 * k - 20.0) for k in range(4)]
     one = video(tmp_path / "cam_0.avi", shots)
     two = video(tmp_path / "cam_1.avi", [np.full((240, 320), 90, np.uint8), *shots[:2]])
@@ -87,6 +87,11 @@ def test_videos_of_two_cameras_give_frames_of_one_moment(tmp_path: Path) -> None
     done = frames_of_videos({"cam_0": one, "cam_1": two}, tmp_path / "frames", [BOARD], timestamps=stamps)
     assert [p.stem for p in done.images["cam_0"]] == ["000010", "000011", "000012", "000013"]
     assert [p.stem for p in done.images["cam_1"]] == ["000012", "000013"]
+    # Without the table frames are counted, which videos of other lengths speak against.
+    assert "differ" not in caplog.text
+    frames_of_videos({"cam_0": one, "cam_1": two}, tmp_path / "counted", [BOARD])
+    assert "the videos differ in frames, 4 of 'cam_0', 3 of 'cam_1'" in caplog.text
+    assert "per second" not in caplog.text
 
 
 def test_detect_takes_a_video(tmp_path: Path) -> None:
