@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
         note(f"left out: {reason}")
     note_written(done.written)
     if args.fix is not None and args.fix not in done.written:
-        note(f"{args.fix} not written: {'nothing changed' if check.holds else 'no change explains the pictures'}")
+        why = "the pictures were flipped" if check.flipped else "no change explains the pictures"
+        note(f"{args.fix} not written: {'nothing changed' if check.holds else why}")
     if not check.holds:
         return ExitCode.CHECK_FAILED
     return ExitCode.BAD_INPUT if done.unreadable else ExitCode.WELL

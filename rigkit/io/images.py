@@ -169,9 +169,11 @@ def no_images(folder: Path) -> str:
     inside = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
     if not inside:
         return f"{words}; give another"
-    others = len({path.parent for path in inside}) - 1
-    those = f"'{inside[0].parent}' has some" if others == 0 else f"'{inside[0].parent}' and {others} more below it have"
-    return f'{words}, but {those}; give one folder a camera, or a session: images = "{folder}/**/*{inside[0].suffix}"'
+    first, others = inside[0].parent, len({path.parent for path in inside}) - 1
+    if others == 0:
+        return f"{words}, but '{first}' has some; give that"
+    every = f'images = "{folder}/**/*{inside[0].suffix}"'
+    return f"{words}, but '{first}' and {others} more below it have; give one folder a camera, or a session: {every}"
 
 
 def name_unread(folder: Path) -> None:

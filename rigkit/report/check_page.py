@@ -42,6 +42,12 @@ def check_facts(check: SentinelCheck) -> PageFacts:
                 f"More than chance is there, of no importance: {change}; it moves the projection by "
                 f"{change.size_px:.3f} px."
             )
+    elif check.flipped:
+        headline = f"Does NOT hold as the images are ({p}): they seem {check.flipped}; put back, they fit"
+        sentences.append(
+            "Give them as the camera wrote them: a viewer, a tag of the file or a setting of the camera flips pictures."
+            + ("" if check.unexplained or change is None else f" Else it would be this: {change}.")
+        )
     elif check.unexplained or change is None:
         headline = f"Does NOT hold ({p}): nothing that moved explains it"
         sentences.append(

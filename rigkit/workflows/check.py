@@ -36,6 +36,7 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
+from rigkit.validation.sentinel.flipped import flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.camera_files import warn_if_bad
@@ -123,6 +124,7 @@ def check_pictures(
             check = check_views(watched, views, cost)
             if not check.holds:
                 _require_right_order(check, views)
+                check = replace(check, flipped=flipped_pictures(watched, views))
     files = _files(source, check, options)
     write_together(files, force=options.force)
     if options.history is not None:
@@ -138,8 +140,9 @@ def check_pictures(
 def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Path, str | bytes]:
     """Return what is written, each with its place: the calibration corrected, and the page."""
     files: dict[Path, str | bytes] = {}
-    # What holds needs no correction, and what nothing explains has none.
-    if options.fix is not None and check.change is not None and not check.holds and not check.unexplained:
+    # What holds needs no correction, and what nothing explains has none; of flipped pictures it is these that are wrong.
+    right = check.holds or check.unexplained or bool(check.flipped)
+    if options.fix is not None and check.change is not None and not right:
         files[options.fix] = fixed_text(source, check)
     if options.report is not None:
         facts = {source.name: digest_line(source), **software_facts()}

@@ -130,6 +130,20 @@ def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) 
     assert check_pictures(rig, [pictures[k] for k in (0, 3)], options).check.unexplained
 
 
+@pytest.mark.parametrize(("flip", "words"), [(-1, "turned by half a turn"), (0, "mirrored top to bottom")])
+def test_pictures_that_were_flipped_are_no_moved_principal_point(
+    flip: int, words: str, home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (home / "same").iterdir():
+        cv2.imwrite(str(tmp_path / path.name), cv2.flip(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), flip))
+    fixed = tmp_path / "fixed.json"
+    assert main(["check", str(home / "cam.json"), str(tmp_path), "--fix", str(fixed)]) == 1
+    said = capsys.readouterr()
+    assert f"they seem {words}; put back, they fit" in said.out
+    assert "Else it would be this: the principal point of the camera moved" in said.out
+    assert "not written: the pictures were flipped" in said.err and not fixed.exists()
+
+
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration, register = str(home / "cam.json"), tmp_path / "cam.jsonl"
     also = ["--register", str(register), "--temperature", "20.5"]

@@ -206,6 +206,8 @@ def test_a_folder_without_images_says_what_it_holds_instead(tmp_path: Path) -> N
     for day in ("monday", "tuesday"):
         (tmp_path / day).mkdir()
         (tmp_path / day / "a.PNG").touch()
+        if day == "monday":
+            assert no_images(tmp_path).endswith(f"but '{tmp_path / 'monday'}' has some; give that")
     words = no_images(tmp_path)
     assert f"but '{tmp_path / 'monday'}' and 1 more below it have" in words
     assert f'images = "{tmp_path}/**/*.PNG"' in words

@@ -100,6 +100,8 @@ class SentinelCheck:
     tried : every cause by itself, the simplest first.
     powers : how well changes of lenses and turns of mounts would have been seen; what is missing was not seen at all.
     cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
+    flipped : how the pictures must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
+        explanation, or was not asked.
     """
 
     chance: float
@@ -117,6 +119,7 @@ class SentinelCheck:
     powers: tuple[Power, ...] = ()
     cost: float = 0.0
     cost_unit: str = "px"
+    flipped: str = ""
 
     @property
     def unexplained(self) -> bool:
