@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 STORAGE = re.compile(r'!!opencv-matrix|<opencv_storage>|"type_id"\s*:\s*"opencv-matrix"|\A%YAML')
 """What such files have."""
-XML = re.compile(r"\A\s*<")
+XML_START = re.compile(r"\A\s*<")
 ENTITY = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
-NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|nan)", re.IGNORECASE)
+XML_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|nan)", re.IGNORECASE)
 
 
 def parse_storage(text: str, name: str) -> dict[str, Any]:
@@ -27,7 +27,7 @@ def parse_storage(text: str, name: str) -> dict[str, Any]:
 
     Matrices are mappings with `rows`, `cols` and `data`. Raises InputError where the text is no such file.
     """
-    data = _parse_xml(text, name) if XML.match(text) else parse_yaml(text, name)
+    data = _parse_xml(text, name) if XML_START.match(text) else parse_yaml(text, name)
     return {**{key.lower(): value for key, value in data.items()}, **data}
 
 
@@ -71,7 +71,7 @@ def _value(element: Element, name: str, depth: int) -> Any:
 
 
 def _number(word: str) -> float | int | str:
-    if not NUMBER.fullmatch(word):
+    if not XML_NUMBER.fullmatch(word):
         return word
     if word.lstrip("+-").isdigit():
         return int(word) if len(word) < 40 else float(word)

@@ -140,7 +140,7 @@ def check_pictures(
 def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Path, str | bytes]:
     """Return what is written, each with its place: the calibration corrected, and the page."""
     files: dict[Path, str | bytes] = {}
-    # What holds needs no correction, and what nothing explains has none; of flipped pictures it is these that are wrong.
+    # What holds needs no correction, and what nothing explains has none; flipped pictures are wrong themselves.
     right = check.holds or check.unexplained or bool(check.flipped)
     if options.fix is not None and check.change is not None and not right:
         files[options.fix] = fixed_text(source, check)

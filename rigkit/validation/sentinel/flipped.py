@@ -14,15 +14,15 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import check_views
 
-FLIPS = {
+WAYS_TO_FLIP = {
     "turned by half a turn": (-1.0, -1.0),
     "mirrored left to right": (-1.0, 1.0),
     "mirrored top to bottom": (1.0, -1.0),
 }
 """What may be done to a picture, and the signs of its axes then."""
-MIN_SHARE_MOVED = 0.01
+MIN_SHARE_FLIPPED = 0.01
 """Of the longer side: a flip moves the principal point by more, or a knock may as well have moved the glass. REAL
-lenses lie off the middle by 0.2 to 4 %, and a flip doubles that."""
+lenses lie off the middle by 0.1 to 3.5 % (camodocal-fisheye, bouguet-stereo), and a flip doubles that."""
 
 
 def flipped_pictures(watched: Watched, views: Sequence[FreshView]) -> str:
@@ -33,9 +33,9 @@ def flipped_pictures(watched: Watched, views: Sequence[FreshView]) -> str:
     camera = watched.cameras[0]
     off = np.array(camera.size_px) - 1.0 - 2.0 * camera.axis_px
     fit = []
-    for words, signs in FLIPS.items():
+    for words, signs in WAYS_TO_FLIP.items():
         moved = np.where(np.array(signs) < 0.0, off, 0.0)
-        if np.linalg.norm(moved) < MIN_SHARE_MOVED * max(camera.size_px):
+        if np.linalg.norm(moved) < MIN_SHARE_FLIPPED * max(camera.size_px):
             continue
         # In a mirror a board's columns or its rows are counted backwards, as the colours of its ends have it.
         ways = (0, 1) if np.prod(signs) < 0.0 else (None,)
