@@ -120,7 +120,8 @@ class PairTruth:
     def __post_init__(self) -> None:
         # Of a copied row one measurement would count as two facts that hold.
         known: set[object] = set()
-        for one in (*self.angles, *self.distances):
+        measured: tuple[MeasuredAngle | MeasuredDistance, ...] = (*self.angles, *self.distances)
+        for one in measured:
             ends = frozenset((str(one.a), str(one.b)))
             if (type(one), ends) in known:
                 raise InputError(f"{one.name} is stated twice; keep one")

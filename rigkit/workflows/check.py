@@ -41,6 +41,7 @@ from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.detect import images_in
+from rigkit.workflows.identify_board import explained
 from rigkit.workflows.next_views import goal_of, length_goal
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
@@ -120,7 +121,7 @@ def check_pictures(
                 raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
             views = _views(watched, frames, seen, boards, left_out)
             if not views:
-                raise InputError(f"check: {_nothing_to_check(left_out, unreadable)}")
+                raise InputError(f"check: {_nothing_to_check(left_out, unreadable, boards)}")
             check = check_views(watched, views, cost)
             if not check.holds:
                 _require_right_order(check, views)
@@ -265,13 +266,17 @@ def _views(
     return out
 
 
-def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[str]) -> str:
+def _nothing_to_check(
+    left_out: Sequence[tuple[str, str]], unreadable: Sequence[str], boards: Sequence[Board]
+) -> str:
     """Return in words why no image shows a board."""
     if not left_out:
         return unreadable[0]
     total = len(left_out) + len(unreadable)
     where = "the image" if total == 1 else f"any of {total} images"
-    return f"no board was found in {where}: {left_out[0][1]}; take sharp pictures of the whole board"
+    shown = explained([Path(name) for name, _ in left_out], boards)
+    why = f"; {shown}" if shown else f": {left_out[0][1]}; take sharp pictures of the whole board"
+    return f"no board was found in {where}{why}"
 
 
 def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:

@@ -29,6 +29,7 @@ from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.detect import images_in
+from rigkit.workflows.identify_board import explained
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
@@ -142,7 +143,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
                 f"'{image}' shows {alike} grids of the size of board '{known.board_id}', and nothing tells which of "
                 "them it is; cover what else is tiled"
             )
-        raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; check focus and the board's file")
+        why = explained([Path(image)], [known]) or "check focus and the board's file"
+        raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
     rays, valid = lens.unproject(view.pixels)
     unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
     points = view.points()[valid]

@@ -10,6 +10,7 @@ import pytest
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.circles import Circles
 
 STATED = (Board("stated", 9, 7, 30.0, 30.0),)
@@ -31,6 +32,9 @@ def shown(*grids: BoardDetection) -> dict[str, list[BoardDetection]]:
 def test_whole_grids_of_another_size_are_other_boards() -> None:
     words = other_size(shown(grid(9, 6), grid(9, 6), grid(9, 6), grid(9, 6), grid(8, 5)), STATED)
     assert words == "9 x 6 inner corners are seen in 4 of 5 images, 9 x 7 are declared"
+    tags = Board("tags", 10, 8, 30.0, 30.0, pattern=AprilGrid(0.3))
+    words = other_size(shown(grid(9, 6), grid(9, 6), grid(9, 6), grid(9, 6)), (*STATED, tags))
+    assert words == "9 x 6 inner corners are seen in 4 of 4 images, 9 x 7, 5 x 4 tags are declared"
 
 
 def test_a_larger_board_of_which_part_was_taken() -> None:

@@ -182,6 +182,10 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
         (["{cam}", "{same}", "--length", "3"], "belong together"),
         (["{cam}", "{home}/nothing.png"], "does not exist"),
         (["{cam}", "{same}", "--board", "8x5x25"], "9 x 6 inner corners are seen in 3 of 3 images, 8 x 5 are declared"),
+        (
+            ["{cam}", "{same}", "--board", "aprilgrid:5x4x25,spacing=0.3"],
+            "no board was found in any of 3 images; in 3 images a chessboard of 9 x 6 inner corners is seen",
+        ),
         (["{cam}", "{same}", "--fix", "{cam}", "--force"], "cam.json"),
         # The calibration's own board, whole, in the only image: its pictures once held with a row more.
         (["{cam}", "{one}", "--board", "9x7x25"], "9 x 6 inner corners are seen in 1 of 1 images, 9 x 7 are declared"),
@@ -217,3 +221,9 @@ def test_what_would_have_been_found_needs_no_more_pictures() -> None:
         kind="focal length", camera="left", size=0.1, unit="px", chance=0.97, found_from=0.08, frames=3, both=None
     )
     assert _could_have_found(sure).endswith("on).") and "pictures like these" not in _could_have_found(sure)
+
+
+def test_a_pose_on_another_board_names_the_one_that_is_seen(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = str(sorted((home / "same").iterdir())[0])
+    assert main(["pose", one, "--camera", str(home / "cam.json"), "--board", "8x5x25"]) == 1
+    assert "does not show board 'board-8x5x25'; in 1 image 9 x 6 inner corners are seen" in capsys.readouterr().err

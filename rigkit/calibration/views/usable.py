@@ -113,7 +113,9 @@ def other_size(
     """
     listed = {frozenset(board.size) for board in boards}
     found = [_put_together(own) for own in detections.values() if own]
-    sizes = ", ".join(f"{c} x {r}" for c, r in sorted({board.size for board in boards}))
+    # Of other patterns than chessboards as people count them: tags, not the corners of tags.
+    declared = sorted(boards, key=lambda board: board.size)
+    sizes = ", ".join(dict.fromkeys(b.describe().split(", ")[0].removesuffix(" inner corners") for b in declared))
     without = [own for own in found if not any(frozenset(seen.size) in listed for seen in own)]
     counts = Counter((max(s.size), min(s.size)) for own in without for s in own if s.whole)
     size, count = counts.most_common(1)[0] if counts else ((0, 0), 0)
