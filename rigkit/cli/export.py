@@ -27,12 +27,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
     add_planes_argument(parser, "points and normals of a pair")
+    parser.add_argument("--float", action="store_true", help="of a PLY: 32-bit numbers (PCL reads no others)")
     parser.add_argument("--force", action="store_true", help="replace existing files")
 
 
 def run(args: argparse.Namespace) -> int:
     if args.source.is_dir() or args.source.suffix in (".toml", ".ply"):
         return _export_cloud(args)
+    if args.float:
+        raise InputError("export: --float is of clouds; leave it out")
     import numpy as np
 
     from rigkit.rectification.targets import field_across
@@ -71,11 +74,18 @@ def _export_cloud(args: argparse.Namespace) -> int:
         what = "a PLY" if is_ply else "a cloud"
         raise InputError(f"export: {what} is written as {', '.join(known)}, not as '{kind}'; use --to")
     unused = {"--names": args.names, "--size": args.size, "--from": args.source_format}
+    unused |= {"--float": args.float and kind != "ply"}
     unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
         raise InputError(f"export: {option} says nothing of {'a PLY' if is_ply else 'a cloud'}; leave it out")
     options = ExportCloudOptions(
-        output=args.output, kind=kind, pair=args.pair, method=args.method, planes=args.planes, force=args.force
+        output=args.output,
+        kind=kind,
+        pair=args.pair,
+        method=args.method,
+        planes=args.planes,
+        force=args.force,
+        single_precision=args.float,
     )
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")

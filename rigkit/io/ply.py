@@ -6,6 +6,7 @@ they do not know (board, column, row, sigma_mm, normal_sigma_deg) they show as s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -176,6 +177,14 @@ def read_ply(path: str | Path) -> OrientedCloud:
         )
     except InputError as error:
         raise InputError(f"point cloud '{source}': {error}; write it again") from error
+
+
+def ply_unit(path: str | Path) -> str:
+    """Return the unit of a file's lengths as its header says it, mm where it says none; raises as `read_ply`."""
+    data = read_bytes(path, "point cloud")
+    start = _header(data, Path(path))[-1]
+    said = re.search(rb"^comment units (\S+)$", data[:start], re.MULTILINE)
+    return "mm" if said is None else said[1].decode("utf-8", errors="replace")
 
 
 def _unit_normals(normals: FloatArray) -> FloatArray:

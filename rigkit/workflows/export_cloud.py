@@ -18,7 +18,7 @@ from rigkit.interop.colmap_model import colmap_model
 from rigkit.interop.las import las_bytes
 from rigkit.io.files import ensure_writable, npz_bytes
 from rigkit.io.manifest import Dataset, load_dataset
-from rigkit.io.ply import ply_bytes, read_ply
+from rigkit.io.ply import ply_bytes, ply_unit, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras
 from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
@@ -41,6 +41,8 @@ class ExportCloudOptions:
     """Affine estimator of the normals."""
     planes: Planes | None = None
     """Points and normals, as `ReconstructOptions` has it; None: as the manifest says of the pair."""
+    single_precision: bool = False
+    """Of a PLY: 32-bit numbers, for programs that know no other."""
     force: bool = False
     """Replace files that exist; what was read is never replaced."""
 
@@ -81,7 +83,7 @@ def export_cloud(
             _log.info(words)
     else:
         folder = options.output.parent
-        files[options.output.name] = _cloud_npz(r) if options.kind == "npz" else _cloud_bytes(r.cloud, options.kind)
+        files[options.output.name] = _cloud_npz(r) if options.kind == "npz" else _cloud_bytes(r.cloud, options)
     write_results(folder, files, force=options.force, inputs=known.inputs)
     return r
 
@@ -93,7 +95,8 @@ def export_ply(source: Path, options: ExportCloudOptions) -> OrientedCloud:
     """
     ensure_writable(options.output, force=options.force, inputs=(source,))
     cloud = read_ply(source)
-    files: dict[str, str | bytes] = {options.output.name: _cloud_bytes(cloud, options.kind)}
+    content = _cloud_bytes(cloud, options, ply_unit(source))
+    files: dict[str, str | bytes] = {options.output.name: content}
     write_results(options.output.parent, files, force=options.force, inputs=(source,))
     return cloud
 
@@ -123,5 +126,7 @@ def _cloud_npz(reconstruction: Reconstruction) -> bytes:
     return npz_bytes(arrays)
 
 
-def _cloud_bytes(cloud: OrientedCloud, kind: str) -> bytes:
-    return las_bytes(cloud) if kind == "las" else ply_bytes(cloud)
+def _cloud_bytes(cloud: OrientedCloud, options: ExportCloudOptions, unit: str = "mm") -> bytes:
+    if options.kind == "las":
+        return las_bytes(cloud)
+    return ply_bytes(cloud, single_precision=options.single_precision, unit=unit)

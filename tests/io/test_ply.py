@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
+from rigkit.cli.main import main
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
 from rigkit.io.ply import ply_bytes, read_ply, write_ply
@@ -36,6 +37,20 @@ def test_single_precision_for_programs_that_know_no_other(tmp_path: Path) -> Non
     cloud = make_reconstruction().cloud
     write_ply(tmp_path / "small.ply", cloud, single_precision=True)
     np.testing.assert_array_equal(read_ply(tmp_path / "small.ply").points_mm, cloud.points_mm.astype(np.float32))
+
+
+def test_export_of_a_ply_keeps_its_unit_and_writes_32_bit_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cloud = make_reconstruction().cloud
+    (tmp_path / "a.ply").write_bytes(ply_bytes(cloud, unit="baselines"))
+    assert main(["export", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.ply"), "--float"]) == 0
+    header = (tmp_path / "b.ply").read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert "comment units baselines" in header
+    assert not any("double" in line for line in header) and "property float x" in header
+    np.testing.assert_array_equal(read_ply(tmp_path / "b.ply").points_mm, cloud.points_mm.astype(np.float32))
+    assert main(["export", str(tmp_path / "a.ply"), "-o", str(tmp_path / "b.las"), "--float"]) == 2
+    assert "--float says nothing of a" in capsys.readouterr().err
 
 
 def test_header_says_units_frame_boards_and_comments(cloud_file: Path) -> None:
