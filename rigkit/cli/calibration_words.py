@@ -46,18 +46,21 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 
 def describe(calibration: Calibration) -> str:
     """Return the result for a person: the headline first."""
-    from rigkit.report.calibration_facts import training_note
+    from rigkit.rectification.targets import field_across
+    from rigkit.report.calibration_facts import focal_words, training_note
     from rigkit.report.tables import rounded_parameters
 
     camera = calibration.camera
     held = calibration.heldout_rms_px
     headline = "held-out RMS not available (too few images)" if held is None else f"held-out RMS {held:.4f} px"
+    across_deg = math.degrees(field_across(camera))
     note = training_note(calibration.rms_px, held)
     lines = [
         f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
         f"training RMS {calibration.rms_px:.4f} px{note} (2-D per corner, {calibration.corner_count} corners in "
         f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {calibration.images_left_out} images "
         "dropped",
+        f"focal length on the axis {focal_words(calibration)} px, sees {across_deg:.1f} degrees across",
     ]
     words = rounded_parameters(camera, calibration.parameter_sigmas)
     lines += [f"  {name:>4} = {value}" for name, value in words.items()]

@@ -18,9 +18,11 @@ from rigkit.report.calibration_drawings import MAP_GRID
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.plan_page import plan_table, plan_words
 from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
-from rigkit.report.tables import rounded_parameters
+from rigkit.report.tables import rounded_parameters, rounded_words
 from rigkit.validation.check import Check
 
+FOCAL_STEP = 1e-3
+"""Step of derivatives of the focal length, in standard deviations: rounding leaves 1e-7 of them or so."""
 IN_PX = ("fx", "fy", "cx", "cy")
 MAX_RATIO_BEYOND = 3.0
 """Where the projection is no worse than so many times the worst place that boards reached, all of the image serves."""
@@ -110,10 +112,28 @@ def _reach(c: Calibration) -> str:
     return words + " with the board at the border, tilted by 30 degrees."
 
 
+def focal_words(c: Calibration) -> str:
+    """Return the focal length on the optical axis and its standard deviation, px a radian, in words.
+
+    fx and fy are that in some models only: those of a narrow double sphere may be several times less.
+    """
+    p, sigmas = c.camera.parameters, c.parameter_sigmas
+    # Far less than is known of each number: so near every trial is a lens, and the focal length a straight line.
+    steps = np.where(sigmas > 0.0, FOCAL_STEP * sigmas, FOCAL_STEP * np.maximum(np.abs(p), 1.0))
+
+    def focal_px(k: int, sign: float) -> float:
+        return c.camera.with_parameters(p + sign * steps * (np.arange(p.size) == k)).focal_px
+
+    gradient = np.array([(focal_px(k, 1.0) - focal_px(k, -1.0)) / (2.0 * steps[k]) for k in range(p.size)])
+    sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
+    return rounded_words(c.camera.focal_px, sigma)
+
+
 def _parameters(c: Calibration) -> Table:
-    rows = tuple(
-        cells(name, words, "px" if name in IN_PX else "")
-        for name, words in rounded_parameters(c.camera, c.parameter_sigmas).items()
+    named = rounded_parameters(c.camera, c.parameter_sigmas).items()
+    rows = (
+        cells("focal length on the axis", focal_words(c), "px"),
+        *(cells(name, words, "px" if name in IN_PX else "") for name, words in named),
     )
     heads = columns("name | value and standard deviation | unit")
     return Table("parameters", "Parameters", heads, rows, "The file has every digit.")

@@ -109,6 +109,27 @@ def test_a_training_rms_above_the_heldout_one_is_explained(calibration: Calibrat
     assert "every corner alike" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
 
 
+def told_focal_px(calibration: Calibration) -> tuple[float, float]:
+    """Return the focal length and its standard deviation as they are printed."""
+    words = re.search(r"focal length on the axis ([\d.]+) ± ([\d.]+) px, sees [\d.]+ degrees", describe(calibration))
+    assert words is not None and "focal length on the axis" in page(calibration)
+    return float(words[1]), float(words[2])
+
+
+def test_the_focal_length_is_told_whatever_a_model_calls_fx(calibration: Calibration) -> None:
+    focal_px, sigma_px = told_focal_px(calibration)
+    fx, fy = calibration.camera.parameters[:2]
+    half = 0.5 * np.array([np.sqrt(fy / fx), np.sqrt(fx / fy)])
+    expected = calibration.widening * np.sqrt(half @ calibration.covariance[:2, :2] @ half)
+    assert focal_px == pytest.approx(np.sqrt(fx * fy), abs=0.01 * sigma_px + 0.01)
+    assert sigma_px == pytest.approx(expected, rel=0.05)
+    truth = lens("wide")
+    views = random_views(truth, IMAGES, np.random.default_rng(2), reach_deg=55.0, noise_px=NOISE_PX)[0]
+    sphere = calibrate(views, truth.size_px, model="double_sphere", board="flat")
+    focal_px, sigma_px = told_focal_px(sphere)
+    assert abs(sphere.camera.parameters[0] - truth.focal_px) > 50.0 > 10.0 * abs(focal_px - truth.focal_px)
+
+
 def test_says_what_the_calibration_says(calibration: Calibration) -> None:
     text = re.sub(r'src="data:[^"]*"', "", page(calibration))
     assert f"held-out RMS <b>{calibration.heldout_rms_px:.3f} px</b>" in text
