@@ -143,5 +143,6 @@ def _check(what: str, value: float, sigma: float, unit: str) -> None:
     if sigma >= value:
         # Any result would agree with it: a check that cannot fail. Angles across faces are never near 0.
         raise InputError(
-            f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement; were both exchanged?"
+            f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement: were both exchanged, or is "
+            "one in another unit?"
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -190,11 +191,20 @@ def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[Val
             f"pair '{failed[0][0]}': {failed[0][1].name} comes out {percent:+.1f} %: it was misread, or the squares "
             f"are {squares}"
         ]
-    return [
+    exchanged = [
+        f"pairs '{one}' and '{two}': each {a.name} comes out as the other's is written: they were probably exchanged"
+        for (one, a), (two, b) in combinations(failed, 2)
+        if a.name == b.name and one != two and _would_hold(a, b.measured) and _would_hold(b, a.measured)
+    ]
+    return exchanged or [
         f"pair '{pair}': {check.name} comes out {100.0 * (check.ours / check.measured - 1.0):+.1f} % while other "
         "lengths hold: it was probably misread"
         for pair, check in failed
     ]
+
+
+def _would_hold(check: Check, measured: float) -> bool:
+    return abs(check.ours - measured) <= check.limit_k * check.combined_sigma
 
 
 def _diagnose_angles(report: ValidationReport) -> list[str]:
@@ -202,6 +212,10 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
     if not failed:
         return []
     names = [check.name.removeprefix("angle ") for check in failed]
+    radians = [c for c in failed if abs(c.ours / np.degrees(c.measured) - 1.0) < UNIT_RATIO]
+    if radians:
+        said = ", ".join(c.name.removeprefix("angle ") for c in radians)
+        return [f"pair '{report.pair_id}': {said}: written in radians? Angles are in degrees"]
     supplement = [c for c in failed if abs(180.0 - c.ours - c.measured) <= c.limit_k * c.combined_sigma]
     if supplement:
         return [

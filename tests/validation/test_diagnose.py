@@ -31,6 +31,7 @@ def reported(
     scale: float = 1.0,
     angles: tuple[float, ...] = (90.0, 90.0, 90.0),
     stated_mm: float = BASELINE_MM,
+    stated_sigma_mm: float = 1.0,
     stated_deg: float = 90.0,
     distances: bool = True,
     pair_id: str = "made",
@@ -50,7 +51,9 @@ def reported(
     )
     ends = [(Feature.parse("plane1.centre"), Feature.parse(f"plane{k}.centre")) for k in (2, 3)]
     lengths = tuple(MeasuredDistance(a, b, CENTRES_MM, 1.0, "steel rule") for a, b in ends)
-    return validate(made, PairTruth(MeasuredLength(stated_mm, 1.0, "rule"), stated, lengths if distances else ()))
+    return validate(
+        made, PairTruth(MeasuredLength(stated_mm, stated_sigma_mm, "rule"), stated, lengths if distances else ())
+    )
 
 
 def test_nothing_is_suspected_where_all_is_well() -> None:
@@ -184,12 +187,27 @@ def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1000.0), ("cm", 10.0), ("inches", 25.4)])
 def test_a_length_in_another_unit_is_named(unit: str, factor: float) -> None:
-    one = diagnose([reported(stated_mm=BASELINE_MM / factor, distances=False)])
+    stated = {"stated_mm": BASELINE_MM / factor, "stated_sigma_mm": 1.0 / factor}
+    one = diagnose([reported(**stated, distances=False)])
     assert len(one) == 1
     assert f"written in {unit}?" in one[0]
-    beside = diagnose([reported(stated_mm=BASELINE_MM / factor)])
+    beside = diagnose([reported(**stated)])
     assert f"written in {unit}?" in beside[0]
     assert not any("written in" in words for words in diagnose([reported(stated_mm=BASELINE_MM / 1.1)]))
+
+
+def test_an_angle_in_radians_is_named() -> None:
+    found = diagnose([reported(stated_deg=float(np.radians(90.0)))])
+    assert found == ("pair 'made': plane1-plane2: written in radians? Angles are in degrees",)
+
+
+def test_baselines_of_two_pairs_that_were_exchanged_are_named() -> None:
+    near = reported(pair_id="near", stated_mm=0.6 * BASELINE_MM, distances=False)
+    far = reported(pair_id="far", scale=0.6, stated_mm=BASELINE_MM, distances=False)
+    words = "pairs 'near' and 'far': each baseline comes out as the other's is written: they were probably exchanged"
+    assert words in diagnose([near, far])
+    off = reported(pair_id="far", scale=0.6, stated_mm=1.1 * BASELINE_MM, distances=False)
+    assert not any("exchanged" in one for one in diagnose([near, off]))
 
 
 def test_corners_of_different_boards_are_not_called_wrong_squares() -> None:
