@@ -63,7 +63,7 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
 
     Raises InputError where the paper is unknown or too small; the message names the paper that would do.
     """
-    size = _sheet_size(board, paper)
+    size = _sheet_size(board, paper.lower())
     if board.ink().inverted and not len(board.ink().circles):
         raise InputError(
             f"board '{board.board_id}': {board.pattern.type} boards are printed black on white; leave 'inverted' out"
@@ -215,8 +215,11 @@ def _sheet_size(board: Board, paper: str) -> tuple[float, float]:
         edge = 2.0 * UNPRINTABLE_MM + RULER_STRIP_MM
         part = float(((np.sort(PAPERS[paper]) - edge) / (np.sort((width, height)) - edge)).min())
         largest = np.floor(part * max(board.squares_mm))
-        known = board.pattern.size_word == "square" and largest >= 1.0
-        smaller = f"squares of up to {largest:.0f} mm" if known else "smaller ones"
+        smaller = "fewer of them"
+        if board.pattern.size_word == "square" and largest >= 1.0:
+            smaller = f"squares of up to {largest:.0f} mm"
+        elif part > 0.0:
+            smaller = f"every length {np.floor(100.0 * part):.0f} % of what it is, at most"
         raise InputError(
             f"a board of {width:.0f} x {height:.0f} mm (with margins and rulers) does not fit on {paper}: "
             f"{advice} {smaller}"

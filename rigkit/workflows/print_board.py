@@ -55,7 +55,7 @@ def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path,
     Raises InputError for a board that does not fit on the paper, or a file that cannot be written.
     """
     layout = board if isinstance(board, Board) else load_layout(board)
-    with about(f"{layout.columns}x{layout.rows}" if isinstance(board, Board) else board):
+    with about(layout.describe().split(", ")[0] if isinstance(board, Board) else board):
         sheet = board_sheet(layout, options.paper)
     files: dict[Path, str | bytes] = {
         Path(f"{options.output}.pdf"): pdf_bytes(sheet),

@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ import pytest
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.circles import Circles
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.report.plan_page import printed_outlines
+from rigkit.workflows.print_board import PrintOptions, print_board
 
 POINTS_PER_MM = 72.0 / 25.4
 PDF_ROUNDING_MM = 1e-4
@@ -82,3 +85,12 @@ def test_too_large_a_board_is_told_which_paper_would_do() -> None:
         board_sheet(Board("b", 30, 30, 50.0, 50.0), "a0")
     with pytest.raises(InputError, match="known: a4"):
         board_sheet(Board("b", 8, 6, 5.0, 5.0), "a7")
+
+
+def test_tags_that_are_too_large_are_called_tags(tmp_path: Path) -> None:
+    board = Board("b", 12, 12, 24.0, 24.0, pattern=AprilGrid(0.3))
+    with pytest.raises(InputError, match=r"^'6 x 6 tags': .* every length 94 % of what it is, at most") as caught:
+        print_board(board, PrintOptions(output=tmp_path / "b"))
+    assert "12x12" not in str(caught.value)
+    smaller = Board("b", 12, 12, 0.94 * 24.0, 0.94 * 24.0, pattern=AprilGrid(0.3))
+    assert print_board(smaller, PrintOptions(output=tmp_path / "b", paper="A4"))
