@@ -34,6 +34,8 @@ BARE_POINT = 1.5
 MAX_NORMALS = 300
 """Of a cloud without boards: more are not drawn."""
 NORMAL_COLOUR = "#1f6fd0"
+PYRAMID = np.array([[0.0, 0.0, 0.0], [-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
+"""Tip and base of a drawn camera of depth 1."""
 PYRAMID_DEPTH_IN_FIGURE = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 
@@ -160,10 +162,11 @@ def cloud_figure(reconstruction: Reconstruction, *, unit: str = "mm") -> Figure:
             axis.scatter(*p.T, s=5, color=colour, label=name, depthshade=False)
             axis.quiver(*p.T, *n.T, color=colour, linewidth=0.6, arrow_length_ratio=0.25)
         cameras = ((Rigid3.identity(), "camera 1"), (reconstruction.cam2_from_cam1.inverse(), "camera 2"))
+        depth = reach * PYRAMID_DEPTH_IN_FIGURE
         for cam1_from_cam, name in cameras:
-            _draw_pyramid(axis, cam1_from_cam, reach * PYRAMID_DEPTH_IN_FIGURE, name)
+            _draw_pyramid(axis, cam1_from_cam, depth, name)
         axis.view_init(elev=elevation, azim=azimuth)
-        _fit_equal(axis, reconstruction)
+        _fit_equal(axis, reconstruction, np.concatenate([_pyramid(pose, depth) for pose, _ in cameras]))
         axis.set_xlabel(f"x {unit}", fontsize=7)
         from_above = elevation > 45.0
         axis.set_ylabel(f"z {unit}", fontsize=7, labelpad=ABOVE_PAD if from_above else SIDE_PAD)
@@ -221,25 +224,29 @@ def _upright(vectors: FloatArray) -> FloatArray:
     return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], axis=-1)
 
 
+def _pyramid(cam1_from_cam: Rigid3, depth: float) -> FloatArray:
+    """Return tip and base (5, 3) of a camera's pyramid, in plot axes."""
+    return _upright(cam1_from_cam.apply(depth * PYRAMID))
+
+
 def _draw_pyramid(axis: Any, cam1_from_cam: Rigid3, depth: float, name: str) -> None:
-    corners = depth * np.array([[-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
-    tip = _upright(cam1_from_cam.translation_mm)
-    base = _upright(cam1_from_cam.apply(corners))
+    tip, *base = _pyramid(cam1_from_cam, depth)
     # One line through all eight edges; two of them are drawn twice.
     edges = np.stack([tip, base[0], base[1], tip, base[2], base[3], tip, base[3], base[0], base[1], base[2]])
     axis.plot(*edges.T, color="black", linewidth=0.8)
-    axis.text(*tip, f"   {name}", fontsize=7)
+    # Below its tip: beside it, it would lie over the numbers of an axis.
+    axis.text(*tip, f"\n{name}", fontsize=7, horizontalalignment="center", verticalalignment="top", linespacing=0.5)
 
 
-def _fit_equal(axis: Any, reconstruction: Reconstruction) -> None:
-    """Set limits around cloud and cameras, millimetres equal on all axes, and fill the picture with that box."""
+def _fit_equal(axis: Any, reconstruction: Reconstruction, pyramids: FloatArray) -> None:
+    """Set limits around the cloud and the cameras' `pyramids` (N, 3), in plot axes, millimetres equal on all axes, and
+    fill the picture with that box."""
     from mpl_toolkits.mplot3d import proj3d
 
-    centres = np.stack([np.zeros(3), reconstruction.cam2_from_cam1.inverse().translation_mm])
     points = reconstruction.cloud.points_mm
     distance = np.linalg.norm(points, axis=1)
     points = points[distance < FAR * np.median(distance)]
-    everything = _upright(np.concatenate([points, centres]))
+    everything = np.concatenate([_upright(points), pyramids])
     low, high = everything.min(axis=0), everything.max(axis=0)
     margin = 0.05 * (high - low).max()
     low, high = low - margin, high + margin

@@ -44,6 +44,22 @@ def test_the_cloud_s_axes_and_their_numbers_are_all_in_the_picture(baseline_mm: 
         assert max(drawn.width / (0.5 * width), drawn.height / height) > 0.8
 
 
+@pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (-300.0, 0.0, 0.0), (0.0, 0.0, -150.0)])
+def test_cameras_are_drawn_within_the_axes(baseline_mm: tuple[float, float, float]) -> None:
+    from mpl_toolkits.mplot3d import Axes3D
+    from mpl_toolkits.mplot3d.art3d import Line3D
+
+    figure = cloud_figure(make_reconstruction(cam2_from_cam1=Rigid3(np.eye(3), np.array(baseline_mm))))
+    lines = [(axes, line) for axes in figure.axes if isinstance(axes, Axes3D) for line in axes.lines]
+    assert len(lines) == 4
+    for axes, line in lines:
+        assert isinstance(line, Line3D)
+        for (low, high), values in zip(
+            (axes.get_xlim(), axes.get_ylim(), axes.get_zlim()), line.get_data_3d(), strict=True
+        ):
+            assert low <= np.min(values) and np.max(values) <= high
+
+
 @pytest.mark.parametrize("baseline_mm", [(300.0, 0.0, 0.0), (0.0, 0.0, -150.0), (250.0, 40.0, 90.0)])
 def test_no_axis_name_lies_over_a_number(baseline_mm: tuple[float, float, float]) -> None:
     from mpl_toolkits.mplot3d import Axes3D
