@@ -178,7 +178,7 @@ def test_what_names_tell_of_cameras(tmp_path: Path, names: list[str], expected: 
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     if expected is None:
-        with pytest.raises(InputError, match="left and right"):
+        with pytest.raises(InputError, match="give one folder a camera"):
             cameras_in([tmp_path])
         return
     assert {name: [pattern for _, pattern in own] for name, own in cameras_in([tmp_path]).items()} == expected
