@@ -3,9 +3,12 @@
 SIMULATED: five lenses, boards that are not flat, each held where the coach asks within a human's error, until it says
 that there are enough. REAL: the images of a capture, in a random order, offered to the coach as photos in a watched
 folder are, until it says so. In both, what the coach says is put beside what all of `calibrate` states, and beside the
-truth: the lens, or the calibration from all images where boards were.
+truth: the lens, or the calibration from all images where boards were. `--rig`: SIMULATED pairs of each lens, 60 mm
+apart; said and true are the largest of the errors of either lens, and of both projections where boards were, mounts
+included.
 
-    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--real SET ... [--data DIR] [--cache DIR]]
+    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--rig | --real SET ... [--data DIR]
+        [--cache DIR]]
 """
 
 from __future__ import annotations
@@ -19,18 +22,27 @@ from pathlib import Path
 
 import numpy as np
 from bench_planner import BOARD, LENSES, NOISE_PX, SIZE, Lens, by_hand, true_error
+from bench_rig_planner import MOUNT, NAMES
 from planner.real import GRID, Images
+from scipy.optimize import least_squares
 from split_halves import CAPTURES
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
-from rigkit.cameras.compare import compare_cameras
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions
 from rigkit.coach.look import Glance
+from rigkit.coach.rig import RigGuide
+from rigkit.coach.rig_whole import left_of_rig, whole_rig
+from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.detections import BoardView
-from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import projection_goal
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.planning.candidates import Reach, outline_mm
+from rigkit.planning.goal import GOAL_GRID, projection_goal, rays_within
 from rigkit.synthetic.scene import PlacedBoard
 
 BOW_MM, TWIST_MM, WAVE_MM = 0.4, 0.12, 0.06
@@ -91,7 +103,7 @@ def ended(
     found = calibrate(guide.views, guide.size_px, model="auto")
     known = uncertain_camera(found)
     stated = float(projection_goal(known.camera, field_deg).error(known.covariance))
-    said = float("nan") if advice.error is None else advice.error
+    said = advice.left[0].error if advice.left else float("nan")
     return found, {
         "frames": len(guide.views),
         "words": advice.words,
@@ -121,6 +133,75 @@ def simulated(name: str, goal_px: float, rng: np.random.Generator) -> Session:
             guide.add(view, SIZE)
     found, said = ended(guide, advice, lens.field_deg, longest)
     return Session(true=true_error(lens, found.camera), **said)  # type: ignore[arg-type]
+
+
+def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Session:
+    """Hold boards into the outlines that the coach of a pair of cameras shows, until it says that there are enough."""
+    lens, empty = LENSES[name], Glance(size_px=SIZE, view=None)
+    options = GuideOptions(
+        boards=(BOARD,), hfov_deg=WIDTH_DEG[name], goal_px=goal_px, reach=Reach(field_deg=lens.field_deg)
+    )
+    guide, longest, alone = RigGuide(NAMES, options), 0.0, 0
+    for k in range(MAX_FRAMES):
+        began = time.process_time()
+        advice = guide.advise([empty, empty])
+        longest = max(longest, time.process_time() - began)
+        # From here on the rig's calibration decides.
+        alone = alone or (len(guide.frames) if advice.left else 0)
+        if advice.enough:
+            break
+        asked = shown_pose(lens, advice.targets)
+        for _ in range(TRIES):
+            held = by_hand(asked, BOARD, rng)
+            views = [
+                see(PlacedBoard(BOARD, pose @ held.world_from_board), lens, f"{own}-{k:03d}", rng)
+                for own, pose in zip(NAMES, (Rigid3.identity(), MOUNT), strict=True)
+            ]
+            if any(view is not None for view in views):
+                guide.add([Glance(size_px=SIZE, view=view) for view in views])
+                break
+    whole = whole_rig([[glance.view for glance in frame] for frame in guide.frames], NAMES, [SIZE, SIZE])
+    assert whole is not None
+    left = left_of_rig(whole.rig, options)
+    return Session(
+        frames=len(guide.frames),
+        words=advice.words,
+        said=max(own.error for own in advice.left) if advice.left else float("nan"),
+        stated=max(own.error for own in left),
+        true=max(true_error_of_rig(lens, whole.rig), *(true_error(lens, own.camera) for own in whole.rig.cameras)),
+        model=f"{'/'.join(own.camera.model for own in whole.rig.cameras)}, {alone} frames by lenses and mounts alone",
+        seconds=longest,
+    )
+
+
+def shown_pose(lens: Lens, targets: Sequence[Pixels | None]) -> Rigid3:
+    """Return where a board before a pair fills the first outline that is shown."""
+    c, outline = next((c, target) for c, target in enumerate(targets) if target is not None)
+    paper = outline_mm(BOARD)
+    corners = outline[:: len(outline) // len(paper)]
+    shown = np.isfinite(corners).all(axis=1)
+    return (Rigid3.identity(), MOUNT)[c].inverse() @ cam_from_seen_board(lens.camera, corners[shown], paper[shown])
+
+
+def true_error_of_rig(lens: Lens, rig: RigCalibration) -> float:
+    """Return the rms error of the projections of a pair, px, of what lies before both cameras where boards were, after
+    the best motion of the world."""
+    boards = [view.cam_from_board.translation_mm for own in rig.cameras for view in own.calibration.views]
+    rays = rays_within(lens.camera, grid_pixels(SIZE, GOAL_GRID).reshape(-1, 2), lens.field_deg)
+    before = float(np.median(np.linalg.norm(boards, axis=-1))) * rays
+    points = np.concatenate([before, MOUNT.inverse().apply(before)])
+    poses = (Rigid3.identity(), MOUNT)
+    exact = [lens.camera.project(pose.apply(points)) for pose in poses]
+    seen = [valid & lens.camera.on_image(pixels) for pixels, valid in exact]
+
+    def off(motion: FloatArray) -> FloatArray:
+        moved = points @ exp_so3(motion[:3]).T + 100.0 * motion[3:]
+        shown = [own.camera.project(own.cam_from_rig.apply(moved))[0] for own in rig.cameras]
+        rows = [(a - b)[own] for a, (b, _), own in zip(shown, exact, seen, strict=True)]
+        return np.nan_to_num(np.concatenate(rows)).ravel()
+
+    found = least_squares(off, np.zeros(6))
+    return float(np.sqrt(2.0 * (found.fun**2).mean()))
 
 
 def real(images: Images, goal_px: float, rng: np.random.Generator) -> Session:
@@ -174,6 +255,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lens", nargs="+", choices=sorted(LENSES), default=list(LENSES))
     parser.add_argument("--goal", type=float, default=0.1, help="px")
+    parser.add_argument("--rig", action="store_true", help="pairs of cameras instead")
     parser.add_argument("--real", nargs="+", choices=sorted(CAPTURES), metavar="SET", help="of split_halves.py instead")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
@@ -183,7 +265,8 @@ def main() -> None:
         sessions = []
         for seed in range(args.seeds):
             rng = np.random.default_rng([seed, 5])
-            sessions.append(simulated(name, args.goal, rng) if images is None else real(images, args.goal, rng))
+            one = simulated_rig if args.rig else simulated
+            sessions.append(one(name, args.goal, rng) if images is None else real(images, args.goal, rng))
             print(f"{name:8s} {seed}: {sessions[-1]}", flush=True)
         together(name, sessions)
 

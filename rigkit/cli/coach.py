@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_reach_arguments(parser)
     parser.add_argument("--length", type=float, metavar="MM", help="a length so long is to be measured,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance,")
-    parser.add_argument("--goal-mm", type=float, metavar="MM", help="as well as this (standard error)")
+    parser.add_argument("--goal-mm", type=float, metavar="MM", help="as well as this (standard error), beside --goal")
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--cameras", type=int, default=1, metavar="N", help="of the browser, taken together (default: 1)"

@@ -16,7 +16,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
 from rigkit.coach.look import Glance
-from rigkit.coach.whole import WholeCalibrations
+from rigkit.coach.whole import WholeCalibrations, whole_calibration
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -24,7 +24,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.processes import Here
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Aim, Goal, projection_goal, px_words, turned_design
+from rigkit.planning.goal import Goal, Left, Wish, projection_goal, px_words, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
@@ -56,8 +56,9 @@ class GuideOptions:
     boards : those that may be shown.
     hfov_deg : rough field of view across the image, until pictures say better.
     goal_px : rms error of the projection at which there are enough; of a rig also of what one camera tells another.
-    goal_mm : error of `measured` at which there are enough, instead; None: only the projection counts.
-    measured : says of a camera what is to be measured with it, in mm.
+    goal_mm : error of `measured` at which there are enough, as well; None: only the projection counts.
+    measured : says of cameras, and of where they stand in their rig, what is to be measured with them, in mm; raises
+        DegenerateError where that is nowhere in view.
     reach : where boards can be held.
     """
 
@@ -65,27 +66,25 @@ class GuideOptions:
     hfov_deg: float = 70.0
     goal_px: float = 0.1
     goal_mm: float | None = None
-    measured: Callable[[Camera], Goal] | None = None
+    measured: Callable[[Sequence[Camera], Sequence[Rigid3]], Sequence[Goal]] | None = None
     reach: Reach = field(default_factory=Reach)
 
-    def goal(self, camera: Camera) -> Goal:
-        """Return what is to become small."""
-        if self.goal_mm is not None and self.measured is not None:
-            return self.measured(camera)
-        return projection_goal(camera, self.reach.field_deg)
+    def wishes(self, camera: Camera) -> tuple[Wish, ...]:
+        """Return what is to become small of a camera alone: the error of its projection, and what is measured."""
+        projection = Wish(projection_goal(camera, self.reach.field_deg), self.goal_px)
+        return projection, *self.lengths((camera,), (Rigid3.identity(),))
+
+    def lengths(self, cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3]) -> tuple[Wish, ...]:
+        """Return what is measured with cameras, as small as it is wanted; raises DegenerateError where that is nowhere
+        in view."""
+        if self.goal_mm is None or self.measured is None:
+            return ()
+        return tuple(Wish(goal, self.goal_mm) for goal in self.measured(cameras, cam_from_rig))
 
     def stated(self, calibration: Calibration) -> str:
-        """Return in words what a calibration says of the goal: its error, and whether that is small enough."""
+        """Return in words what a calibration says of the goals: errors, and whether they are small enough."""
         known = uncertain_camera(calibration)
-        goal = self.goal(known.camera)
-        error = float(goal.error(known.covariance))
-        is_reached = error <= self.wanted
-        return f"error {error:.2g} {goal.unit} ({'as wanted' if is_reached else f'wanted {self.wanted:g}'})"
-
-    @property
-    def wanted(self) -> float:
-        """How small, in the goal's unit."""
-        return self.goal_px if self.goal_mm is None or self.measured is None else self.goal_mm
+        return stated_words([wish.left(known.covariance) for wish in self.wishes(known.camera)])
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -100,8 +99,7 @@ class Advice:
     take : this very frame is worth taking.
     enough : there are enough frames.
     waits : nothing is asked for, until it is known whether there are.
-    error : what the frames so far leave of what is to become small, in `unit`; None where nobody knows yet.
-    error_px : rms error of the projection that they leave.
+    left : what the frames so far leave of what is to become small, the projection first; empty where nobody knows yet.
     more_percent : what two more frames would bring.
     """
 
@@ -111,10 +109,13 @@ class Advice:
     take: bool
     enough: bool
     waits: bool
-    error: float | None
-    unit: str
-    error_px: float | None
+    left: tuple[Left, ...]
     more_percent: float | None
+
+    @property
+    def share(self) -> float:
+        """What is left as a part of what is wanted, the worst of it; infinite where nobody knows yet."""
+        return max((own.share for own in self.left), default=np.inf)
 
 
 class CaptureGuide:
@@ -127,8 +128,9 @@ class CaptureGuide:
         self.size_px: tuple[int, int] | None = None
         self._quick: Calibration | None = None
         self._stale = False
-        self._whole = WholeCalibrations(executor or Here())
+        self._whole = WholeCalibrations(executor or Here(), whole_calibration)
         self._plan: Plan | None = None
+        self._left_now: tuple[Left, ...] = ()
         self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
@@ -152,11 +154,7 @@ class CaptureGuide:
         """Take what has been calibrated meanwhile, and have calibrated what has come."""
         if self.size_px is None or _distinct(self.views) < ENOUGH_FRAMES:
             return
-        while True:
-            # A session that goes on has no held-out error of fewer frames to compare with.
-            self._whole.ask(self.views if self._whole.is_new(self.views) else self.views[:-1], self.size_px)
-            if not self._whole.arrived():
-                return
+        if self._whole.go_on(self.views, self.size_px):
             self._plan = self._map = None
 
     def advise(self, glance: Glance, *, photo: bool = False) -> Advice:
@@ -166,17 +164,15 @@ class CaptureGuide:
         target = self.asked(glance.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth, least_worth = self._worth(glance.view, plan, photo=photo), least_worth_of(photo=photo)
-        error = None if self.calibration is None else self._stated(plan, plan.goal)
-        error_px = None if error is None else self._stated(plan, self._projection(plan))
-        reached = error is not None and error <= self.options.wanted
-        would_do = error is not None and _distinct(self.views) >= ENOUGH_FRAMES
-        would_do = would_do and (reached or plan.gain < WORTH_GOING_ON)
+        left = () if self.calibration is None else self._left_now
+        would_do = bool(left) and _distinct(self.views) >= ENOUGH_FRAMES
+        would_do = would_do and (all(own.reached for own in left) or plan.gain < WORTH_GOING_ON)
         steady = self._whole.steady(len(self.views)) if would_do else False
         words = f"Hold the board: {where}"
         if steady is None:
             words = CHECKING
-        elif steady and error is not None and error_px is not None:
-            words = self._enough_words(plan, error, error_px, reached=reached)
+        elif steady:
+            words = enough_words(left, plan.gain, plan.knowledge.camera)
         elif glance.view is not None and worth >= least_worth and glance.complaint:
             words = glance.complaint.capitalize()
         elif would_do:
@@ -188,17 +184,9 @@ class CaptureGuide:
             take=not glance.complaint and worth >= least_worth and steady is False,
             enough=steady is True,
             waits=steady is None,
-            error=error,
-            unit=plan.goal.unit,
-            error_px=error_px,
-            more_percent=None if error is None else 100.0 * plan.gain,
+            left=left,
+            more_percent=100.0 * plan.gain if left else None,
         )
-
-    def _enough_words(self, plan: Plan, error: float, error_px: float, *, reached: bool) -> str:
-        unit, wanted = plan.goal.unit, self.options.wanted
-        left = px_words(plan.knowledge.camera, error_px) if unit == "px" else f"{error:.2g} {unit}, {error_px:.2g} px"
-        more = f"two more pictures would bring {'' if reached else 'only '}{100.0 * plan.gain:.0f} %"
-        return f"Enough: {left}; {more}" if reached else f"Enough: {left}, not {wanted:g} {unit}, but {more}"
 
     def asked(self, size_px: tuple[int, int]) -> Proposal:
         """Return where the outline is."""
@@ -216,17 +204,16 @@ class CaptureGuide:
         """Return where a board is; None where the lens does not see enough of it."""
         return _pose(self.camera(size_px), view)
 
-    def _projection(self, plan: Plan) -> Goal:
-        return projection_goal(plan.knowledge.camera, self.options.reach.field_deg)
-
-    def _stated(self, plan: Plan, goal: Aim) -> float:
-        """Return what the frames leave of a goal: as all of `calibrate` states it for those that it has had."""
-        error = float(goal.error(covariance_of(plan.knowledge.information)))
+    def _left(self, knowledge: Knowledge) -> tuple[Left, ...]:
+        """Return what the frames leave of what is to become small: as all of `calibrate` states it for those that it
+        has had."""
+        left = [wish.left(covariance_of(knowledge.information)) for wish in self.options.wishes(knowledge.camera)]
         whole = self._whole.latest
         if whole is None:
-            return error
+            return tuple(left)
         then, stated = covariance_of(whole.knowledge.information), whole.stated.covariance
-        return error * float(goal.error(stated) / goal.error(then))
+        factors = [float(own.wish.goal.error(stated) / own.wish.goal.error(then)) for own in left]
+        return tuple(replace(own, error=own.error * factor) for own, factor in zip(left, factors, strict=True))
 
     def sigma_map(self) -> list[list[float | None]] | None:
         """Return the rms error of the projection over the image, rows of LIVE_GRID px, None where the lens does not
@@ -249,13 +236,14 @@ class CaptureGuide:
 
     def _planned(self, size_px: tuple[int, int]) -> Plan:
         if self._plan is None:
-            knowledge, goal = self._known(size_px)
-            o = self.options
+            knowledge, o = self._known(size_px), self.options
+            self._left_now = self._left(knowledge)
+            goal = max(self._left_now, key=lambda own: own.share).wish.goal
             last = _pose(knowledge.camera, self.views[-1]) if self.views else None
             self._plan = plan_views(knowledge, o.boards, goal, 2, reach=o.reach, last=last)
         return self._plan
 
-    def _known(self, size_px: tuple[int, int]) -> tuple[Knowledge, Goal]:
+    def _known(self, size_px: tuple[int, int]) -> Knowledge:
         later: Sequence[BoardView] = ()
         if self._whole.latest is not None:
             knowledge, later = self._whole.latest.knowledge, self.views[self._whole.count :]
@@ -270,26 +258,49 @@ class CaptureGuide:
             pose = _pose(knowledge.camera, view)
             if pose is not None:
                 knowledge = knowledge.with_views(held_view(view, pose), view.board.board_id)
-        return knowledge, self.options.goal(knowledge.camera)
+        return knowledge
+
+    def repeats(self, view: BoardView) -> bool:
+        """Say whether the board was not moved since a frame that is taken: the two count as one."""
+        return _distinct([*self.views, view]) == _distinct(self.views)
 
     def _worth(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
         """Return what this frame brings, as a part of what the outline would: nothing where the board was not moved
         since one that is taken, for the two count as one. A photo that is new is worth taking as one of the first, and
         where it takes enough off the error."""
-        if view is None or _distinct([*self.views, view]) == _distinct(self.views):
+        if view is None or self.repeats(view):
             return 0.0
         pose = _pose(plan.knowledge.camera, view)
         if pose is None:
             return 0.0
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
-        after = float(plan.goal.error(covariance_of(known.information + more)))
-        brings = (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
-        if not photo:
-            return brings
+        worth = worth_beside(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
         # So few frames do not tell what others would bring.
-        few = WORTH_OF_PHOTO if _distinct(self.views) < ENOUGH_FRAMES else 0.0
-        return max(brings, WORTH_OF_PHOTO / WORTH_GOING_ON * (1.0 - after / plan.error), few)
+        few = photo and _distinct(self.views) < ENOUGH_FRAMES
+        return max(worth, WORTH_OF_PHOTO) if few else worth
+
+
+def worth_beside(plan: Plan, after: float, *, photo: bool) -> float:
+    """Return what a frame that leaves the error `after` brings, as a part of what the first of the plan would; of a
+    photo also what it takes off the error counts."""
+    brings = (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
+    return max(brings, WORTH_OF_PHOTO / WORTH_GOING_ON * (1.0 - after / plan.error)) if photo else brings
+
+
+def stated_words(left: Sequence[Left]) -> str:
+    """Return errors in words, and whether they are small enough."""
+    each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.wish.wanted:g}'})" for own in left)
+    return f"error {', '.join(each)}"
+
+
+def enough_words(left: Sequence[Left], gain: float, camera: Camera | None = None) -> str:
+    """Return that there are enough frames, in words; of one `camera` also what an error comes to."""
+    said = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
+    missed = [f"{own.wish.wanted:g} {own.wish.goal.unit}" for own in left if not own.reached]
+    if not missed:
+        return f"Enough: {said}; two more pictures would bring {100.0 * gain:.0f} %"
+    return f"Enough: {said}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"
 
 
 def least_worth_of(*, photo: bool) -> float:

@@ -1,22 +1,37 @@
 """Several cameras whose frames are taken together: every lens by its own guide, and the mounts by the boards that two
 cameras see at once. Of one camera it is that camera's guide.
 
-The lens that is worst off says what to do, until all are well; then the camera whose mount is least sure does.
+The lens that is worst off says what to do, until all are well; then the camera whose mount is least sure does; and then
+what all of the rig's calibration says of all frames, which alone tells whether there are enough.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions, held_view, least_worth_of
+from rigkit.coach.guide import (
+    CHECKING,
+    WORTH_GOING_ON,
+    Advice,
+    CaptureGuide,
+    GuideOptions,
+    enough_words,
+    held_view,
+    least_worth_of,
+)
 from rigkit.coach.look import Glance
+from rigkit.coach.rig_whole import RigKnown, whole_rig
+from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
+from rigkit.core.errors import DegenerateError
+from rigkit.core.processes import Here
 from rigkit.planning.candidates import held_boards, outline_mm
+from rigkit.planning.goal import Left
 from rigkit.planning.information import HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.planning.words import placement
@@ -32,18 +47,26 @@ MAX_MARKS = 1500
 class RigAdvice:
     """What the coach says: words, what these frames bring as a part of what a board in the outline would, whether to
     take them, whether there are enough or nothing is asked for until that is known (`waits`), the number of the camera
-    that it speaks of, what each camera's guide says, outlines (K, 2) to hold the board into by camera (None: none), and
-    how wrong the mounts are (px; None where nobody knows)."""
+    that it speaks of, what each camera's guide says, outlines (K, 2) to hold the board into by camera (None: none), how
+    wrong the mounts are (px; None where nobody knows), and, once the rig was calibrated, what that leaves of what is to
+    become small, and the part of the worst of it that two more frames would take away."""
 
-    words: str
-    worth: float
-    take: bool
-    enough: bool
-    waits: bool
-    speaks: int
     lenses: tuple[Advice, ...]
-    targets: tuple[Pixels | None, ...]
     mount_px: float | None
+    words: str = ""
+    worth: float = 0.0
+    take: bool = False
+    enough: bool = False
+    waits: bool = False
+    speaks: int = 0
+    targets: tuple[Pixels | None, ...] = ()
+    left: tuple[Left, ...] = ()
+    gain: float | None = None
+
+    @property
+    def more_percent(self) -> float | None:
+        """What two more frames would bring."""
+        return self.lenses[self.speaks].more_percent if self.gain is None else 100.0 * self.gain
 
 
 class RigGuide:
@@ -51,7 +74,11 @@ class RigGuide:
 
     def __init__(self, names: Sequence[str], options: GuideOptions, executor: Executor | None = None) -> None:
         self.names, self.options = tuple(names), options
-        self.lenses = tuple(CaptureGuide(options, executor) for _ in names)
+        # What several cameras measure, they measure together.
+        alone = options if len(names) == 1 else replace(options, goal_mm=None)
+        self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
+        self._whole = WholeCalibrations(executor or Here(), whole_rig)
+        self._known: RigKnown | None = None
         self.frames: list[tuple[Glance, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
@@ -67,52 +94,77 @@ class RigGuide:
 
     def advise(self, glances: Sequence[Glance], *, photo: bool = False) -> RigAdvice:
         """Return what to do, and whether to take these frames, or photos."""
-        least_worth = least_worth_of(photo=photo)
         lenses = tuple(lens.advise(glance, photo=photo) for lens, glance in zip(self.lenses, glances, strict=True))
-        seeing = [g for g in glances if g.view is not None]
-        good = bool(seeing) and not any(g.complaint for g in seeing)
-        # Nobody knows an error: the lens with the fewest frames goes first.
-        badly = [
-            (advice.enough, advice.waits, -(np.inf if advice.error is None else advice.error), len(lens.views))
-            for lens, advice in zip(self.lenses, lenses, strict=True)
-        ]
-        speaks = min(range(len(lenses)), key=lambda c: badly[c])
         mounts = {c: self._mount_px(c) for c in range(1, len(lenses))}
         open_mounts = [c for c, px in mounts.items() if px is None or px > self.options.goal_px]
         known_px = [px for px in mounts.values() if px is not None]
         mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
-        enough = all(advice.enough for advice in lenses) and not open_mounts
-        worth = max(
-            [a.worth for a, g in zip(lenses, glances, strict=True) if not (a.enough or a.waits) and g.view], default=0.0
-        )
-        words, targets = (
-            lenses[speaks].words,
-            [a.target_px if c == speaks and not a.waits else None for c, a in enumerate(lenses)],
-        )
-        if len(lenses) > 1 and not enough:
-            words = f"{self.names[speaks]}: {words}"
-        if lenses[speaks].enough and open_mounts:
+        said = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
+        if len(lenses) == 1 or not all(advice.enough for advice in lenses):
+            said = self._of_lenses(said, glances)
+        elif open_mounts:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
-            if speaks not in self._asked:
-                self._asked[speaks] = self._shared_target(speaks)
-            words, targets = self._asked[speaks]
-            worth = self._shared_worth(speaks, glances)
-        take = good and worth >= least_worth and not enough
-        if take:
-            words = TAKING
-        elif not enough and worth >= least_worth:
-            words = next((g.complaint.capitalize() for g in seeing if g.complaint), words)
-        return RigAdvice(
-            words=words,
-            worth=worth,
-            take=take,
-            enough=enough,
-            waits=lenses[speaks].waits,
+            said = self._of_mount(replace(said, speaks=speaks), glances)
+        else:
+            said = self._of_rig(said, glances, photo=photo)
+        seeing, least_worth = [g for g in glances if g.view is not None], least_worth_of(photo=photo)
+        complaint = next((g.complaint for g in seeing if g.complaint), "")
+        if said.enough or said.waits or not seeing or said.worth < least_worth:
+            return said
+        return replace(said, take=not complaint, words=complaint.capitalize() or TAKING)
+
+    def _of_lenses(self, said: RigAdvice, glances: Sequence[Glance]) -> RigAdvice:
+        """Return what the lens that is worst off says; where nobody knows an error, that with the fewest frames."""
+        lenses = said.lenses
+        badly = [(a.enough, a.waits, -a.share, len(lens.views)) for lens, a in zip(self.lenses, lenses, strict=True)]
+        speaks = min(range(len(lenses)), key=lambda c: badly[c])
+        own = lenses[speaks]
+        return replace(
+            said,
+            words=own.words if len(lenses) == 1 else f"{self.names[speaks]}: {own.words}",
+            worth=max(
+                [a.worth for a, g in zip(lenses, glances, strict=True) if not (a.enough or a.waits) and g.view],
+                default=0.0,
+            ),
+            enough=own.enough,
+            waits=own.waits,
             speaks=speaks,
-            lenses=lenses,
-            targets=tuple(targets),
-            mount_px=mount_px,
+            targets=tuple(a.target_px if c == speaks and not a.waits else None for c, a in enumerate(lenses)),
         )
+
+    def _of_mount(self, said: RigAdvice, glances: Sequence[Glance]) -> RigAdvice:
+        """Return what the camera whose mount is least sure says."""
+        c = said.speaks
+        if c not in self._asked:
+            self._asked[c] = self._shared_target(c)
+        words, targets = self._asked[c]
+        return replace(said, words=words, targets=tuple(targets), worth=self._shared_worth(c, glances))
+
+    def _of_rig(self, said: RigAdvice, glances: Sequence[Glance], *, photo: bool) -> RigAdvice:
+        """Return what the rig's calibration says, once lenses and mounts seem good enough."""
+        frames = [[glance.view for glance in frame] for frame in self.frames]
+        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses]):
+            self._known = None
+        steady, whole = self._whole.steady(len(frames)), self._whole.latest
+        if steady is None:
+            return replace(said, words=CHECKING, waits=True)
+        if whole is None:
+            return self._of_mount(replace(said, speaks=1), glances)
+        try:
+            known = self._known = self._known or RigKnown.of(whole.rig, self.options)
+        except DegenerateError as error:
+            return replace(said, words=str(error))
+        said = replace(said, left=known.left, gain=known.plan.gain)
+        would_do = known.reached or known.plan.gain < WORTH_GOING_ON
+        if steady and would_do:
+            return replace(said, words=enough_words(known.left, known.plan.gain), enough=True)
+        words, targets = known.target()
+        if would_do:
+            words = f"One more, to see that it is steady: {words[0].lower()}{words[1:]}"
+        frame = [glance.view for glance in glances]
+        new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
+        worth = known.worth(frame, photo=photo) if new else 0.0
+        return replace(said, words=words, targets=tuple(targets), worth=worth)
 
     def _partner(self, c: int) -> int:
         """Return the camera that saw most boards together with camera `c`."""
@@ -194,20 +246,16 @@ class RigGuide:
         """Return what the page shows."""
         out: dict[str, Any] = {"frames": len(self.frames)}
         if advice is not None:
-            first = advice.lenses[advice.speaks]
-            errors = [a.error_px for a in advice.lenses]
+            left = advice.left or advice.lenses[advice.speaks].left
             out |= {
                 "words": advice.words,
                 "take": advice.take,
                 "enough": advice.enough,
                 "waits": advice.waits,
-                "error": first.error,
-                "unit": first.unit,
-                "goal": self.options.wanted,
-                "error_px": None if None in errors else max(e for e in errors if e is not None),
-                "mount_px": advice.mount_px,
-                "goal_px": self.options.goal_px,
-                "more_percent": first.more_percent,
+                "error": ", ".join(map(str, left)),
+                "share": max((own.share for own in left), default=None),
+                "mount_px": None if advice.left else advice.mount_px,
+                "more_percent": advice.more_percent,
             }
         cameras = []
         for c, (name, lens) in enumerate(zip(self.names, self.lenses, strict=True)):

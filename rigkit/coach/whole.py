@@ -7,10 +7,11 @@ session will come to, so only that may say that there are frames enough.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from typing import Any, Generic, Protocol, TypeVar
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
@@ -26,6 +27,16 @@ STEADY = 0.15
 predicted 15 % worse in rms than they are together has residuals twice as large as theirs."""
 
 
+class WithHeldOut(Protocol):
+    """What was calibrated with frames held out."""
+
+    @property
+    def heldout_px(self) -> float | None: ...
+
+
+Found = TypeVar("Found", bound=WithHeldOut)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Whole:
     """A calibration, what is known by it, for what is to be taken next, and how sure it says that the lens is."""
@@ -33,6 +44,10 @@ class Whole:
     calibration: Calibration
     knowledge: Knowledge
     stated: UncertainCamera
+
+    @property
+    def heldout_px(self) -> float | None:
+        return self.calibration.heldout_rms_px
 
 
 def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Whole | None:
@@ -45,31 +60,41 @@ def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> W
         return None
 
 
-class WholeCalibrations:
-    """Calibrations of the first frames of a capture, one at a time. `latest` is that of most frames, of which there are
-    `count`."""
+class WholeCalibrations(Generic[Found]):
+    """Calibrations of the first frames of a capture, one at a time, by `calibrated`, which gets the frames and what
+    belongs to them, in another process. `latest` is that of most frames, of which there are `count`."""
 
-    def __init__(self, executor: Executor) -> None:
-        self.latest: Whole | None = None
+    def __init__(self, executor: Executor, calibrated: Callable[..., Found | None]) -> None:
+        self.latest: Found | None = None
         self.count = 0
-        self._executor = executor
+        self._executor, self._calibrated = executor, calibrated
         self._heldout_px: dict[int, float | None] = {}
-        self._asked: tuple[int, Future[Whole | None]] | None = None
+        self._asked: tuple[int, Future[Found | None]] | None = None
 
-    def is_new(self, views: Sequence[BoardView]) -> bool:
+    def go_on(self, frames: Sequence[Any], *given: object) -> bool:
+        """Take what has been calibrated meanwhile, and have calibrated what has come; say whether there is news."""
+        news = False
+        while True:
+            # A session that goes on has no held-out error of fewer frames to compare with.
+            self.ask(frames if self.is_new(frames) else frames[:-1], *given)
+            if not self.arrived():
+                return news
+            news = True
+
+    def is_new(self, frames: Sequence[Any]) -> bool:
         """Say whether so many frames have not been calibrated."""
-        return len(views) not in self._heldout_px
+        return len(frames) not in self._heldout_px
 
-    def ask(self, views: Sequence[BoardView], size_px: tuple[int, int]) -> None:
+    def ask(self, frames: Sequence[Any], *given: object) -> None:
         """Have frames calibrated, if that is not known, and nothing else is under way."""
-        if self._asked is not None or not self.is_new(views):
+        if self._asked is not None or not self.is_new(frames):
             return
         try:
-            future = self._executor.submit(whole_calibration, views, size_px)
+            future = self._executor.submit(self._calibrated, frames, *given)
         except BrokenProcessPool:
             self._executor = Here()
-            future = self._executor.submit(whole_calibration, views, size_px)
-        self._asked = len(views), future
+            future = self._executor.submit(self._calibrated, frames, *given)
+        self._asked = len(frames), future
 
     def arrived(self) -> bool:
         """Say whether there is a new one."""
@@ -82,7 +107,7 @@ class WholeCalibrations:
             # Without its process the page stands still for a moment, but the capture goes on.
             self._executor = Here()
             return False
-        self._heldout_px[count] = None if found is None else found.calibration.heldout_rms_px
+        self._heldout_px[count] = None if found is None else found.heldout_px
         if found is None or count < self.count:
             return False
         self.latest, self.count = found, count

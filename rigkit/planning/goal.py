@@ -3,7 +3,7 @@ trace(W C), with C their covariance."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
-from rigkit.core.arrays import FloatArray, Pixels, Rays
+from rigkit.core.arrays import FloatArray, IntArray, Pixels, Rays
 
 GOAL_GRID = (24, 18)
 """Columns and rows of the pixels that the goal averages over."""
@@ -44,6 +44,45 @@ class Goal:
         """Return what covariances (..., T, T) leave, (...,); the camera's parameters are the first of T."""
         p = len(self.weight)
         return np.asarray(np.sqrt(np.maximum((self.weight * covariance[..., :p, :p]).sum(axis=(-1, -2)), 0.0)))
+
+    def among(self, index: IntArray, count: int) -> Goal:
+        """Return it where there are `count` unknowns, of which its own are those at `index` (P,)."""
+        weight = np.zeros((count, count))
+        weight[np.ix_(index, index)] = self.weight
+        return replace(self, weight=weight)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Wish:
+    """How small a goal's error is to become, in its unit, and whose it is: "" where there is but one."""
+
+    goal: Goal
+    wanted: float
+    whose: str = ""
+
+    def left(self, covariance: FloatArray) -> Left:
+        """Return how far it is from that."""
+        return Left(self, float(self.goal.error(covariance)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Left:
+    """What there is left of a goal's error."""
+
+    wish: Wish
+    error: float
+
+    @property
+    def share(self) -> float:
+        """As a part of what is wanted: reached at 1."""
+        return self.error / self.wish.wanted
+
+    @property
+    def reached(self) -> bool:
+        return self.share <= 1.0
+
+    def __str__(self) -> str:
+        return f"{self.wish.whose} {self.error:.2g} {self.wish.goal.unit}".lstrip()
 
 
 def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:

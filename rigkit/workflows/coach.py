@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 
 from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach, Image, Take, ignored
-from rigkit.coach.guide import GuideOptions
+from rigkit.coach.guide import GuideOptions, stated_words
 from rigkit.coach.keeper import Keeper, folder_of
 from rigkit.coach.look import Glance
+from rigkit.coach.rig_whole import left_of_rig
 from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
 from rigkit.coach.sources import Frame, device_frames, watched_frames
-from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.findings import Severity, worst
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.files import ensure_folder_writable
 from rigkit.io.rig_session import ONE
 from rigkit.io.session import SESSION_NAME
@@ -39,7 +41,7 @@ from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.corners import Cache
 from rigkit.workflows.folder_session import session_to_come
 from rigkit.workflows.frames import frames_of_videos, moments_of_videos, timestamps_beside
-from rigkit.workflows.next_views import goal_of
+from rigkit.workflows.next_frames import length_goals
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (
@@ -88,8 +90,8 @@ def open_coach(options: CoachOptions, tell: Callable[[str], None] = ignored, exe
     guide, length = options.guide, options.length
     if length is not None:
 
-        def measured(camera: Camera) -> Goal:
-            return goal_of(camera, guide.reach, length)
+        def measured(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3]) -> Sequence[Goal]:
+            return length_goals(cameras, cam_from_rig, length)
 
         guide = replace(guide, measured=measured)
     return Coach(guide, keeper, lambda: finished_words(options.folder, guide), tell, executor)
@@ -119,7 +121,10 @@ def finished_words(folder: Path, guide: GuideOptions) -> str:
         what = f"{c.camera.model}, {guide.stated(c)}"
         return _finished(what, c.rms_px, c.heldout_rms_px, worst(c.verdicts), done.written)
     rig = done.rig
-    what = "; ".join(f"{own.name}: {guide.stated(own.calibration)}" for own in rig.cameras)
+    try:
+        what = stated_words(left_of_rig(rig, guide))
+    except DegenerateError as error:
+        what = str(error)
     return _finished(what, rig.rms_px, rig.heldout_rms_px, worst(rig.verdicts), done.written)
 
 
@@ -174,7 +179,7 @@ def coach_recording(
     if not guide.frames:
         return ""
     advice = guide.advise([Glance(size_px=glance.size_px, view=None) for glance in guide.frames[-1]])
-    more = advice.lenses[advice.speaks].more_percent
+    more = advice.more_percent
     bring = "" if more is None else f"; two more pictures would bring {more:.0f} %"
     return "" if advice.enough else f". What it lacks: {advice.words[0].lower()}{advice.words[1:]}{bring}"
 

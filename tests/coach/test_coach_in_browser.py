@@ -172,7 +172,7 @@ def test_a_capture_from_beginning_to_end(tmp_path: Path) -> None:
         assert page.evaluate("coach.state.frames") >= kept
         said = page.wait("coach.state.enough && coach.state.words", PATIENCE_S)
         assert said.startswith("Enough: ") and "two more pictures would bring" in said
-        assert page.evaluate("coach.state.error") <= GOAL_PX
+        assert page.evaluate("coach.state.share") <= 1
         page.wait("coach.state.finished", PATIENCE_S)
         assert _words(page).startswith("Done: ") and "calibration.json written" in _words(page)
         assert page.evaluate('["take", "undo", "done"].every((id) => document.getElementById(id).hidden)')

@@ -14,13 +14,15 @@ import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE
 from helpers.calibration_scenes import noisy_view
 
+from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.coach.guide import CHECKING, CaptureGuide, GuideOptions
+from rigkit.coach.guide import CHECKING, WORTH_GOING_ON, CaptureGuide, GuideOptions
 from rigkit.coach.look import Glance
 from rigkit.coach.whole import STEADY, Whole, WholeCalibrations, whole_calibration
 from rigkit.core.detections import BoardView
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach, held_boards
-from rigkit.planning.goal import projection_goal
+from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.coach import CoachOptions, open_coach
 
 FRAMES, NOISE_PX = 10, 0.05
@@ -73,15 +75,14 @@ def test_it_waits_for_all_of_calibrate_and_says_what_that_states(views: list[Boa
     assert later.tell(whole) == FRAMES and guide.advise(seen).waits, "no held-out error of fewer to compare with"
     assert later.tell(whole) == FRAMES - 1
     now = guide.advise(EMPTY)
-    stated = projection_goal(whole.stated.camera).error(whole.stated.covariance)
+    stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
     assert now.enough and not now.waits and now.words.startswith("Enough: ")
-    assert now.error is not None
-    assert now.error == pytest.approx(stated) and now.error_px == pytest.approx(stated)
+    assert [own.error for own in now.left] == pytest.approx([stated])
     # Another frame makes it better, but nobody has calibrated it.
     pose = held_boards(CAMERA, BOARD, Reach(nearest_mm=250.0)).pose(7)
     guide.add(noisy_view(CAMERA, pose, "more", np.random.default_rng(9), NOISE_PX, board=BOARD), SIZE)
     after = guide.advise(EMPTY)
-    assert after.waits and not after.enough and after.error is not None and after.error < now.error
+    assert after.waits and not after.enough and after.left[0].error < now.left[0].error
 
 
 def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardView], whole: Whole) -> None:
@@ -95,7 +96,7 @@ def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardVi
     guide.advise(EMPTY)
     later.tell(unsure)
     now = guide.advise(EMPTY)
-    assert now.error == pytest.approx(3.0 * stated)
+    assert now.left[0].error == pytest.approx(3.0 * stated)
     # What it is less sure of is said, and that more pictures would not bring it where that is so.
     assert not now.enough or f"not {2.0 * stated:g} px" in now.words
 
@@ -114,16 +115,16 @@ def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView],
     assert not now.enough and not now.waits and now.words.startswith("One more, to see that it is steady: ")
 
 
-def test_without_its_process_the_capture_goes_on(
-    views: list[BoardView], whole: Whole, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("rigkit.coach.whole.whole_calibration", lambda *_: whole)
+def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: Whole) -> None:
+    def calibrated(*_: object) -> Whole:
+        return whole
 
     class Ended(Executor):
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
             raise BrokenProcessPool
 
-    at_once, meanwhile = WholeCalibrations(Ended()), WholeCalibrations(later := Later())
+    later = Later()
+    at_once, meanwhile = (WholeCalibrations(executor, calibrated) for executor in (Ended(), later))
     at_once.ask(views, SIZE)
     meanwhile.ask(views, SIZE)
     later.asked[0][1].set_exception(BrokenProcessPool())
@@ -147,3 +148,26 @@ def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
         later.tell(whole)
         coach.state()
     assert coach.state()["enough"] and not coach.state()["waits"]
+
+
+@pytest.mark.parametrize(("px", "mm"), [(2.0, 2.0), (0.5, 2.0), (2.0, 0.5)])
+def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted(
+    views: list[BoardView], whole: Whole, px: float, mm: float
+) -> None:
+    def measured(cameras: Sequence[Camera], _: Sequence[Rigid3]) -> Sequence[Goal]:
+        return [replace(projection_goal(cameras[0]), unit="mm")]
+
+    stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
+    later = Later()
+    wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=px * stated, goal_mm=mm * stated, measured=measured)
+    guide = CaptureGuide(wanted, later)
+    for view in views:
+        guide.add(view, SIZE)
+    for _ in range(2):
+        guide.advise(EMPTY)
+        later.tell(whole)
+    now = guide.advise(EMPTY)
+    assert [own.reached for own in now.left] == [px > 1.0, mm > 1.0]
+    assert now.more_percent is not None and now.more_percent > 100.0 * WORTH_GOING_ON, "more pictures would help"
+    assert now.enough is (min(px, mm) > 1.0) and not now.waits
+    assert wanted.stated(whole.calibration).count("as wanted") == (px > 1.0) + (mm > 1.0)

@@ -12,7 +12,9 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees_held
-from rigkit.planning.plan import Proposal
+from rigkit.planning.goal import Goal
+from rigkit.planning.information import CornerError, Knowledge
+from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
 from rigkit.validation.sentinel.evidence import Watched, told_by
 
 
@@ -63,6 +65,15 @@ class Frames:
         count = np.ones(len(held), dtype=np.int64)
         told = told_by(watched, board, in_rig.rotation, in_rig.translation_mm, corners)
         return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, told)
+
+    def plan(self, watched: Watched, boards: Sequence[Board], goal: Goal, count: int) -> Plan:
+        """Return the `count` frames that would lower the goal's error most. Images are taken to disagree as those of
+        the calibration do."""
+        inverse, sigma = covariance_of(watched.covariance), watched.fresh_sigma_px
+        taken, errors = choose_views(inverse, self.information / sigma**2, goal, count)
+        known = Knowledge(watched.cameras[0], inverse, CornerError(sigma))
+        views = self.proposals(watched, boards, taken, errors)
+        return Plan(known, goal, float(goal.error(watched.covariance)), views)
 
     def proposals(
         self, watched: Watched, boards: Sequence[Board], taken: Sequence[int], errors: Sequence[float]

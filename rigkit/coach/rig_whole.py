@@ -1,0 +1,131 @@
+"""What `rigkit calibrate` says of all frames of a rig: whether there are enough, and what to take next where not.
+
+Lenses and mounts that are good enough each by itself need not be so together, and the rig may know its lenses better
+than they do alone. Only the rig's calibration is what the session will come to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.coach.guide import GuideOptions, worth_beside
+from rigkit.core.arrays import Pixels
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.planning.goal import Left, Wish, projection_goal
+from rigkit.planning.plan import Plan, covariance_of
+from rigkit.planning.rig_goal import rig_goal
+from rigkit.planning.words import placement
+from rigkit.validation.sentinel.evidence import Watched, told_by
+from rigkit.validation.sentinel.frames import Frames
+from rigkit.validation.sentinel.watch import watched_rig
+
+Views = Sequence[BoardView | None]
+"""What the cameras saw at one moment, one a camera."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class WholeRig:
+    """A rig's calibration."""
+
+    rig: RigCalibration
+
+    @property
+    def heldout_px(self) -> float | None:
+        return self.rig.heldout_rms_px
+
+
+def whole_rig(frames: Sequence[Views], names: Sequence[str], sizes_px: Sequence[tuple[int, int]]) -> WholeRig | None:
+    """Return what `calibrate` makes of frames of the cameras `names`; None where they do not determine the rig."""
+    views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
+    for k, frame in enumerate(frames):
+        for name, view in zip(names, frame, strict=True):
+            if view is not None:
+                views[name].append((f"{k:04d}", replace(view, image=f"{name}-{k:04d}")))
+    sizes = dict(zip(names, sizes_px, strict=True))
+    try:
+        return WholeRig(calibrate_rig(views, sizes, model="auto", board="auto"))
+    except (InputError, DegenerateError):
+        return None
+
+
+def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[Left, ...]:
+    """Return what a rig's calibration leaves of what is to become small: the error of each lens alone; that of all
+    projections, mounts included, where boards were; and of what is measured.
+
+    Raises DegenerateError where that is nowhere in view.
+    """
+    cameras, covariance = rig.quoted
+    mounts = [own.cam_from_rig for own in rig.cameras]
+    layout, field_deg = Layout.of_cameras(cameras), options.reach.field_deg
+    wishes = []
+    for own, camera, at in zip(rig.cameras, cameras, layout.cameras, strict=True):
+        goal = projection_goal(camera, field_deg).among(np.r_[at], layout.count)
+        wishes.append(Wish(goal, options.goal_px, own.name))
+    boards = [view.cam_from_board.translation_mm for own in rig.cameras for view in own.calibration.views]
+    away_mm = float(np.median(np.linalg.norm(boards, axis=-1)))
+    wishes.append(Wish(rig_goal(cameras, mounts, away_mm, field_deg), options.goal_px, "together"))
+    wishes += options.lengths(cameras, mounts)
+    return tuple(wish.left(covariance) for wish in wishes)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RigKnown:
+    """What a rig's calibration leaves, and the next two frames for what is farthest from what is wanted."""
+
+    watched: Watched
+    left: tuple[Left, ...]
+    plan: Plan
+
+    @classmethod
+    def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
+        """Raises DegenerateError where what is to be measured is nowhere in view."""
+        watched, left = watched_rig(rig), left_of_rig(rig, options)
+        farthest = max(left, key=lambda own: own.share)
+        frames = Frames.of(watched, options.boards, options.reach)
+        return cls(watched, left, frames.plan(watched, options.boards, farthest.wish.goal, 2))
+
+    @property
+    def reached(self) -> bool:
+        return all(own.reached for own in self.left)
+
+    def target(self) -> tuple[str, list[Pixels | None]]:
+        """Return where to hold the board next, in words and as outlines."""
+        asked, names = self.plan.views[0], self.watched.names
+        first = names.index(asked.seen_by[0])
+        rig_from_board = self.watched.cam_from_rig[first].inverse() @ asked.cam_from_board
+        targets: list[Pixels | None] = [None] * len(names)
+        for name in asked.seen_by:
+            c = names.index(name)
+            held = placement(self.watched.cameras[c], asked.board, self.watched.cam_from_rig[c] @ rig_from_board)
+            targets[c] = held.outline_px
+        where = placement(asked.camera, asked.board, asked.cam_from_board)
+        together = f" where {' and '.join(asked.seen_by)} see it" if len(asked.seen_by) > 1 else ""
+        return f"Hold the board{together}: {where} of {names[first]}", targets
+
+    def worth(self, frame: Views, *, photo: bool) -> float:
+        """Return what a frame brings, as a part of what the one asked for would."""
+        watched, plan = self.watched, self.plan
+        for camera, mount, view in zip(watched.cameras, watched.cam_from_rig, frame, strict=True):
+            if view is None:
+                continue
+            try:
+                held = mount.inverse() @ cam_from_seen_board(camera, view.pixels, view.points())
+            except (InputError, DegenerateError):
+                continue
+            seen = np.zeros((len(frame), 1, view.board.corner_count), dtype=bool)
+            for own, other in zip(seen, frame, strict=True):
+                if other is not None and other.board.board_id == view.board.board_id:
+                    own[0, view.board.index(other.grid)] = True
+            told = told_by(watched, view.board, held.rotation[None], held.translation_mm[None], list(seen))[0]
+            after = plan.goal.error(covariance_of(plan.knowledge.information + told / watched.fresh_sigma_px**2))
+            return worth_beside(plan, float(after), photo=photo)
+        return 0.0

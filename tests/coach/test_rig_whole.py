@@ -1,0 +1,186 @@
+"""A rig has frames enough only where all of its calibration says so: lenses, mounts, and what is to be measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from coach.test_coach import BOARD, SIZE
+from coach.test_rig import REACH, both, shared_boards
+
+from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.coach.guide import CHECKING, GuideOptions
+from rigkit.coach.look import Glance
+from rigkit.coach.rig import RigGuide
+from rigkit.coach.rig_whole import RigKnown, WholeRig, left_of_rig, whole_rig
+from rigkit.coach.whole import STEADY, Whole
+from rigkit.core.errors import DegenerateError
+from rigkit.planning.goal import projection_goal
+from rigkit.planning.information import Knowledge
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.workflows.next_frames import length_goals
+
+NAMES, OTHER = ("left", "right"), "right"
+FRAMES = 10
+EMPTY = [Glance(size_px=SIZE, view=None)] * 2
+LENGTH = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=600.0)
+
+
+def frame(k: int, rng: np.random.Generator) -> list[Glance]:
+    """What both cameras see of a board that both see."""
+    in_a, _ = shared_boards(60)
+    seen = both(in_a.pose(k), rng, f"{k}")
+    return [replace(g, view=replace(g.view, image=f"{n}{k}")) for n, g in zip(NAMES, seen, strict=True) if g.view]
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[list[Glance]]:
+    rng = np.random.default_rng(5)
+    return [frame(4 * k, rng) for k in range(FRAMES)]
+
+
+@pytest.fixture(scope="module")
+def rig(frames: list[list[Glance]]) -> RigCalibration:
+    views = {
+        name: [(f"{k}", seen[c].view) for k, seen in enumerate(frames) if seen[c].view is not None]
+        for c, name in enumerate(NAMES)
+    }
+    return calibrate_rig(views, dict.fromkeys(NAMES, SIZE), model="brown", degree=5)  # type: ignore[arg-type]
+
+
+@dataclass
+class Later(Executor):
+    """Has the lenses' calibrations at hand, sure of all; the rig's come when that is told."""
+
+    rig: RigCalibration
+    asked: list[tuple[int, Future[WholeRig | None]]] = field(default_factory=list)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        if fn is whole_rig:
+            self.asked.append((len(args[0]), future))
+        else:
+            own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
+            future.set_result(Whole(own, Knowledge.beyond_model(own), uncertain_camera(own)))
+        return future
+
+    def tell(self, found: RigCalibration) -> int:
+        count, future = self.asked[-1]
+        future.set_result(WholeRig(found))
+        return count
+
+
+def guide_of(frames: Sequence[Sequence[Glance]], executor: Executor, **more: Any) -> RigGuide:
+    wanted: dict[str, Any] = {"boards": (BOARD,), "hfov_deg": 52.0, "goal_px": 3.0, "reach": REACH} | more
+    guide = RigGuide(NAMES, GuideOptions(**wanted), executor)
+    for seen in frames:
+        guide.add(seen)
+    return guide
+
+
+def told(guide: RigGuide, later: Later, found: RigCalibration) -> None:
+    """Tell the guide what came of all frames, and of all but the last."""
+    assert guide.advise(EMPTY).waits
+    assert later.tell(found) == FRAMES and guide.advise(EMPTY).waits, "no held-out error of fewer to compare with"
+    assert later.tell(later.rig) == FRAMES - 1
+
+
+def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
+    frames: list[list[Glance]], rig: RigCalibration
+) -> None:
+    later = Later(rig)
+    guide = guide_of(frames, later)
+    now = guide.advise(EMPTY)
+    assert all(lens.enough for lens in now.lenses) and now.mount_px is not None and now.mount_px < 3.0
+    assert now.waits and now.words == CHECKING and not now.enough and guide.advise(frames[0]).take is False
+    told(guide, later, rig)
+    now = guide.advise(EMPTY)
+    assert now.enough and now.words.startswith("Enough: left ") and "together" in now.words
+    assert [own.wish.whose for own in now.left] == ["left", "right", "together"]
+    # The rig's own statements: of each lens as its calibration has it, and of all projections together.
+    for own, camera in zip(now.left, rig.cameras, strict=False):
+        known = uncertain_camera(camera.calibration)
+        stated = float(projection_goal(known.camera).error(known.covariance))
+        assert own.error == pytest.approx(stated, rel=0.1)
+    state = guide.state(EMPTY, now)
+    assert state["error"].startswith("left ") and state["share"] <= 1.0 and state["mount_px"] is None
+
+
+def test_what_the_rig_is_less_sure_of_is_asked_for(
+    frames: list[list[Glance]], rig: RigCalibration, rng: np.random.Generator
+) -> None:
+    # The mount is a hundred times less sure than the boards that both see say.
+    unsure, mount = rig.covariance.copy(), rig.mount(1)
+    unsure[mount] *= 100.0
+    unsure[:, mount] *= 100.0
+    doubtful = replace(rig, covariance=unsure)
+    later = Later(rig)
+    guide = guide_of(frames, later)
+    told(guide, later, doubtful)
+    now = guide.advise(EMPTY)
+    *lenses, together = now.left
+    assert all(own.reached for own in lenses) and not together.reached
+    assert not now.enough and not now.waits and now.words.startswith("Hold the board where ")
+    assert all(target is not None for target in now.targets), "outlines in both images"
+    seen = guide.advise(frame(3, rng))
+    assert seen.worth > 0.2 and guide.advise(frames[-1]).worth == 0.0, "the board was not moved"
+
+
+def test_a_held_out_error_of_the_rig_that_changes_asks_for_one_more(
+    frames: list[list[Glance]], rig: RigCalibration
+) -> None:
+    usual = rig.heldout_rms_px
+    assert usual is not None
+    later = Later(rig)
+    guide = guide_of(frames, later)
+    told(guide, later, replace(rig, heldout_rms_px=(1.0 + 2.0 * STEADY) * usual))
+    now = guide.advise(EMPTY)
+    assert not now.enough and now.words.startswith("One more, to see that it is steady: hold the board")
+
+
+def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig: RigCalibration) -> None:
+    def measured(cameras: Sequence[Any], cam_from_rig: Sequence[Any]) -> Any:
+        return length_goals(cameras, cam_from_rig, LENGTH)
+
+    options = GuideOptions(boards=(BOARD,), goal_px=3.0, goal_mm=1.0, measured=measured, reach=REACH)
+    in_mm = left_of_rig(rig, options)[-1]
+    assert in_mm.wish.goal.unit == "mm" and in_mm.error > 0.0
+    for part, enough in ((2.0, True), (0.5, False)):
+        later = Later(rig)
+        guide = guide_of(frames, later, goal_mm=part * in_mm.error, measured=measured)
+        told(guide, later, rig)
+        now = guide.advise(EMPTY)
+        assert all(own.reached for own in now.left[:-1]) and now.left[-1].reached is enough
+        assert now.enough is enough or f"not {0.5 * in_mm.error:g} mm" in now.words
+
+    def nowhere(*_: object) -> Any:
+        raise DegenerateError("nowhere is it in view")
+
+    later = Later(rig)
+    guide = guide_of(frames, later, goal_mm=1.0, measured=nowhere)
+    told(guide, later, rig)
+    now = guide.advise(EMPTY)
+    assert not now.enough and now.words == "nowhere is it in view"
+
+
+def test_frames_of_a_rig_are_calibrated_by_their_moments(
+    frames: list[list[Glance]], rig: RigCalibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "rigkit.coach.rig_whole.calibrate_rig",
+        lambda views, sizes, model, board: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
+    )
+    views = [[glance.view for glance in seen] for seen in frames]
+    found = whole_rig([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])
+    assert found is not None and found.rig.shared_count == FRAMES - 1
+    assert found.rig.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
+    never_both = [[left, None] if k % 2 else [None, right] for k, (left, right) in enumerate(views)]
+    assert whole_rig(never_both, NAMES, [SIZE, SIZE]) is None
+    known = RigKnown.of(found.rig, GuideOptions(boards=(BOARD,), reach=REACH))
+    assert known.plan.views[-1].error < known.plan.error
