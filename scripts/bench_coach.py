@@ -5,10 +5,10 @@ that there are enough. REAL: the images of a capture, in a random order, offered
 folder are, until it says so. In both, what the coach says is put beside what all of `calibrate` states, and beside the
 truth: the lens, or the calibration from all images where boards were. `--rig`: SIMULATED pairs of each lens, 60 mm
 apart; said and true are the largest of the errors of either lens, and of both projections where boards were, mounts
-included.
+included. `--follow`: SIMULATED sessions go on to so many frames, whatever is said.
 
-    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1] [--rig | --real SET ... [--data DIR]
-        [--cache DIR]]
+    python scripts/bench_coach.py [--seeds 5] [--lens NAME ...] [--goal 0.1]
+        [--follow N | --rig | --real SET ... [--data DIR] [--cache DIR]]
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +50,8 @@ BOW_MM, TWIST_MM, WAVE_MM = 0.4, 0.12, 0.06
 WIDTH_DEG = {"tele-20": 20.0, "60": 60.0, "90": 90.0, "120": 120.0, "185": 240.0}
 GUESSED_WRONG = 0.1
 MAX_FRAMES, TRIES = 60, 5
+GOALS_PX = (0.1, 0.12, 0.14, 0.17, 0.2, 0.25)
+"""Of sessions that are followed: what is planned does not depend on the goal."""
 SAME = 1.03
 """Goal reached, but all of `calibrate` states more than this part of it: said too early."""
 
@@ -114,25 +116,45 @@ def ended(
     }
 
 
-def simulated(name: str, goal_px: float, rng: np.random.Generator) -> Session:
+def guided(name: str, goal_px: float, rng: np.random.Generator) -> Iterator[tuple[CaptureGuide, Advice, float]]:
+    """Hold boards where the coach asks; yield it, what it says after each, and how long that took (s)."""
     lens = LENSES[name]
     width_deg = WIDTH_DEG[name] * (1.0 + GUESSED_WRONG * rng.uniform(-1.0, 1.0))
     reach = Reach(field_deg=lens.field_deg)
     guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=width_deg, goal_px=goal_px, reach=reach))
-    nothing, longest = Glance(size_px=SIZE, view=None), 0.0
+    nothing = Glance(size_px=SIZE, view=None)
     for k in range(MAX_FRAMES):
         began = time.process_time()
         advice = guide.advise(nothing)
-        longest = max(longest, time.process_time() - began)
-        if advice.enough:
-            break
+        yield guide, advice, time.process_time() - began
         asked = guide.asked(SIZE)
         held = (see(by_hand(asked.cam_from_board, BOARD, rng), lens, f"{k:03d}", rng) for _ in range(TRIES))
         view = next((one for one in held if one is not None), None)
         if view is not None:
             guide.add(view, SIZE)
+
+
+def simulated(name: str, goal_px: float, rng: np.random.Generator) -> Session:
+    lens, longest = LENSES[name], 0.0
+    for guide, advice, seconds in guided(name, goal_px, rng):  # noqa: B007
+        longest = max(longest, seconds)
+        if advice.enough:
+            break
     found, said = ended(guide, advice, lens.field_deg, longest)
     return Session(true=true_error(lens, found.camera), **said)  # type: ignore[arg-type]
+
+
+def followed(name: str, frames: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Go on to so many frames, whatever is said; return true over stated errors after each from the first at which
+    there may be enough, and where what is stated is first within each of GOALS_PX."""
+    lens, errors = LENSES[name], list[tuple[float, float]]()
+    for guide, advice, _ in guided(name, min(GOALS_PX), rng):
+        if guide.has_many and guide.calibration is not None:
+            errors.append((advice.left[0].error, true_error(lens, guide.calibration.camera)))
+        if len(guide.views) >= frames:
+            break
+    first = [next((true / said for said, true in errors if said <= goal), np.nan) for goal in GOALS_PX]
+    return np.array([true / said for said, true in errors]), np.array(first)[np.isfinite(first)]
 
 
 def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Session:
@@ -250,16 +272,33 @@ def together(name: str, sessions: Sequence[Session]) -> None:
     )
 
 
+def follow(name: str, frames: int, seeds: int) -> None:
+    each = [followed(name, frames, np.random.default_rng([seed, 5])) for seed in range(seeds)]
+    for what, k in (("at each frame", 0), ("where it is first within a goal", 1)):
+        ratio = np.concatenate([one[k] for one in each])
+        print(
+            f"{name}: true over stated error {what} ({len(ratio)} in {seeds} sessions): rms "
+            f"{np.sqrt((ratio**2).mean()):.2f}, within it {(ratio <= 1.0).mean():.2f}, within 1.5 times "
+            f"{(ratio <= 1.5).mean():.2f}",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--lens", nargs="+", choices=sorted(LENSES), default=list(LENSES))
     parser.add_argument("--goal", type=float, default=0.1, help="px")
+    parser.add_argument("--follow", type=int, metavar="N", help="go on to N frames instead, whatever the coach says")
     parser.add_argument("--rig", action="store_true", help="pairs of cameras instead")
     parser.add_argument("--real", nargs="+", choices=sorted(CAPTURES), metavar="SET", help="of split_halves.py instead")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "split_halves")
     args = parser.parse_args()
+    if args.follow:
+        for name in args.lens:
+            follow(name, args.follow, args.seeds)
+        return
     for name in args.lens if args.real is None else args.real:
         images = None if args.real is None else Images.of(name, args.data, args.cache)
         sessions = []

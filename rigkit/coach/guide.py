@@ -150,9 +150,14 @@ class CaptureGuide:
         self._stale = False
         return self._quick
 
+    @property
+    def has_many(self) -> bool:
+        """Whether there are frames enough to tell whether the lens model fits."""
+        return _distinct(self.views) >= ENOUGH_FRAMES
+
     def _go_on(self) -> None:
         """Take what has been calibrated meanwhile, and have calibrated what has come."""
-        if self.size_px is None or _distinct(self.views) < ENOUGH_FRAMES:
+        if self.size_px is None or not self.has_many:
             return
         if self._whole.go_on(self.views, self.size_px):
             self._plan = self._map = None
@@ -165,7 +170,7 @@ class CaptureGuide:
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
         worth, least_worth = self._worth(glance.view, plan, photo=photo), least_worth_of(photo=photo)
         left = () if self.calibration is None else self._left_now
-        would_do = bool(left) and _distinct(self.views) >= ENOUGH_FRAMES
+        would_do = bool(left) and self.has_many
         would_do = would_do and (all(own.reached for own in left) or plan.gain < WORTH_GOING_ON)
         steady = self._whole.steady(len(self.views)) if would_do else False
         words = f"Hold the board: {where}"
@@ -277,8 +282,7 @@ class CaptureGuide:
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
         worth = worth_beside(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
         # So few frames do not tell what others would bring.
-        few = photo and _distinct(self.views) < ENOUGH_FRAMES
-        return max(worth, WORTH_OF_PHOTO) if few else worth
+        return max(worth, WORTH_OF_PHOTO) if photo and not self.has_many else worth
 
 
 def worth_beside(plan: Plan, after: float, *, photo: bool) -> float:

@@ -25,7 +25,7 @@ from rigkit.coach.guide import (
     least_worth_of,
 )
 from rigkit.coach.look import Glance
-from rigkit.coach.rig_whole import RigKnown, whole_rig
+from rigkit.coach.rig_whole import RigKnown, WholeRig, whole_rig
 from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
@@ -100,13 +100,14 @@ class RigGuide:
         known_px = [px for px in mounts.values() if px is not None]
         mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
         said = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
-        if len(lenses) == 1 or not all(advice.enough for advice in lenses):
+        alone = all(advice.enough for advice in lenses)
+        if len(lenses) > 1 and not open_mounts and (alone or self._rig_is_enough(lenses)):
+            said = self._of_rig(said, glances, photo=photo)
+        elif len(lenses) == 1 or not alone:
             said = self._of_lenses(said, glances)
-        elif open_mounts:
+        else:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
             said = self._of_mount(replace(said, speaks=speaks), glances)
-        else:
-            said = self._of_rig(said, glances, photo=photo)
         seeing, least_worth = [g for g in glances if g.view is not None], least_worth_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
         if said.enough or said.waits or not seeing or said.worth < least_worth:
@@ -142,16 +143,14 @@ class RigGuide:
 
     def _of_rig(self, said: RigAdvice, glances: Sequence[Glance], *, photo: bool) -> RigAdvice:
         """Return what the rig's calibration says, once lenses and mounts seem good enough."""
-        frames = [[glance.view for glance in frame] for frame in self.frames]
-        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses]):
-            self._known = None
-        steady, whole = self._whole.steady(len(frames)), self._whole.latest
+        self._go_on()
+        steady = self._whole.steady(len(self.frames))
         if steady is None:
             return replace(said, words=CHECKING, waits=True)
-        if whole is None:
+        if self._whole.latest is None:
             return self._of_mount(replace(said, speaks=1), glances)
         try:
-            known = self._known = self._known or RigKnown.of(whole.rig, self.options)
+            known = self._known_by(self._whole.latest)
         except DegenerateError as error:
             return replace(said, words=str(error))
         said = replace(said, left=known.left, gain=known.plan.gain)
@@ -165,6 +164,31 @@ class RigGuide:
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
         worth = known.worth(frame, photo=photo) if new else 0.0
         return replace(said, words=words, targets=tuple(targets), worth=worth)
+
+    def _rig_is_enough(self, lenses: Sequence[Advice]) -> bool:
+        """Say whether the rig's calibration says so although some lens alone does not, as cameras help each other: at
+        the best each of n knows its boards' poses by all n."""
+        if not all(lens.has_many for lens in self.lenses):
+            return False
+        if not all(own.enough or own.share <= np.sqrt(len(lenses)) for own in lenses):
+            return False
+        self._go_on()
+        if not self._whole.steady(len(self.frames)) or self._whole.latest is None:
+            return False
+        try:
+            return self._known_by(self._whole.latest).reached
+        except DegenerateError:
+            return False
+
+    def _go_on(self) -> None:
+        """Take what has been calibrated meanwhile, and have calibrated what has come."""
+        frames = [[glance.view for glance in frame] for frame in self.frames]
+        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses]):
+            self._known = None
+
+    def _known_by(self, whole: WholeRig) -> RigKnown:
+        self._known = self._known or RigKnown.of(whole.rig, self.options)
+        return self._known
 
     def _partner(self, c: int) -> int:
         """Return the camera that saw most boards together with camera `c`."""

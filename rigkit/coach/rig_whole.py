@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -77,21 +78,24 @@ def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[Left, ...]:
     return tuple(wish.left(covariance) for wish in wishes)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class RigKnown:
-    """What a rig's calibration leaves, and the next two frames for what is farthest from what is wanted."""
+    """What is known of a rig by its calibration, and what that leaves."""
 
     watched: Watched
     left: tuple[Left, ...]
-    plan: Plan
+    options: GuideOptions
 
     @classmethod
     def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
         """Raises DegenerateError where what is to be measured is nowhere in view."""
-        watched, left = watched_rig(rig), left_of_rig(rig, options)
-        farthest = max(left, key=lambda own: own.share)
-        frames = Frames.of(watched, options.boards, options.reach)
-        return cls(watched, left, frames.plan(watched, options.boards, farthest.wish.goal, 2))
+        return cls(watched_rig(rig), left_of_rig(rig, options), options)
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The next two frames for what is farthest from what is wanted."""
+        farthest, boards = max(self.left, key=lambda own: own.share), self.options.boards
+        return Frames.of(self.watched, boards, self.options.reach).plan(self.watched, boards, farthest.wish.goal, 2)
 
     @property
     def reached(self) -> bool:

@@ -13,6 +13,7 @@ from coach.test_coach import BOARD, SIZE
 from coach.test_rig import REACH, both, shared_boards
 
 from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import CHECKING, GuideOptions
@@ -184,3 +185,29 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
     assert whole_rig(never_both, NAMES, [SIZE, SIZE]) is None
     known = RigKnown.of(found.rig, GuideOptions(boards=(BOARD,), reach=REACH))
     assert known.plan.views[-1].error < known.plan.error
+
+
+def test_cameras_that_help_each_other_are_enough_before_each_is_alone(
+    frames: list[list[Glance]], rig: RigCalibration
+) -> None:
+    goal_px = max(own.error for own in left_of_rig(rig, GuideOptions(boards=(BOARD,), reach=REACH)))
+    for factor, enough in ((1.3, True), (3.0, False)):
+        # Each alone is less sure than what is wanted.
+        single = [
+            replace(own, covariance=(factor * goal_px) ** 2 / _alone_px(own) ** 2 * own.covariance)
+            for own in rig.single
+        ]
+        later = Later(replace(rig, single=tuple(single)))
+        guide = guide_of(frames, later, goal_px=1.01 * goal_px)
+        for _ in range(2):
+            assert not guide.advise(EMPTY).enough
+            if later.asked:
+                later.tell(rig)
+        now = guide.advise(EMPTY)
+        assert now.enough is enough and bool(later.asked) is enough
+        assert not any(lens.enough for lens in now.lenses)
+
+
+def _alone_px(calibration: Calibration) -> float:
+    known = uncertain_camera(calibration)
+    return float(projection_goal(known.camera).error(known.covariance))
