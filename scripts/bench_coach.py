@@ -163,13 +163,11 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
     options = GuideOptions(
         boards=(BOARD,), hfov_deg=WIDTH_DEG[name], goal_px=goal_px, reach=Reach(field_deg=lens.field_deg)
     )
-    guide, longest, alone = RigGuide(NAMES, options), 0.0, 0
+    guide, longest = RigGuide(NAMES, options), 0.0
     for k in range(MAX_FRAMES):
         began = time.process_time()
         advice = guide.advise([empty, empty])
         longest = max(longest, time.process_time() - began)
-        # From here on the rig's calibration decides.
-        alone = alone or (len(guide.frames) if advice.left else 0)
         if advice.enough:
             break
         asked = shown_pose(lens, advice.targets)
@@ -191,7 +189,7 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
         said=max(own.error for own in advice.left) if advice.left else float("nan"),
         stated=max(own.error for own in left),
         true=max(true_error_of_rig(lens, whole.rig), *(true_error(lens, own.camera) for own in whole.rig.cameras)),
-        model=f"{'/'.join(own.camera.model for own in whole.rig.cameras)}, {alone} frames by lenses and mounts alone",
+        model="/".join(own.camera.model for own in whole.rig.cameras),
         seconds=longest,
     )
 

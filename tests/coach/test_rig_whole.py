@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,12 @@ from rigkit.coach.rig import RigGuide
 from rigkit.coach.rig_whole import RigKnown, WholeRig, left_of_rig, whole_rig
 from rigkit.coach.whole import STEADY, Whole
 from rigkit.core.errors import DegenerateError
+from rigkit.io.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.workflows.calibrate_rig import RigSessionCalibration
+from rigkit.workflows.coach import finished_words
 from rigkit.workflows.next_frames import length_goals
 
 NAMES, OTHER = ("left", "right"), "right"
@@ -168,6 +172,24 @@ def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig:
     told(guide, later, rig)
     now = guide.advise(EMPTY)
     assert not now.enough and now.words == "nowhere is it in view"
+
+
+def test_what_came_of_a_rig_is_said_as_the_rig_states_it(
+    rig: RigCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = RigSession(path=tmp_path / "session.toml", cameras={}, frames=None, baselines=())
+    done = RigSessionCalibration(
+        session=session, rig=rig, checks=(), unreadable={}, written=(tmp_path / "rig.json", tmp_path / "page.html")
+    )
+    monkeypatch.setattr("rigkit.workflows.coach.calibrate_session_file", lambda *_: done)
+    options = GuideOptions(boards=(BOARD,), goal_px=3.0, reach=REACH)
+    words = finished_words(tmp_path, options)
+    assert words.count("(as wanted)") == 3 and "together" in words and "rig.json written" in words
+
+    def nowhere(*_: object) -> Any:
+        raise DegenerateError("nowhere is it in view")
+
+    assert "nowhere" in finished_words(tmp_path, replace(options, goal_mm=1.0, measured=nowhere))
 
 
 def test_frames_of_a_rig_are_calibrated_by_their_moments(
