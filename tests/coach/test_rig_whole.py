@@ -19,7 +19,7 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import Glance
-from rigkit.coach.rig import RigGuide
+from rigkit.coach.rig import MAX_HELP, RigGuide
 from rigkit.coach.rig_whole import RigKnown, WholeRig, left_of_rig, whole_rig
 from rigkit.coach.whole import STEADY, Whole
 from rigkit.core.errors import DegenerateError
@@ -213,7 +213,7 @@ def test_cameras_that_help_each_other_are_enough_before_each_is_alone(
     frames: list[list[Glance]], rig: RigCalibration
 ) -> None:
     goal_px = max(own.error for own in left_of_rig(rig, GuideOptions(boards=(BOARD,), reach=REACH)))
-    for factor, enough in ((1.3, True), (3.0, False)):
+    for factor, enough in ((0.7 * MAX_HELP, True), (1.5 * MAX_HELP, False)):
         # Each alone is less sure than what is wanted.
         single = [
             replace(own, covariance=(factor * goal_px) ** 2 / _alone_px(own) ** 2 * own.covariance)
