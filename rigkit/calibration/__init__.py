@@ -8,7 +8,8 @@
 - how sure that is: `clustered`, `covariance`, `uncertainty`, `between_models`, `departures`, `series`,
   `displaced`
 - where boards were, and how alike neighbours' residuals are: `coverage`, `neighbours`
-- `judging`: `captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds` (with `view_evidence`), `verdicts`
+- `judging`: `captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`, `pupil` (with `view_evidence`),
+  `verdicts`
 - what comes out: `assemble`, `result`
 
 `compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.

@@ -22,6 +22,7 @@ from rigkit.calibration.judging.captured import (
 )
 from rigkit.calibration.judging.changing import MOTION, changing
 from rigkit.calibration.judging.mixed import two_cameras
+from rigkit.calibration.judging.pupil import moving_pupil
 from rigkit.calibration.judging.two_kinds import APART, fewest_of_a_kind
 from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.neighbours import neighbour_correlation
@@ -98,7 +99,7 @@ def judge(
         clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
     upright = same_way_up(calibration)
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
-    mixed, change = _between_images(calibration, correlation, also, clusters, solved)
+    mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else _pattern(calibration, correlation, in_force)
@@ -136,20 +137,20 @@ def judge(
     return (*with_headline(calibration, causes, effects, extent.where), *found)
 
 
-def _between_images(
+def _residuals(
     c: Calibration,
     correlation: float,
+    far: FarProjection,
     also: Sequence[Finding],
     clusters: IntArray,
     solved: tuple[Observations, Fit] | None,
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings on two cameras that are mixed, and on what else differs from image to image."""
-    mixed = two_cameras(c, clusters)
-    if mixed:
+    """Return findings on two cameras that are mixed, and on what else residuals tell of images and lens."""
+    if mixed := two_cameras(c, clusters):
         return mixed, []
     # Where it was another lens later on, residuals of one for both are of no motion and of no board.
     but = NOT_OF_LENS if worst(also) is Severity.BAD else ()
-    return [], changing(c, correlation, solved, but, clusters)
+    return [], changing(c, correlation, solved, but, clusters) or moving_pupil(c, correlation, far)
 
 
 def judge_session(

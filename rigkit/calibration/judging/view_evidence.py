@@ -26,9 +26,9 @@ NO_CHANGE = "columns"
 """No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
 model."""
 WAY_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
-"""How many rows of `_rows` each way to change has, in their order before the residual; bends are common, too."""
+"""How many rows of `rows_of` each way to change has, in their order before the residual; bends are common, too."""
 COMMON = slice(6, -(sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1))
-"""Rows of `_rows` that are common to all images: not of the pose, nor of one image's own."""
+"""Rows of `rows_of` that are common to all images: not of the pose, nor of one image's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class ViewChange:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewEvidence:
-    """What the residuals of V views say, as products of rows of `_rows` without the pose.
+    """What the residuals of V views say, as products of rows of `rows_of` without the pose.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         telling = [k for k in telling if images[k] == first[int(clusters[k])]]
     if len(telling) < MIN_TELLING_VIEWS:
         return None
-    rows, count = _rows(calibration, [calibration.views[k] for k in telling])
+    rows, count = rows_of(calibration, [calibration.views[k] for k in telling])
     # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
     told = np.logical_and.reduceat(np.isfinite(rows).all(axis=(0, 1)), np.cumsum(count) - count)
     if np.count_nonzero(told) < MIN_TELLING_VIEWS:
@@ -139,7 +139,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
     each = [rows[..., stop - n : stop] for n, stop in zip(count[told], stops[told], strict=True)]
     products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
-    own = _without_pose(products, length)
+    own = without_pose(products, length)
     residual = -1
     gram, score = own[:, COMMON, COMMON].sum(axis=0), own[:, COMMON, residual].sum(axis=0)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
@@ -163,7 +163,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
 
 
 def columns_of(count: int) -> dict[str, slice]:
-    """Return where the ways to change are among `count` rows of `_rows`."""
+    """Return where the ways to change are among `count` rows of `rows_of`."""
     stops = count - 1 - sum(WAY_COLUMNS.values()) + np.cumsum(list(WAY_COLUMNS.values()))
     out = {
         name: slice(stop - size, stop) for (name, size), stop in zip(WAY_COLUMNS.items(), stops.tolist(), strict=True)
@@ -171,7 +171,7 @@ def columns_of(count: int) -> dict[str, slice]:
     return out | {"lens": slice(out["focus"].start, out["shift"].stop)}
 
 
-def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
+def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
     """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
 
     With what is, in this order: the pose (6), what all images share (the camera's parameters and the 3 bows of the
@@ -183,7 +183,7 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     def centred(values: FloatArray) -> FloatArray:
         return np.asarray(values - (np.add.reduceat(values, start, axis=-1) / count)[..., view])
 
-    points = _points(calibration, views).T
+    points = points_of(calibration, views).T
     rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
     turned = (rotation * points).sum(axis=1)
     in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
@@ -212,13 +212,13 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     return rows, count
 
 
-def _points(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
+def points_of(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
     """Return the points (N, 3) of the boards that the kept corners of the views are."""
     shapes = {board.board_id: board for board in calibration.boards}
     return np.concatenate([shapes[view.board_id].at(view.grid[view.kept]) for view in views])
 
 
-def _without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
+def without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
     """Return the products (V, K, K) of rows with the part taken out that the first six follow, the pose; `length`
     (V, K) is that of the rows. Directions that the corners leave open are none of the pose."""
     pose = length[:, :6]

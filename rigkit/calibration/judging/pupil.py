@@ -1,0 +1,175 @@
+"""A lens that does not look from one point: its entrance pupil moves along the axis with the angle.
+
+All camera models here are central: a pixel has a ray, and all rays meet. Of wide lenses that is true of what is far
+away. The pupil of a real fisheye moves forward by millimetres towards the rim, so that a point at the angle t and the
+distance R appears turned by about s(t) sin(t) / R, with s(t) = e t^2 to first order. Boards that fill the image of such
+a lens are as near as the board is large, where that is pixels. A central model follows it for one distance; what it
+cannot follow shows in the residuals, and what it did follow is wrong at all other distances, far away most of all.
+
+The residuals tell e, with the boards' poses and a bow of the boards free to follow, and the lens, as far as any central
+one can: a displacement of its image that no model has is not taken for a pupil. How sure e is, the scatter from image
+to image tells; how far what is far away has moved, by how much the parameters have followed. Corners that fit least
+were left out, and boards of free shape follow, too: of what is there this finds a half to all, and says "at least".
+
+Reference: D. B. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68 (2006), section 2, on the
+moving entrance pupil (the E terms of CAHVORE).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rigkit.calibration.clustered import MIN_LEFT
+from rigkit.calibration.judging.captured import SMALL_PX
+from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
+from rigkit.calibration.judging.view_evidence import (
+    MIN_TELLING_CORNERS,
+    MIN_TELLING_VIEWS,
+    WAY_COLUMNS,
+    columns_of,
+    points_of,
+    rows_of,
+    without_pose,
+)
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.uncertainty import FarProjection
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.findings import Finding
+from rigkit.kernels.departures import displacements
+
+BOWS = WAY_COLUMNS["bend"]
+BY_CHANCE = 1e-3
+"""Of images of a lens that looks from one point so few show a pupil that moves."""
+MIN_PUPIL_PART = 1e-4
+"""Of the square of what a pupil does to the corners, poses, boards and a central lens that follow it leave at least
+this. Captures that tell have a hundredth to a third, boards of one distance and narrow lenses next to nothing."""
+NOT_FOLLOWED = 1e-10
+"""Of what is common to all images, a direction with less than this part of the largest square is not followed."""
+DISTANCES = (0.05, 0.95)
+"""Quantiles of the corners' distances that are told."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MovingPupil:
+    """How an entrance pupil moves.
+
+    Attributes
+    ----------
+    mm_per_rad2, sigma_mm_per_rad2 : by how much it moves forward with the square of the angle, and the standard
+        deviation of that, from the scatter between images.
+    freedom : degrees of freedom of the latter.
+    followed : (P,) by how much the camera's parameters would change if it were known.
+    """
+
+    mm_per_rad2: float
+    sigma_mm_per_rad2: float
+    freedom: float
+    followed: FloatArray
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> MovingPupil | None:
+        """Return that of a calibrated lens; None where its images leave it open."""
+        found = _products(calibration)
+        if found is None:
+            return None
+        # All that is common to the images, then the pupil and the residual.
+        products, image, p = found
+        whole = products.sum(axis=0)
+        scale = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+        gram = whole / np.outer(scale, scale)
+        pupil = len(gram) - 2
+        common = np.arange(pupil)
+        follow = _following(gram, common, pupil)
+        left = float(gram[pupil, pupil] - follow @ gram[common, pupil])
+        if not left > MIN_PUPIL_PART:
+            return None
+        # How all of it moves with 1 mm rad^-2 of the pupil, and what is then left in each image.
+        way = np.append(-follow * scale[pupil] / scale[common], 1.0)
+        information = left * scale[pupil] ** 2
+        own, pull = products[:, :-1, :-1], products[:, :-1, -1]
+        amount = float((pull @ way).sum()) / information
+        step = _following(gram, np.arange(pupil + 1), -1) * scale[-1] / scale[:-1]
+        after = np.bincount(image, (pull - own @ step) @ way)
+        share = np.bincount(image, own @ way @ way) / information
+        variance = float((after**2 / np.maximum(1.0 - share, MIN_LEFT)).sum()) / information**2
+        # Images of much leverage count for several.
+        freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
+        # The lens as it is had its parameters and the boards' shapes to follow with, and no displacement.
+        alone = _following(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
+        return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone)
+
+    @property
+    def chance(self) -> float:
+        """Probability of a movement as large from images of a lens that looks from one point."""
+        # Imported here: scipy is slow to import, and most calibrations never ask.
+        from scipy.special import stdtr
+
+        return float(2.0 * stdtr(self.freedom, -abs(self.mm_per_rad2) / max(self.sigma_mm_per_rad2, 1e-12)))
+
+    def far_px(self, far: FarProjection) -> float:
+        """Return by how much (rms at the boards' corners) it moves what is far away, after the rotation that hides it
+        best."""
+        safe = np.where(far.sigmas > 0.0, far.sigmas, 1.0)
+        moved = np.einsum(
+            "ipm,p->im", far.corners.design, np.append(self.followed, -far.hides @ (self.followed / safe))
+        )
+        return float(np.sqrt((moved**2).sum(axis=0).mean()))
+
+
+def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | None:
+    """Return products (V, K, K) of how the corners of V views move, their poses eliminated, with what is common to all
+    images (the camera's P parameters, displacements of the image and bows of the boards), with the pupil and with the
+    residual; which image (V,) each is of, and P. None where that is nothing."""
+    views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
+    if len(views) < MIN_TELLING_VIEWS:
+        return None
+    rows, count = rows_of(calibration, views)
+    p, bows = calibration.camera.parameters.size, columns_of(rows.shape[1])["bend"]
+    corners = np.concatenate([view.pixels[view.kept] for view in views])
+    poses = [view.cam_from_board for view in views]
+    points = np.split(points_of(calibration, views), np.cumsum(count)[:-1])
+    x, y, z = np.concatenate(
+        [at @ pose.rotation.T + pose.translation_mm for at, pose in zip(points, poses, strict=True)]
+    ).T
+    # Boards that come nearer by as much as the pupil moves forward: the third of the rows of a pose's shift.
+    pupil = -(np.arctan2(np.hypot(x, y), z) ** 2) * rows[:, 5]
+    moved = displacements(corners, calibration.camera.size_px)
+    rows = np.concatenate([rows[:, : 6 + p], moved, rows[:, bows], pupil[:, None], rows[:, -1:]], axis=1)
+    if not np.isfinite(rows).all():
+        return None
+    each = np.split(rows, np.cumsum(count)[:-1], axis=-1)
+    products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
+    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    image = np.unique([view.image for view in views], return_inverse=True)[1]
+    return without_pose(products, length)[:, 6:, 6:], image, p
+
+
+def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
+    """Return the amounts of these `rows` with which they follow the row `what` best."""
+    return np.asarray(np.linalg.lstsq(gram[np.ix_(rows, rows)], gram[rows, what], rcond=NOT_FOLLOWED)[0])
+
+
+def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> list[Finding]:
+    """Return a finding where the lens does not look from one point, and that matters; `correlation`: that of the
+    residuals of neighbouring corners."""
+    pupil = MovingPupil.of(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else None
+    if pupil is None or pupil.chance > BY_CHANCE:
+        return []
+    off = pupil.far_px(far)
+    if off <= max(far.usual_px, SMALL_PX):
+        return []
+    points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
+    distance = np.linalg.norm(points, axis=1)
+    near, away = np.quantile(distance, DISTANCES).tolist()
+    rim = float(np.arccos(np.clip(points[:, 2] / distance, -1.0, 1.0)).max())
+    moved = abs(pupil.mm_per_rad2) * rim**2
+    return [
+        Finding.look(
+            f"the lens does not look from one point: its entrance pupil moves by at least {moved:.1f} mm from the "
+            f"middle to the outermost corners, which boards {near:.0f} to {away:.0f} mm away show; what is far away is "
+            f"off by at least {off:.2f} px",
+            "take boards about as far away as what is to be measured (a larger board fills as much of the image)",
+        )
+    ]
