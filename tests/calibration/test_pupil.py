@@ -10,7 +10,9 @@ from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
+from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.compare import best_rotation, grid_pixels
@@ -90,6 +92,13 @@ def test_a_lens_unlike_its_model_is_no_pupil_that_moves(model: str, rng: np.rand
     found = calibrate(views, SIZE, model=model, board="flat", folds=0)
     assert found.rms_px > 0.1
     assert TOLD not in str(found.verdicts)
+
+
+def test_a_pupil_that_moves_is_not_taken_for_what_changes_from_image_to_image() -> None:
+    """A pupil of 4 mm per rad^2 leaves residuals that each image's own shear follows as well as that of a motion."""
+    found = session(NEAR, 4.0, 4)
+    assert "row by row" in str(changing(found, neighbour_correlation(found)))
+    assert TOLD in found.verdicts[0].message and "row by row" not in str(found.verdicts)
 
 
 def test_boards_far_away_do_not_show_a_pupil_that_moves() -> None:

@@ -150,7 +150,9 @@ def _residuals(
         return mixed, []
     # Where it was another lens later on, residuals of one for both are of no motion and of no board.
     but = NOT_OF_LENS if worst(also) is Severity.BAD else ()
-    return [], changing(c, correlation, solved, but, clusters) or moving_pupil(c, correlation, far)
+    change = changing(c, correlation, solved, but, clusters)
+    # A pupil that moves looks a little like a zoom in every image, and what changes never like a pupil.
+    return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
 
 
 def judge_session(
@@ -322,9 +324,8 @@ def _pattern(c: Calibration, correlation: float, in_force: Collection[str]) -> l
     if "model" not in in_force:
         return [Finding.look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
     what += "neither the lens models nor the boards' shapes follow all of it, so that something differs between images"
-    return [
-        Finding.look(what, "fix focus and stabilisation, hold camera and board still, take a board that does not bend")
-    ]
+    remedy = "fix focus and stabilisation, hold camera and board still, take a board that does not bend"
+    return [Finding.look(what, remedy)]
 
 
 def _overfit(c: Calibration) -> list[Finding]:
@@ -355,8 +356,7 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     what = f"the projection is uncertain by up to {worst:.1f} px (one standard deviation) where the boards were"
     if not np.isfinite(worst):
         return [Finding.bad(what, "take more views, with the board tilted")]
-    place = far.corners.pixels[np.nanargmax(inside[far.rays_valid])]
-    what += f", most in the {_cell(c, place)} of the image"
+    what += f", most in the {_cell(c, far.corners.pixels[np.nanargmax(inside[far.rays_valid])])} of the image"
     return [Finding.bad(what, "take more views there, with the board tilted")]
 
 
