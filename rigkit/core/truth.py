@@ -98,7 +98,9 @@ class MeasuredDistance:
     how: str
 
     def __post_init__(self) -> None:
-        _check(self.name, self.value_mm, self.sigma_mm, "mm")
+        # A point may lie in the plane of another board.
+        near = self.a.is_plane or self.b.is_plane
+        _check(self.name, self.value_mm, self.sigma_mm, "mm", near_zero=near)
         if self.a.is_plane and self.b.is_plane:
             raise InputError(f"{self.name}: two planes have no one distance; name a corner of one")
 
@@ -109,7 +111,7 @@ class MeasuredDistance:
 
 @dataclass(frozen=True, slots=True)
 class PairTruth:
-    """Everything that a person measured of one pair, each once; empty where nobody did."""
+    """Everything that a person measured of one pair, each once by one means; empty where nobody did."""
 
     baseline: MeasuredLength | None = None
     angles: tuple[MeasuredAngle, ...] = ()
@@ -122,10 +124,10 @@ class PairTruth:
         known: set[object] = set()
         measured: tuple[MeasuredAngle | MeasuredDistance, ...] = (*self.angles, *self.distances)
         for one in measured:
-            ends = frozenset((str(one.a), str(one.b)))
-            if (type(one), ends) in known:
-                raise InputError(f"{one.name} is stated twice; keep one")
-            known.add((type(one), ends))
+            fact = (type(one), frozenset((str(one.a), str(one.b))), one.how)
+            if fact in known:
+                raise InputError(f"{one.name} is stated twice; keep one, or say how each was measured")
+            known.add(fact)
 
     @property
     def count(self) -> int:
@@ -133,14 +135,14 @@ class PairTruth:
         return (self.baseline is not None) + len(self.angles) + len(self.distances)
 
 
-def _check(what: str, value: float, sigma: float, unit: str) -> None:
+def _check(what: str, value: float, sigma: float, unit: str, *, near_zero: bool = False) -> None:
     if not (np.isfinite(value) and value > 0.0):
         raise InputError(f"{what}: a measured value must be positive, got {value} {unit}")
     if not (np.isfinite(sigma) and sigma > 0.0):
         raise InputError(
             f"{what}: sigma must be positive, got {sigma} {unit}; say how far off the measurement may well be"
         )
-    if sigma >= value:
+    if sigma >= value and not near_zero:
         # Any result would agree with it: a check that cannot fail. Angles across faces are never near 0.
         raise InputError(
             f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement: were both exchanged, or is "

@@ -55,6 +55,13 @@ def test_other_units_are_converted(tmp_path: Path, unit: str, factor: float) -> 
     assert found["first"].baseline.sigma_mm == 2.0 * factor
 
 
+def test_two_means_may_measure_one_thing_and_a_point_may_lie_near_a_plane(tmp_path: Path) -> None:
+    by_eye = "second,angle,plane1,plane2,,,90,2,protractor\nsecond,angle,plane1,plane2,,,90,0.3,set square\n"
+    flush = "second,distance,plane1.centre,plane2,0.2,0.5,,,feeler gauge\n"
+    second = load(tmp_path, TEXT + by_eye + flush)["second"]
+    assert (len(second.angles), second.distances[1].sigma_mm) == (2, 0.5)
+
+
 WRONG = [
     ("value [mm]", "value", "'value' has no unit"),
     ("value [mm]", "value [inch]", "unknown unit"),
@@ -72,7 +79,7 @@ WRONG = [
     (",90,0.3,", ",0.3,90,", "line 3: .*were both exchanged"),
     (
         "set square\n",
-        "set square\nfirst,angle,plane2,plane1,,,90,1,eye\n",
+        "set square\nfirst,angle,plane2,plane1,,,90,1,set square\n",
         "'first': angle plane2-plane1 is stated twice",
     ),
     (",,90,0.3,", ",90,90,0.3,", "leave it empty"),
