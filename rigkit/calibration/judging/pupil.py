@@ -9,7 +9,8 @@ cannot follow shows in the residuals, and what it did follow is wrong at all oth
 The residuals tell e, with the boards' poses and a bow of the boards free to follow, and the lens, as far as any central
 one can: a displacement of its image that no model has is not taken for a pupil. How sure e is, the scatter from image
 to image tells; how far what is far away has moved, by how much the parameters have followed. Corners that fit least
-were left out, and boards of free shape follow, too: of what is there this finds about a half to three quarters, and says "at least".
+were left out, and boards of free shape follow, too: of what is there this finds about a half to three quarters, and
+says "at least".
 
 Reference: D. B. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68 (2006), section 2, on the
 moving entrance pupil (the E terms of CAHVORE).
