@@ -74,12 +74,9 @@ from rigkit.workflows.calibrate_any import calibrate_folders as calibrate_folder
 from rigkit.workflows.calibrate_any import calibrate_session_file as calibrate_session_file
 from rigkit.workflows.calibrate_rig import RigSessionCalibration as RigSessionCalibration
 from rigkit.workflows.calibrate_rig import calibrate_rig_session as calibrate_rig_session
-from rigkit.workflows.camera_files import import_camera as import_camera
-from rigkit.workflows.camera_files import import_rig as import_rig
 from rigkit.workflows.certify import CertifiedFile as CertifiedFile
 from rigkit.workflows.certify import CertifyOptions as CertifyOptions
 from rigkit.workflows.certify import certify_file as certify_file
-from rigkit.workflows.corners import Cache as Cache
 from rigkit.workflows.crosscheck import DatasetCrossCheck as DatasetCrossCheck
 from rigkit.workflows.crosscheck import crosscheck_dataset as crosscheck_dataset
 from rigkit.workflows.datasets import DatasetOptions as DatasetOptions
@@ -104,6 +101,9 @@ from rigkit.workflows.handeye import HandEyeOptions as HandEyeOptions
 from rigkit.workflows.handeye import PlacedCamera as PlacedCamera
 from rigkit.workflows.handeye import calibrate_hand_eye as calibrate_hand_eye
 from rigkit.workflows.handeye import camera_on_board as camera_on_board
+from rigkit.workflows.inputs.camera_files import import_camera as import_camera
+from rigkit.workflows.inputs.camera_files import import_rig as import_rig
+from rigkit.workflows.inputs.corners import Cache as Cache
 from rigkit.workflows.print_board import MeasuredPrint as MeasuredPrint
 from rigkit.workflows.print_board import PrintOptions as PrintOptions
 from rigkit.workflows.print_board import print_board as print_board

@@ -34,7 +34,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
-from rigkit.workflows.folder_session import cameras_in
+from rigkit.workflows.inputs.folder_session import cameras_in
 
 Frame = tuple[Path, Path]
 

@@ -34,7 +34,7 @@ from rigkit.io.board_words import words_of_board
 from rigkit.io.images import read_image
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
-from rigkit.workflows.corners import Cache
+from rigkit.workflows.inputs.corners import Cache
 
 AS_IT_IS = "as it is"
 WORSE = (

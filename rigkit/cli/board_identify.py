@@ -16,7 +16,7 @@ def identify(args: argparse.Namespace) -> int:
     from rigkit.io.files import ensure_writable, write_atomic
     from rigkit.io.video import is_video
     from rigkit.workflows.detect import images_in
-    from rigkit.workflows.identify_board import identify_board
+    from rigkit.workflows.inputs.identify_board import identify_board
 
     if args.square_mm is not None and not 0.0 < args.square_mm < float("inf"):
         raise InputError(f"board: --square-mm {args.square_mm:g} must be positive")

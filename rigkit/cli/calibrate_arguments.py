@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.core.errors import InputError
-from rigkit.workflows.formats import FOREIGN_ENDINGS
+from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS
 
 if TYPE_CHECKING:
     from rigkit.workflows.calibrate import CalibrateOptions
@@ -93,8 +93,8 @@ def _add_of_folders(parser: argparse.ArgumentParser) -> None:
 def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
     """Return what is written where, and what is known before."""
     from rigkit.workflows.calibrate import CalibrateOptions
-    from rigkit.workflows.corners import Cache
-    from rigkit.workflows.folder_session import Known
+    from rigkit.workflows.inputs.corners import Cache
+    from rigkit.workflows.inputs.folder_session import Known
 
     return CalibrateOptions(
         output=args.output,

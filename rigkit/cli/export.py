@@ -8,7 +8,7 @@ from pathlib import Path
 from rigkit.cli.dataset_arguments import add_planes_argument
 from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
-from rigkit.workflows.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
+from rigkit.workflows.inputs.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from rigkit.rectification.targets import field_across
-    from rigkit.workflows.camera_files import is_rig
     from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, export_rig
+    from rigkit.workflows.inputs.camera_files import is_rig
 
     options = ExportCameraOptions(
         output=args.output,

@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _session(args: argparse.Namespace) -> int:
     from rigkit.io.files import write_together
-    from rigkit.workflows.folder_session import session_of_folders
+    from rigkit.workflows.inputs.folder_session import session_of_folders
 
     if (
         args.square_mm is not None

@@ -1,6 +1,6 @@
 """The camera formats of other programs: what tells a file of each, its reader and its writer.
 
-Adding one is a module, a line here and, for what is written, its ending in `rigkit.workflows.formats`.
+Adding one is a module, a line here and, for what is written, its ending in `rigkit.workflows.inputs.formats`.
 """
 
 from __future__ import annotations

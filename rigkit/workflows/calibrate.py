@@ -19,10 +19,10 @@ from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, files_of_session, load_session
-from rigkit.workflows.corners import Cache, SessionCorners, given_corners, session_corners, session_views
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
-from rigkit.workflows.folder_session import Known
-from rigkit.workflows.identify_board import misread
+from rigkit.workflows.inputs.corners import Cache, SessionCorners, given_corners, session_corners, session_views
+from rigkit.workflows.inputs.folder_session import Known
+from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
@@ -45,7 +45,7 @@ class CalibrateOptions:
     known: Known = field(default_factory=Known)
     """Of a rig: files of lenses that stay as they are, or of a rig to which the others of the session are added."""
     exports: tuple[str, ...] = ()
-    """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.formats`)."""
+    """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.inputs.formats`)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -20,8 +20,14 @@ from rigkit.io.session import SESSION_NAME, Session, load_session
 from rigkit.io.video import VIDEO_ENDINGS, is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.folder_session import boards_seen, session_of_folders
-from rigkit.workflows.frames import frames_folder, frames_of_video, frames_of_videos, timestamps_beside, with_frames
+from rigkit.workflows.inputs.folder_session import boards_seen, session_of_folders
+from rigkit.workflows.inputs.frames import (
+    frames_folder,
+    frames_of_video,
+    frames_of_videos,
+    timestamps_beside,
+    with_frames,
+)
 
 _log = logging.getLogger(__name__)
 

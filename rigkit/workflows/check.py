@@ -39,9 +39,9 @@ from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.flipped import flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
-from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.next_views import goal_of, length_goal
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
@@ -266,9 +266,7 @@ def _views(
     return out
 
 
-def _nothing_to_check(
-    left_out: Sequence[tuple[str, str]], unreadable: Sequence[str], boards: Sequence[Board]
-) -> str:
+def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[str], boards: Sequence[Board]) -> str:
     """Return in words why no image shows a board."""
     if not left_out:
         return unreadable[0]

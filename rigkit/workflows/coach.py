@@ -38,9 +38,9 @@ from rigkit.planning.guess import check_field
 from rigkit.validation.certificate.contracts import Task
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibrate_any import calibrate_session_file
-from rigkit.workflows.corners import Cache
-from rigkit.workflows.folder_session import session_to_come
-from rigkit.workflows.frames import frames_of_videos, moments_of_videos, timestamps_beside
+from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.inputs.folder_session import session_to_come
+from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_beside
 from rigkit.workflows.next_frames import length_goals
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"

@@ -29,7 +29,7 @@ from rigkit.io.calibration_file import calibration_text, load_calibration_or_cam
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
-from rigkit.workflows.camera_files import warn_if_bad
+from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")

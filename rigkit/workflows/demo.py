@@ -17,7 +17,7 @@ from rigkit.io.manifest import load_dataset
 from rigkit.io.reading import usable_path
 from rigkit.synthetic.demo import build_demo
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
-from rigkit.workflows.corners import Cache
+from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
 
 _log = logging.getLogger(__name__)

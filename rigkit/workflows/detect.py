@@ -29,9 +29,9 @@ from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
 from rigkit.io.video import is_video
 from rigkit.report.overlay import draw_boards
-from rigkit.workflows.camera_files import import_camera
-from rigkit.workflows.frames import VideoFrames, frames_folder, frames_of_video
-from rigkit.workflows.identify_board import explained, suggestion
+from rigkit.workflows.inputs.camera_files import import_camera
+from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_video
+from rigkit.workflows.inputs.identify_board import explained, suggestion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ def detect_in_images(
 ) -> DetectionResult:
     """Detect the boards of images, folders of images, and videos, and write what `options` ask for.
 
-    Of a video those frames are looked at that are worth keeping (`rigkit.workflows.frames`).
+    Of a video those frames are looked at that are worth keeping (`rigkit.workflows.inputs.frames`).
 
     An image that cannot be read is among the failures and does not end the rest; its error is raised where there is no
     other image.

@@ -15,7 +15,7 @@ from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.report.figures import difference_png
-from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

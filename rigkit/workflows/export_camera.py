@@ -20,8 +20,8 @@ from rigkit.io.calibration_file import save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
-from rigkit.workflows.camera_files import import_camera, import_rig, own_calibration, warn_if_bad
-from rigkit.workflows.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
+from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad
+from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 RIG_ENDINGS = {"colmap": ".json"}
 """Where the file of a rig ends otherwise than that of a camera."""

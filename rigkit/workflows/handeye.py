@@ -27,9 +27,9 @@ from rigkit.io.images import read_image_of
 from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
-from rigkit.workflows.camera_files import import_camera
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.inputs.camera_files import import_camera
+from rigkit.workflows.inputs.identify_board import explained
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))

@@ -17,7 +17,7 @@ from rigkit.io.files import write_atomic
 from rigkit.io.images import read_image, to_grey
 from rigkit.io.manifest import load_dataset
 from rigkit.io.manifest_writer import FoundPair, ImageBoards, NewManifest, board_sizes, group_pairs, manifest_text
-from rigkit.workflows.identify_board import suggestion
+from rigkit.workflows.inputs.identify_board import suggestion
 
 
 @dataclass(frozen=True, eq=False, slots=True)

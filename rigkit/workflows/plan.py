@@ -29,9 +29,9 @@ from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
-from rigkit.workflows.camera_files import warn_if_bad
 from rigkit.workflows.check import load_watched
-from rigkit.workflows.corners import Cache
+from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.next_frames import next_frames
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
 from rigkit.workflows.provenance import digest_line, software_facts

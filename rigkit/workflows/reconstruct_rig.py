@@ -26,7 +26,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure
-from rigkit.workflows.camera_files import saved_rig, warn_if_bad
+from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 from rigkit.workflows.results import require_folder, write_results

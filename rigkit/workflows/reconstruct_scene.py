@@ -35,7 +35,7 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure, epipolar_figure
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.camera_files import import_camera, import_pair, own_calibration, saved_rig
+from rigkit.workflows.inputs.camera_files import import_camera, import_pair, own_calibration, saved_rig
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 

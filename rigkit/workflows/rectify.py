@@ -26,9 +26,9 @@ from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair
 from rigkit.rectification.targets import target_camera
-from rigkit.workflows.camera_files import import_camera, import_pair
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.folder_session import cameras_in
+from rigkit.workflows.inputs.camera_files import import_camera, import_pair
+from rigkit.workflows.inputs.folder_session import cameras_in
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -278,7 +278,7 @@ KINDS: dict[str, Kind] = {
     "caliscope-target": _board_file("charuco.toml"),
     "public-set": Kind("public.toml", (("rigkit.io.public_set:load_public_set", "{case}"),)),
     "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
-    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.camera_files:import_camera", "{case}")),
+    "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.inputs.camera_files:import_camera", "{case}")),
     "chain": Kind("chain.yaml", (("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),)),
     "opencv-stereo": Kind("stereo.yaml", (("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),)),
     "ros": _camera_file("ros.yaml", ("export", "{case}", "--from", "ros", "-o", "{out}/new.json")),

@@ -23,7 +23,7 @@ from rigkit.io.truth_csv import load_truth_csv
 from rigkit.io.video import read_timestamps
 from rigkit.workflows.calibrate import calibrate_session
 from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach
-from rigkit.workflows.frames import frames_of_video
+from rigkit.workflows.inputs.frames import frames_of_video
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)
 GUIDE = GuideOptions(boards=(SMALL,))

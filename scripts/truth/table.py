@@ -17,8 +17,8 @@ from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
-from rigkit.workflows.corners import Cache
-from rigkit.workflows.frames import with_frames
+from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.inputs.frames import with_frames
 from rigkit.workflows.truth import FetchedSet
 
 RIGKIT, OPENCV, MRCAL, COLMAP = "rigkit", "OpenCV", "mrcal", "COLMAP"

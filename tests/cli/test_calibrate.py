@@ -27,7 +27,7 @@ from rigkit.io.session import load_session
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
-from rigkit.workflows.corners import first_camera
+from rigkit.workflows.inputs.corners import first_camera
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "calibration" / "fisheye"
 SESSION = 'schema = "rigkit.session/1"\nimages = "*.jpg"\nboard = "board.toml"\nmodel = "kannala_brandt"\n'

@@ -27,10 +27,10 @@ from rigkit.io.rig_session import load_rig_session
 from rigkit.io.session import load_session
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_any import calibrate_session_file
-from rigkit.workflows.camera_files import import_rig
-from rigkit.workflows.corners import first_camera
-from rigkit.workflows.folder_session import Known, cameras_in, session_of_folders
-from rigkit.workflows.known_cameras import known_cameras, with_known_first
+from rigkit.workflows.inputs.camera_files import import_rig
+from rigkit.workflows.inputs.corners import first_camera
+from rigkit.workflows.inputs.folder_session import Known, cameras_in, session_of_folders
+from rigkit.workflows.inputs.known_cameras import known_cameras, with_known_first
 
 SAME_LENS_PX = 0.1
 """Projections of the camera found against the true one, where boards were: corners of JPEGs to about 0.03 px, 9 images;
@@ -209,7 +209,9 @@ def test_corners_from_a_file(
             write_vnl(csv, corners)
     (folder / "corners.json").unlink()
     capsys.readouterr()
-    monkeypatch.setattr("rigkit.workflows.corners.detect_boards", lambda *_, **__: pytest.fail("looked for corners"))
+    monkeypatch.setattr(
+        "rigkit.workflows.inputs.corners.detect_boards", lambda *_, **__: pytest.fail("looked for corners")
+    )
     arguments = ["calibrate", str(folder / "session.toml"), "--corners", str(corners), "-o", str(tmp_path / "new.json")]
     assert main(arguments) == 0
     found = load_calibration(tmp_path / "new.json")

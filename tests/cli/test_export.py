@@ -23,8 +23,8 @@ from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
 from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera
 from rigkit.io.ply import read_ply
-from rigkit.workflows.camera_files import import_rig
 from rigkit.workflows.export_camera import foreign_files
+from rigkit.workflows.inputs.camera_files import import_rig
 
 CAMERAS = REPOSITORY / "calib" / "cameras"
 CALIBRATION = CAMERAS / "mvca020_fe185" / "calibration.json"

@@ -23,8 +23,8 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.history_file import load_history
 from rigkit.workflows.coach import CoachOptions, open_coach
-from rigkit.workflows.frames import frames_of_video
 from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
+from rigkit.workflows.inputs.frames import frames_of_video
 
 BOARD = Board("small", 5, 4, 30.0, 30.0)
 CHECK = ["check", "calibration.json", "--board", "floor.toml"]

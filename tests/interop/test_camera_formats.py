@@ -21,8 +21,8 @@ from rigkit.interop.colmap_cameras import MODEL_IDS, read_colmap_cameras, write_
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
-from rigkit.workflows.camera_files import camera_format, import_camera, import_rig, is_rig
-from rigkit.workflows.formats import FOREIGN_ENDINGS, READ_FORMATS
+from rigkit.workflows.inputs.camera_files import camera_format, import_camera, import_rig, is_rig
+from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS, READ_FORMATS
 
 CAMERAS = sample_cameras()
 SAME_PX = 1e-9

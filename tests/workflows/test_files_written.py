@@ -14,7 +14,7 @@ from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import load_calibration
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
-from rigkit.workflows.corners import Cache
+from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.results import write_results
 
 LAB = REPOSITORY / "datasets" / "lab-a"

@@ -24,10 +24,10 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.workflows.calibrate import CalibrateOptions
 from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
-from rigkit.workflows.folder_session import boards_seen
-from rigkit.workflows.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
-from rigkit.workflows.frames import _FrameFolder, frames_of_video, frames_of_videos
-from rigkit.workflows.identify_board import identify_board
+from rigkit.workflows.inputs.folder_session import boards_seen
+from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame
+from rigkit.workflows.inputs.frames import _FrameFolder, frames_of_video, frames_of_videos
+from rigkit.workflows.inputs.identify_board import identify_board
 
 BOARD = Board("b", 7, 5, 20.0, 20.0)
 CAMERA = Pinhole((320, 240), np.array([300.0, 300.0, 159.5, 119.5]))

@@ -15,7 +15,7 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.unknown import BoardGuess
-from rigkit.workflows import identify_board
+from rigkit.workflows.inputs import identify_board
 
 BLUR_PX, NOISE_LEVELS = 4.0, 10.0
 """Together too much for a board of unknown size, in an image of 320 px."""

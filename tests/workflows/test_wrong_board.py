@@ -15,7 +15,7 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.io.images import read_image
 from rigkit.synthetic.render import Optics
-from rigkit.workflows.identify_board import explained, misread
+from rigkit.workflows.inputs.identify_board import explained, misread
 
 BOARD = Board("c", 7, 7, 30.0, 30.0, pattern=Charuco("DICT_4X4_100", 22.5))
 

@@ -24,7 +24,7 @@ from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_k
 from rigkit.io.corners_file import read_corners
 from rigkit.io.images import read_image
 from rigkit.io.session import Session
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.inputs.identify_board import explained
 
 ODD_SIZES = 3
 """A few images of another size are left out; where they are this part of all, which of the sizes is meant?"""

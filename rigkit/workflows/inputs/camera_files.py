@@ -20,7 +20,7 @@ from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.io.calibration_file import load_calibration_or_camera
 from rigkit.io.reading import read_bytes, read_text
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
-from rigkit.workflows.formats import READ_FORMATS
+from rigkit.workflows.inputs.formats import READ_FORMATS
 
 _log = logging.getLogger(__name__)
 

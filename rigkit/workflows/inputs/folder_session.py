@@ -18,7 +18,7 @@ from rigkit.io.images import images_of_folder, name_unread, no_images
 from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
 from rigkit.io.toml_reader import relative_path, toml_text
 from rigkit.io.video import is_video
-from rigkit.workflows.identify_board import Suggestion, suggestion
+from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
 """How people call the cameras of a rig."""

@@ -17,8 +17,8 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.rig_file import SavedRig, is_rig_file
 from rigkit.io.rig_session import RigSession
-from rigkit.workflows.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
-from rigkit.workflows.folder_session import Known
+from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+from rigkit.workflows.inputs.folder_session import Known
 
 _log = logging.getLogger(__name__)
 

@@ -28,8 +28,8 @@ from rigkit.io.reading import read_text
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, beside_session
 from rigkit.io.video import Video, is_video, read_timestamps
-from rigkit.workflows.frame_choice import FrameChoice, KeptFrame, describe
-from rigkit.workflows.identify_board import explained
+from rigkit.workflows.inputs.frame_choice import FrameChoice, KeptFrame, describe
+from rigkit.workflows.inputs.identify_board import explained
 
 _log = logging.getLogger(__name__)
 
