@@ -283,7 +283,7 @@ EXPORT void block_products(
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness
  * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8). */
-enum { CIRCLE_OUTCOMES = 23, SPOT = 3 };
+enum { CIRCLE_OUTCOMES = 26, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
 typedef struct {
@@ -294,8 +294,8 @@ typedef struct {
 EXPORT void fit_circles(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
     ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2), ARRAY(const double, bends, count, 2, 3),
-    ARRAY(const double, blur, count), ARRAY(const double, reach, count), const circle_rules_t *rules, int64_t most,
-    ARRAY(double, scratch, SPOT, most), ARRAY(double, out, count, CIRCLE_OUTCOMES));
+    ARRAY(const double, blur, count), ARRAY(const double, reach, count), ARRAY(const int64_t, beside, count, BESIDE),
+    const circle_rules_t *rules, int64_t most, ARRAY(double, scratch, SPOT, most), ARRAY(double, out, count, CIRCLE_OUTCOMES));
 
 /* light.c */
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import FloatArray, GreyImage
+from rigkit.core.arrays import FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, image_arguments, structure
 from rigkit.kernels.declarations import header
 
-CIRCLE_OUTCOMES, SPOT = (header().constants[name] for name in ("CIRCLE_OUTCOMES", "SPOT"))
+CIRCLE_OUTCOMES, SPOT, BESIDE = (header().constants[name] for name in ("CIRCLE_OUTCOMES", "SPOT", "BESIDE"))
 
 
 @structure("circle_rules_t")
@@ -24,13 +24,16 @@ def fit_circles(
     bends: FloatArray,
     blur: FloatArray,
     reach: FloatArray,
+    beside: IntArray,
     most: int,
     rules: CircleRules,
 ) -> FloatArray:
-    """Return the outcomes of N circles, (N, 23). Arguments as `detection.circles.fit.fit_circles`; `most` : pixels of
+    """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `most` : pixels of
     the largest window."""
     known = [np.ascontiguousarray(part, np.float64) for part in (pixels, maps, bends, blur, reach)]
     out = np.empty((len(pixels), CIRCLE_OUTCOMES))
     scratch = np.empty((SPOT, most))
-    kernels().fit_circles(*image_arguments(image), len(pixels), *known, rules, most, scratch, out)
+    kernels().fit_circles(
+        *image_arguments(image), len(pixels), *known, np.ascontiguousarray(beside, np.int64), rules, most, scratch, out
+    )
     return out

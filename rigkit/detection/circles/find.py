@@ -9,9 +9,11 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
+from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.fit import CircleFit, fit_circles
 from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_bends
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.kernels.circles import BESIDE
 
 if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
@@ -44,12 +46,9 @@ MAX_GAIN = 10.0
 on one side, is five times."""
 SURE_GAIN = 1.5
 """Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
-MAP_ERROR = 1.0
-"""Error of a centre over that of its circle's size times the radius in distances (`_with_map_error`): (n - 1) / 4 for
-the order n = 5 that follows the polynomial's."""
-WAVY_BY_NOISE = 2.5
-"""Noise makes the mean square of harmonics 3 to 6 of a circle's edge so many times its usual one once in a hundred
-circles."""
+NEAR_EDGE, ROUNDS_BESIDE = 3.0, 2
+"""Blur brings light of a neighbour half of whose distance is less than so many sigmas: a 700th of it. The second round
+has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal, blur 3 px)."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MAX_NEW_RINGS = 40
@@ -158,7 +157,7 @@ class _Draft:
     bright: bool
 
     def chosen(self, which: BoolArray) -> _Draft:
-        return replace(self, label=self.label[which], fit=_of(self.fit, which), around=_of(self.around, which))
+        return replace(self, label=self.label[which], fit=rows_of(self.fit, which), around=rows_of(self.around, which))
 
 
 def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) -> CircleGrid | None:
@@ -171,7 +170,12 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
     for step in () if quick else (_again, _with_all, _again):
         if _enough(draft):
             draft = step(grey, draft)
-    return _finished(draft, (grey.shape[1], grey.shape[0])) if _enough(draft) else None
+    if not _enough(draft):
+        return None
+    evidence = _evidence(draft)
+    if evidence.convincing and not quick:
+        draft = _beside_others(grey, draft)
+    return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))
 
 
 def _with_all(grey: GreyImage, draft: _Draft) -> _Draft:
@@ -195,10 +199,17 @@ def _radius(maps: FloatArray, first: FloatArray) -> float:
     return float(np.nanmedian(ratio))
 
 
-def _fitted(grey: GreyImage, pixels: FloatArray, around: PlaneMap, radius: float, blur_px: FloatArray) -> CircleFit:
+def _fitted(
+    grey: GreyImage,
+    pixels: FloatArray,
+    around: PlaneMap,
+    radius: float,
+    blur_px: FloatArray,
+    beside: IntArray | None = None,
+) -> CircleFit:
     maps = radius * around.first
     reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded)
-    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach)
+    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach, beside)
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
@@ -224,7 +235,7 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
     """Return the draft without what is no circle of it; `lenience` multiplies the limits of shape and residual."""
     fit = draft.fit
     good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
-    good &= (np.abs(fit.growth) < lenience * MAX_CIRCLE_GROWTH).all(axis=1)
+    good &= (np.abs(_own_growth(fit, good)) < lenience * MAX_CIRCLE_GROWTH).all(axis=1)
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     contrast = np.abs(fit.contrast)
@@ -239,7 +250,7 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
         fit.pixels[good],
         draft.label,
         hexagonal=draft.hexagonal,
-        sigma_px=_sigma(_of(fit, good)),
+        sigma_px=_sigma(rows_of(fit, good)),
         leave_out=True,
     )
     off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
@@ -247,20 +258,60 @@ def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
     return draft.chosen(good)
 
 
+def _own_growth(fit: CircleFit, good: BoolArray) -> FloatArray:
+    """Return the growth (N, 3) of circles without what all `good` ones have of it.
+
+    Without their neighbours' light they seemed smaller than they are.
+    """
+    common = float(np.median(fit.growth[good, 0])) if good.any() else 0.0
+    return fit.growth - np.array([common, 0.0, 0.0])
+
+
 def _spacing(around: PlaneMap) -> FloatArray:
     """Return the distances (M,) of neighbours, px, in the mean over directions."""
     return np.asarray(np.sqrt(np.maximum(np.abs(np.linalg.det(around.first)), 1e-9)))
 
 
-def _again(grey: GreyImage, draft: _Draft) -> _Draft:
-    """Return the draft fitted with maps through the circles as they are now."""
+def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
+    """Return the draft fitted with maps through the circles as they are now; `beside`: with the light of neighbours."""
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
     size_px = (grey.shape[1], grey.shape[0])
     around = with_smooth_bends(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
-    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px)
+    others = _beside_each(draft.label, draft.hexagonal) if beside else None
+    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px, others)
     return _judged(replace(draft, fit=fresh, around=around, radius=radius))
+
+
+def _beside_others(grey: GreyImage, draft: _Draft) -> _Draft:
+    """Return the draft fitted with the light that blur brings from neighbours, where it does.
+
+    Only what is a grid is: large circles with much blur overlap to what looks like a chessboard.
+    """
+    for _ in range(ROUNDS_BESIDE):
+        half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
+        if not (half_gap_px < NEAR_EDGE * draft.fit.blur_px).any():
+            break
+        fitted = _again(grey, draft, beside=True)
+        if not _enough(fitted):
+            break
+        draft = fitted
+    return draft
+
+
+def _beside_each(label: IntArray, hexagonal: bool) -> IntArray:
+    """Return which circles (N, BESIDE) are the neighbours of each, -1 where there is none."""
+    low = label.min(axis=0) - 1
+    table = np.full(np.ptp(label, axis=0) + 3, -1)
+    table[tuple((label - low).T)] = np.arange(len(label))
+    around = table[tuple((label[:, None] + _steps(hexagonal) - low).transpose(2, 0, 1))]
+    return np.pad(around, ((0, 0), (0, BESIDE - around.shape[1])), constant_values=-1)
+
+
+def _steps(hexagonal: bool) -> IntArray:
+    """Return the steps to a circle's neighbours, (4, 2) or (6, 2)."""
+    return np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if hexagonal else [])])
 
 
 def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
@@ -275,31 +326,16 @@ def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
     joined = replace(
         draft,
         label=np.concatenate([draft.label, places[near]]),
-        fit=_joined(fit, _of(tried, near)),
-        around=_joined(draft.around, _of(around, near)),
+        fit=_joined(fit, rows_of(tried, near)),
+        around=_joined(draft.around, rows_of(around, near)),
     )
     judged = _judged(joined)
     return judged if len(judged.label) > len(draft.label) else None
 
 
-def _with_map_error(fit: CircleFit, radius: float) -> FloatArray:
-    """Return standard deviations (N,) of the centres that know how uncertain the curvature of the map is.
-
-    What size and slant of a circle are off (growth e, in radii), beyond what all are (motion stretches them), shows the
-    error of the map's first derivatives. At the rim, where it is not small, the map is foretold from one side, and what
-    its polynomial leaves of order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that,
-    times the radius, moves the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
-    """
-    misshapen = np.sqrt(((fit.growth - np.median(fit.growth, axis=0)) ** 2).sum(axis=1))
-    size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
-    wavy = ((fit.harmonics - np.median(fit.harmonics, axis=0)) ** 2).mean(axis=(1, 2)) * size_px**2
-    uneven = np.sqrt(np.maximum(wavy - WAVY_BY_NOISE * fit.sigma_px**2, 0.0))
-    return np.asarray(np.sqrt(fit.sigma_px**2 + (MAP_ERROR * radius * misshapen * size_px) ** 2 + uneven**2))
-
-
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
     """Return the places next to circles of the draft that would lie in the image whole, and the maps there."""
-    step = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if draft.hexagonal else [])])
+    step = _steps(draft.hexagonal)
     known = {tuple(label) for label in draft.label.tolist()}
     beside = {tuple(place) for place in (draft.label[:, None] + step).reshape(-1, 2).tolist()}
     places = np.array(sorted(beside - known), np.int64).reshape(-1, 2)
@@ -307,20 +343,24 @@ def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap
     extent = draft.radius * np.sqrt((around.first**2).sum(axis=2))
     inside = ((around.pixels > extent) & (around.pixels < np.array(size_px) - 1.0 - extent)).all(axis=1)
     fine = inside & (around.support >= SUPPORT) & (around.gain < MAX_GAIN) & (extent.min(axis=1) > 1.0)
-    return places[fine], _of(around, fine)
+    return places[fine], rows_of(around, fine)
 
 
-def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
+def _evidence(draft: _Draft) -> GridEvidence:
     fit, label = draft.fit, draft.label
     expected = local_maps(label, fit.pixels, label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit), leave_out=True)
     off = np.linalg.norm(fit.pixels - expected.pixels, axis=1) / _spacing(expected)
     sure = expected.gain < SURE_GAIN
-    evidence = GridEvidence(
+    return GridEvidence(
         unexplained=float(np.median(fit.residual / np.abs(fit.contrast))),
         misshapen=float(np.median(np.sqrt((fit.growth**2).sum(axis=1)))),
         displaced=float(np.median(off[sure])) if sure.any() else np.inf,
         corners=float(np.hypot(*fit.harmonics.mean(axis=0).T).max()),
     )
+
+
+def _finished(draft: _Draft, evidence: GridEvidence, size_px: tuple[int, int]) -> CircleGrid:
+    fit, label = draft.fit, draft.label
     empty, _ = _beside(draft, size_px)
     first = label.min(axis=0)
     label, empty = label - first, empty - first
@@ -328,7 +368,7 @@ def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
     return CircleGrid(
         label=label[order],
         pixels=fit.pixels[order],
-        sigma_px=_with_map_error(fit, draft.radius)[order],
+        sigma_px=centre_sigmas(fit, label, draft.around.slope_gain, draft.radius)[order],
         maps=fit.maps[order],
         hexagonal=draft.hexagonal,
         bright=draft.bright,
@@ -341,7 +381,7 @@ def _finished(draft: _Draft, size_px: tuple[int, int]) -> CircleGrid | None:
     )
 
 
-def _of(table: Rows, which: BoolArray) -> Rows:
+def rows_of(table: Rows, which: BoolArray) -> Rows:
     """Return some rows of a class of arrays."""
     return type(table)(**{name: getattr(table, name)[which] for name in _names(table)})
 

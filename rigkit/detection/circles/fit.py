@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import circles as kernel
 
@@ -41,7 +41,7 @@ class CircleFit:
     pixels : (N, 2) images of the centres.
     maps : (N, 2, 2) px per radius; a turn of the circle in itself is as it was given.
     growth : (N, 3) symmetric part of how `maps` differ from those given: size, and stretch along and aslant of x.
-    covariance : (N, 2, 2) of `pixels` for white noise, px^2.
+    growth_variance, covariance : (N, 3) and (N, 2, 2) of `growth` and `pixels` for white noise, the second in px^2.
     blur_px, brightness, contrast, residual : (N,) blur of the edge, level around the circle, what the level inside is
         more, RMS residual in grey levels.
     count : (N,) pixels.
@@ -52,6 +52,7 @@ class CircleFit:
     pixels: FloatArray
     maps: FloatArray
     growth: FloatArray
+    growth_variance: FloatArray
     covariance: FloatArray
     blur_px: FloatArray
     brightness: FloatArray
@@ -74,7 +75,13 @@ class CircleFit:
 
 
 def fit_circles(
-    grey: GreyImage, pixels: FloatArray, maps: FloatArray, bends: FloatArray, blur_px: FloatArray, reach: FloatArray
+    grey: GreyImage,
+    pixels: FloatArray,
+    maps: FloatArray,
+    bends: FloatArray,
+    blur_px: FloatArray,
+    reach: FloatArray,
+    beside: IntArray | None = None,
 ) -> CircleFit:
     """Fit circles to their pixels.
 
@@ -85,6 +92,7 @@ def fit_circles(
     bends : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
     blur_px : (N,) where to start.
     reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
+    beside : (N, BESIDE) which of the circles are neighbours, whose light blur brings into a circle's pixels; -1 for none.
     """
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
     margin = np.abs(bends).sum(axis=(1, 2)) + 1.0
@@ -92,7 +100,8 @@ def fit_circles(
     finite = own[np.isfinite(own)]
     most = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
     most = min(most, grey.size)
-    rows = kernel.fit_circles(grey, pixels, maps, bends, blur_px, reach, most, RULES)
+    beside = np.full((len(pixels), kernel.BESIDE), -1) if beside is None else beside
+    rows = kernel.fit_circles(grey, pixels, maps, bends, blur_px, reach, beside, most, RULES)
     found = rows[:, 2:6].reshape(-1, 2, 2)
     with np.errstate(all="ignore"):
         relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)
@@ -117,6 +126,7 @@ def fit_circles(
         contrast=rows[:, 11],
         residual=rows[:, 12],
         count=rows[:, 13],
-        harmonics=rows[:, 15:].reshape(-1, 4, 2),
+        growth_variance=rows[:, 15:18] * (rows[:, 12] ** 2)[:, None],
+        harmonics=rows[:, 18:].reshape(-1, 4, 2),
         valid=valid,
     )

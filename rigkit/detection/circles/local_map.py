@@ -33,7 +33,7 @@ MIN_SMOOTH, MIXED_STEP = 20, 0.3
 POWERS = tuple((order - k, k) for order in range(len(TYPICAL_DERIVATIVES)) for k in range(order + 1))
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PlaneMap:
     """The image as a function of the plane (in distances of neighbours) around M places.
 
@@ -44,7 +44,8 @@ class PlaneMap:
     second : (M, 2, 3) second derivatives, xx, xy and yy.
     support : (M,) circles behind the fit, without the one at the place itself.
     surrounded : (M,) whether there is a circle on every side.
-    gain : (M,) standard deviation of `pixels` for circles of standard deviation 1.
+    gain, slope_gain : (M,) standard deviation of `pixels`, and of `first` (per distance; the mean over both sides), for
+        circles of standard deviation 1.
     """
 
     pixels: FloatArray
@@ -53,6 +54,7 @@ class PlaneMap:
     support: IntArray
     surrounded: BoolArray
     gain: FloatArray
+    slope_gain: FloatArray
 
 
 def plane_basis(hexagonal: bool) -> FloatArray:
@@ -98,19 +100,21 @@ def local_maps(
     homography, own = _homographies(plane, values, weight)
     rest = np.where(known[..., None], values - homography, 0.0)
     normal = _sums(weight, terms, terms) + np.diag(ridge)
-    # Beside the terms, what the first of them, the place itself, takes from each of the circles.
-    right = np.zeros((len(places), len(POWERS), 3))
-    right[:, :, :2], right[:, 0, 2] = np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2), 1.0
+    # Beside the terms, what the first three of them, the place itself and its sides, take from each of the circles.
+    right = np.zeros((len(places), len(POWERS), 5))
+    right[:, :, :2] = np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2)
+    right[:, [0, 1, 2], [2, 3, 4]] = 1.0
     solved = np.linalg.solve(normal, right)
     parts = solved[:, :, :2] + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
-    gain = np.linalg.norm(weight * (solved[:, :, 2] @ terms.T), axis=1)
+    gain, *sides = (np.linalg.norm(weight * (solved[:, :, k] @ terms.T), axis=1) for k in (2, 3, 4))
     return PlaneMap(
-        parts[:, 0] + middle,
-        np.swapaxes(parts[:, 1:3], 1, 2),
-        np.swapaxes(parts[:, 3:6], 1, 2),
-        (known & ~centre).sum(axis=1),
-        (known | centre)[:, np.hypot(x, y) < NEXT].all(axis=1),
-        gain,
+        pixels=parts[:, 0] + middle,
+        first=np.swapaxes(parts[:, 1:3], 1, 2),
+        second=np.swapaxes(parts[:, 3:6], 1, 2),
+        support=(known & ~centre).sum(axis=1),
+        surrounded=(known | centre)[:, np.hypot(x, y) < NEXT].all(axis=1),
+        gain=gain,
+        slope_gain=np.sqrt(np.mean(np.square(sides), axis=0)),
     )
 
 

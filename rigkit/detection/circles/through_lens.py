@@ -14,6 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError
 from rigkit.core.patterns.circles import Circles
+from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.find import (
     MAX_CIRCLE_GROWTH,
     MAX_CIRCLE_RESIDUAL,
@@ -22,12 +23,14 @@ from rigkit.detection.circles.find import (
     CircleGrid,
     edge_reach,
     like_contrast,
+    rows_of,
 )
 from rigkit.detection.circles.fit import CircleFit, fit_circles
 from rigkit.detection.circles.local_map import NEXT
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.kernels.circles import BESIDE
 
 MIN_POSE_CIRCLES = 12
 """Circles found that tell the pose of a board."""
@@ -61,16 +64,20 @@ def seen_through(
     whole = ((pixels > extent) & (pixels < np.array([grey.shape[1], grey.shape[0]]) - 1.0 - extent)).all(axis=1)
     tried = valid & (known | whole)
     blur = np.full(int(tried.sum()), found.blur_px)
-    near = np.linalg.norm(points[tried][:, None] - points[known], axis=2) < NEXT * nearest_mm
-    surrounded = near.sum(axis=1) > (6 if found.hexagonal else 4)
+    apart = np.linalg.norm(points[tried][:, None] - points[tried], axis=2)
+    near = (apart < NEXT * nearest_mm) & (apart > 0.0) & known[tried]
+    surrounded = near.sum(axis=1) >= (6 if found.hexagonal else 4)
     reach = edge_reach(maps[tried], 0.5 * nearest_mm / radius_mm, blur, surrounded)
-    fit = fit_circles(grey, pixels[tried], maps[tried], bends[tried], blur, reach)
+    first = np.argsort(~near, axis=1, kind="stable")[:, :BESIDE]
+    beside = np.where(np.take_along_axis(near, first, axis=1), first, -1)
+    fit = fit_circles(grey, pixels[tried], maps[tried], bends[tried], blur, reach, beside)
     off = np.linalg.norm(fit.pixels - pixels[tried], axis=1) / spacing[tried]
     good = _sound(fit, found) & (off < OFF_PLACE)
     sigma = np.full(len(grid), np.nan)
     sigma[known] = placed.sigma_px[np.argsort(board.index(placed.grid))]
     at = np.flatnonzero(tried)[good]
-    pixels[at], sigma[at] = fit.pixels[good], fit.sigma_px[good]
+    pixels[at] = fit.pixels[good]
+    sigma[at] = centre_sigmas(rows_of(fit, good), grid[at], 0.0, found.radius)
     kept = np.isfinite(sigma)
     return BoardDetection(placed.board_id, *board.size, grid[kept], pixels[kept], sigma[kept])
 

@@ -1,0 +1,60 @@
+"""How certain the centres of a grid's circles are: by the noise of pixels, and by what their shapes say of all else.
+
+Where neighbouring pixels share their noise (a picture smoothed after it was taken, JPEG), where print or light differ
+along the edges, there is more about a circle than the residuals of its pixels show. It changes how circles are slanted
+as much as where they lie, each in its sigmas for white noise, and slant is known: neighbours foretell it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.detection.circles.fit import MODEL_SIGMA_PX, CircleFit
+from rigkit.detection.circles.local_map import MIN_SMOOTH
+
+MAP_ERROR = 1.0
+"""Error of a centre over that of its circle's size times the radius in distances: (n - 1) / 4 for the order n = 5 that
+follows the polynomial's (`local_map`)."""
+ODD_BY_NOISE = 3.8
+"""Noise makes the sum of squares of three changes of shape so many times its usual one once in a hundred circles."""
+WAVY_BY_NOISE = 2.5
+"""Likewise the mean square of harmonics 3 to 6 of a circle's edge."""
+
+
+def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | float, radius: float) -> FloatArray:
+    """Return standard deviations (N,) of the centres of a grid's circles, px.
+
+    By how much slants scatter beyond what white noise makes of them, all are less sure. What a single circle is off in
+    size and slant, beyond that and beyond what all are (motion stretches them), shows the error of the map's first
+    derivatives. At the rim, where it is not small, the map is foretold from one side, and what its polynomial leaves of
+    order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that, times the radius, moves
+    the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
+
+    Parameters
+    ----------
+    slope_gain : (N,) of the maps that were given to the fit (`PlaneMap`); 0 where they come from a camera.
+    radius : in distances of neighbours.
+    """
+    size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
+    relative = fit.sigma_px / size_px
+    usual = fit.growth_variance + (MODEL_SIGMA_PX / size_px)[:, None] ** 2
+    usual = usual + 0.5 * (slope_gain * radius * relative)[:, None] ** 2
+    odd = _beside_smooth(fit.growth, label) ** 2
+    # The mean of two squares of normal deviates has the median ln 2.
+    more = max(float(np.median((odd / usual)[:, 1:].mean(axis=1))) / np.log(2.0), 1.0)
+    misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * usual.sum(axis=1), 0.0)
+    wavy = ((fit.harmonics - np.median(fit.harmonics, axis=0)) ** 2).mean(axis=(1, 2))
+    uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
+    return np.asarray(np.sqrt(more * fit.sigma_px**2 + ((MAP_ERROR * radius) ** 2 * misshapen + uneven) * size_px**2))
+
+
+def _beside_smooth(values: FloatArray, label: IntArray) -> FloatArray:
+    """Return what `values` (N, K) are beside a quadratic surface over the places: what all have, and what lens and blur
+    change evenly, is no scatter. Beside their medians where there are few circles."""
+    off = values - np.median(values, axis=0)
+    if len(values) < MIN_SMOOTH:
+        return off
+    x, y = ((label - label.mean(axis=0)) / np.maximum(np.ptp(label, axis=0), 1)).T
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    return off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
