@@ -57,4 +57,4 @@ def _beside_smooth(values: FloatArray, label: IntArray) -> FloatArray:
         return off
     x, y = ((label - label.mean(axis=0)) / np.maximum(np.ptp(label, axis=0), 1)).T
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    return off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0]
+    return np.asarray(off - terms @ np.linalg.lstsq(terms, off, rcond=None)[0])

@@ -264,7 +264,7 @@ def _own_growth(fit: CircleFit, good: BoolArray) -> FloatArray:
     Without their neighbours' light they seemed smaller than they are.
     """
     common = float(np.median(fit.growth[good, 0])) if good.any() else 0.0
-    return fit.growth - np.array([common, 0.0, 0.0])
+    return np.asarray(fit.growth - np.array([common, 0.0, 0.0]))
 
 
 def _spacing(around: PlaneMap) -> FloatArray:

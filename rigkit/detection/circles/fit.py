@@ -92,7 +92,7 @@ def fit_circles(
     bends : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
     blur_px : (N,) where to start.
     reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
-    beside : (N, BESIDE) which of the circles are neighbours, whose light blur brings into a circle's pixels; -1 for none.
+    beside : (N, BESIDE) neighbours, whose light blur brings into a circle's pixels; -1 for none.
     """
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
     margin = np.abs(bends).sum(axis=(1, 2)) + 1.0
