@@ -135,7 +135,7 @@ def test_pictures_that_were_flipped_are_no_moved_principal_point(
     flip: int, words: str, home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for path in (home / "same").iterdir():
-        cv2.imwrite(str(tmp_path / path.name), cv2.flip(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), flip))
+        cv2.imwrite(str(tmp_path / path.name), cv2.flip(np.asarray(read_image(path)), flip))
     fixed = tmp_path / "fixed.json"
     assert main(["check", str(home / "cam.json"), str(tmp_path), "--fix", str(fixed)]) == 1
     said = capsys.readouterr()

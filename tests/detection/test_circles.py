@@ -280,7 +280,7 @@ def test_sigmas_hold_where_blur_joins_circles_or_neighbouring_pixels(
         scene = one_board(rng, lens="regular", board=board)
         image = grey_image(scene.render(blur_px=blur_px, noise_levels=4.0, rng=rng))
         if smoothed_px:
-            image = cv2.GaussianBlur(image, (0, 0), smoothed_px)
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), smoothed_px), np.float32)
         truth = scene.truth()[0].pixels
         for found in find_grids(image):
             nearest = np.linalg.norm(found.pixels[:, None] - truth, axis=2).argmin(axis=1)

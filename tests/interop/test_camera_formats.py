@@ -295,8 +295,8 @@ projection_matrix:
     assert camera.parameters.tolist() == [500.5, 501.5, 320.25, 240.75, -0.2, 0.05, 0.001, -0.002, 0.0]
 
 
-@pytest.mark.parametrize("keys", ["DKRP", "dkrp"])
-def test_a_message_of_ros_as_echo_prints_it(keys: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("keys", [tuple("DKRP"), tuple("dkrp")])
+def test_a_message_of_ros_as_echo_prints_it(keys: tuple[str, ...], tmp_path: Path) -> None:
     D, K, R, P = keys
     message = f"""header:
   frame_id: camera

@@ -187,11 +187,11 @@ def test_no_board_of_known_size_says_nothing(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1000.0), ("cm", 10.0), ("inches", 25.4)])
 def test_a_length_in_another_unit_is_named(unit: str, factor: float) -> None:
-    stated = {"stated_mm": BASELINE_MM / factor, "stated_sigma_mm": 1.0 / factor}
-    one = diagnose([reported(**stated, distances=False)])
+    stated_mm, sigma_mm = BASELINE_MM / factor, 1.0 / factor
+    one = diagnose([reported(stated_mm=stated_mm, stated_sigma_mm=sigma_mm, distances=False)])
     assert len(one) == 1
     assert f"written in {unit}?" in one[0]
-    beside = diagnose([reported(**stated)])
+    beside = diagnose([reported(stated_mm=stated_mm, stated_sigma_mm=sigma_mm)])
     assert f"written in {unit}?" in beside[0]
     assert not any("written in" in words for words in diagnose([reported(stated_mm=BASELINE_MM / 1.1)]))
 
