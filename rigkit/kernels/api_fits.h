@@ -287,7 +287,7 @@ enum { CIRCLE_OUTCOMES = 26, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
 typedef struct {
-    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px;
+    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px, near_beside;
     int64_t iterations, fewest;
 } circle_rules_t;
 

@@ -20,8 +20,6 @@ enum { OFF = PARAMETERS, COLUMNS };
 enum { OWN = COLUMNS, ROWS };
 /* Further from an edge than this, in blurs, it is all one brightness. */
 static const float FAR = 12.0f;
-/* The edge of a circle beside it reaches into a circle's pixels from nearer than so many blurs: a 700th of its light. */
-static const double NEAR_EDGE = 3.0;
 /* Nearer to the centre than this, in px, the way to the edge turns round with the centre, and fits do not settle. */
 static const double NO_DIRECTION = 1.0;
 /* Further than so many radii from a circle beside it pixels have none of its light: there its map may not be inverted. */

@@ -207,7 +207,8 @@ static void write_circle(const circle_t *at, const double *N, double squares, in
 
 /* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
 static group_t grouped(
-    int64_t n, const double *pixels, const double *maps, const double *bends, const double *blur, const int64_t *beside)
+    int64_t n, const double *pixels, const double *maps, const double *bends, const double *blur, const int64_t *beside,
+    const circle_rules_t *rules)
 {
     group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, bends + 6 * n, blur[n])};
     for (int k = 0; k < BESIDE; k++) {
@@ -218,7 +219,7 @@ static group_t grouped(
         /* Both are as wide as the larger of their sides on the way from one to the other; half of what is left is its own. */
         const double u = other.c[0] - group.own.c[0], v = other.c[1] - group.own.c[1], apart = hypot(u, v);
         const double *M = other.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
-        if (0.5 * apart - wide < NEAR_EDGE * blur[n] && apart > 1.0 && inverted(&other))
+        if (0.5 * apart - wide < rules->near_beside * blur[n] && apart > 1.0 && inverted(&other))
             group.beside[group.count++] = other;
     }
     return group;
@@ -234,7 +235,7 @@ void fit_circles(
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * CIRCLE_OUTCOMES;
         memset(result, 0, CIRCLE_OUTCOMES * sizeof(double));
-        group_t group = grouped(n, pixels, maps, bends, blur, beside);
+        group_t group = grouped(n, pixels, maps, bends, blur, beside, rules);
         circle_t *at = &group.own;
         const double band = rules->near_sigmas * at->s + rules->near_px;
         if (!inverted(at))

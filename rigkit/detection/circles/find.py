@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
-from rigkit.detection.circles.fit import CircleFit, fit_circles
+from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, fit_circles
 from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_bends
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels.circles import BESIDE
@@ -46,9 +46,9 @@ MAX_GAIN = 10.0
 on one side, is five times."""
 SURE_GAIN = 1.5
 """Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
-NEAR_EDGE, ROUNDS_BESIDE = 3.0, 2
-"""Blur brings light of a neighbour half of whose distance is less than so many sigmas: a 700th of it. The second round
-has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal, blur 3 px)."""
+ROUNDS_BESIDE = 2
+"""The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
+blur 3 px)."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MAX_NEW_RINGS = 40
@@ -291,7 +291,7 @@ def _beside_others(grey: GreyImage, draft: _Draft) -> _Draft:
     """
     for _ in range(ROUNDS_BESIDE):
         half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
-        if not (half_gap_px < NEAR_EDGE * draft.fit.blur_px).any():
+        if not (half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any():
             break
         fitted = _again(grey, draft, beside=True)
         if not _enough(fitted):

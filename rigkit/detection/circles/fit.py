@@ -16,6 +16,8 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import circles as kernel
 
+NEAR_BESIDE = 3.0
+"""Blur brings light of a neighbour half of whose distance is less than so many sigmas: a 700th of it."""
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,
@@ -25,6 +27,7 @@ RULES = kernel.CircleRules.of(
     most_growth=0.2,
     most_light=1.5,
     converged_px=1e-3,
+    near_beside=NEAR_BESIDE,
     iterations=15,
     fewest=16,
 )
