@@ -57,9 +57,9 @@ def describe(calibration: Calibration) -> str:
     note = training_note(calibration.rms_px, held)
     lines = [
         f"{camera.model}, {camera.size_px[0]}x{camera.size_px[1]} px: {headline}",
-        f"training RMS {calibration.rms_px:.4f} px{note} (2-D per corner, {calibration.corner_count} corners in "
-        f"{len(calibration.views)} views), {len(calibration.outliers)} outliers, {calibration.images_left_out} images "
-        "dropped",
+        f"training RMS {calibration.rms_px:.4f} px (2-D per corner, {calibration.corner_count} corners in "
+        f"{len(calibration.views)} views{note and f'; {note}'}), {len(calibration.outliers)} outliers, "
+        f"{calibration.images_left_out} images dropped",
         f"focal length on the axis {focal_words(calibration)} px, sees {across_deg:.1f} degrees across",
     ]
     words = rounded_parameters(camera, calibration.parameter_sigmas)

@@ -77,7 +77,7 @@ def training_note(rms_px: float, heldout_rms_px: float | None) -> str:
     """Return why the training RMS is above the held-out RMS, which readers take for a mistake; "" where it is not."""
     if heldout_rms_px is None or rms_px <= heldout_rms_px:
         return ""
-    return " (every corner alike; in the held-out RMS blurred ones count less)"
+    return "every corner alike, in the held-out RMS blurred ones count less"
 
 
 def _basis(c: Calibration) -> str:

@@ -144,10 +144,10 @@ def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
 def _said(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:
     """Return what is said first, of a camera or a rig alike: how good it is, severity, colour and words of each
     finding, the gravest first, and what it rests on."""
-    held = c.heldout_rms_px
+    held, note = c.heldout_rms_px, training_note(c.rms_px, c.heldout_rms_px)
     return {
         "heldout": f"not available (too few {taken})" if held is None else f"{held:.3f} px",
-        "training": f"{c.rms_px:.3f} px{training_note(c.rms_px, held)}",
+        "training": f"{c.rms_px:.3f} px" + (f" ({note})" if note else ""),
         "findings": [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(c.verdicts)],
         "told": told(facts),
         "basis": facts.basis,
