@@ -85,8 +85,8 @@ def middle_of(views: Views, size_px: tuple[int, int], middle: tuple[float, float
         for view in views[name]:
             inside = (((view.pixels - centre) / axes) ** 2).sum(axis=1) <= 1.0
             if inside.sum() >= LEAST_CORNERS:
-                fields = {"grid": view.grid[inside], "pixels": view.pixels[inside], "sigma_px": view.sigma_px[inside]}
-                own.append(replace(view, **fields))
+                grid, pixels, sigma_px = view.grid[inside], view.pixels[inside], view.sigma_px[inside]
+                own.append(replace(view, grid=grid, pixels=pixels, sigma_px=sigma_px))
         if own:
             out[name] = own
     return out

@@ -22,6 +22,8 @@ STRUCTURES: dict[str, type[Struct]] = {}
 NAMES_IN_SIZES: dict[str, Any] = dict(header().constants)
 """What sizes of arrays may be made of, beside other arguments: the constants, and the kernels once they are loaded."""
 
+FIRST_BYTE: Callable[[Any], ctypes.c_char] = ctypes.c_char.from_buffer
+"""Raises TypeError or ValueError for what is not contiguous, or read-only, or empty."""
 EMPTY = ctypes.c_double()
 """What is passed for an empty array, which has no first value."""
 
@@ -42,10 +44,8 @@ def address(array: NDArray[Any]) -> int:
     two hundred addresses.
     """
     try:
-        # This refuses what is not contiguous.
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
+        return ctypes.addressof(FIRST_BYTE(array))
     except (TypeError, ValueError):
-        # Read-only, or empty, or another order.
         if not array.flags.c_contiguous:
             raise ValueError("not C-contiguous") from None
         return int(array.ctypes.data)
@@ -82,7 +82,7 @@ def call({", ".join(self.names)}):
         scope: dict[str, Any] = dict(NAMES_IN_SIZES)
         scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}
         scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_checked": self._checked}
-        scope |= {"_addressof": ctypes.addressof, "_from_buffer": ctypes.c_char.from_buffer}
+        scope |= {"_addressof": ctypes.addressof, "_from_buffer": FIRST_BYTE}
         scope |= {"_empty": ctypes.addressof(EMPTY)}
         exec(compile(code, f"api.h: {self.owner}", "exec"), scope)
         return cast("Callable[..., Any]", scope["call"])

@@ -356,8 +356,8 @@ class _Cells:
 def _cells(axis: Float32, per_pixel: int) -> _Cells:
     down, right = np.gradient(axis[::per_pixel, ::per_pixel])
     sides = np.abs(np.stack([down, right])) / np.float32(per_pixel)
-    sides = np.clip(sides, MIN_CELL, MAX_CELL).astype(np.float32)
-    wide, narrow = sides.max(axis=0), sides.min(axis=0)
+    boxes = np.clip(sides, MIN_CELL, MAX_CELL).astype(np.float32)
+    wide, narrow = boxes.max(axis=0), boxes.min(axis=0)
     return _Cells(wide, narrow, per_pixel, 0.5 * float((wide + narrow).max()))
 
 

@@ -158,7 +158,8 @@ def _panels(rng: np.random.Generator) -> Sheet:
 def _facade(rng: np.random.Generator) -> Sheet:
     """A tower of glass: panes without frames to speak of, each mirroring something else."""
     wide, high = int(rng.uniform(40, 90)), int(rng.uniform(50, 110))
-    shades = rng.choice([rng.uniform(30, 90), rng.uniform(120, 220)], (-(-SHEET // high), -(-SHEET // wide)))
+    two = np.array([rng.uniform(30.0, 90.0), rng.uniform(120.0, 220.0)])
+    shades = two[rng.integers(2, size=(-(-SHEET // high), -(-SHEET // wide)))]
     shades = shades + rng.normal(0.0, 15.0, shades.shape)
     panes = np.repeat(np.repeat(shades, high, axis=0), wide, axis=1)[:SHEET, :SHEET]
     return _ruled(_grey(panes), (wide, high), 90, int(rng.integers(1, 5)))

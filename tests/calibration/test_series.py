@@ -41,8 +41,8 @@ def in_middle(views: list[BoardView]) -> list[BoardView]:
     for view in views:
         inside = np.linalg.norm((view.pixels - half) / half, axis=1) < MIDDLE
         if inside.sum() >= 12:
-            part = {"grid": view.grid[inside], "pixels": view.pixels[inside], "sigma_px": view.sigma_px[inside]}
-            out.append(replace(view, **part))
+            grid, pixels, sigma_px = view.grid[inside], view.pixels[inside], view.sigma_px[inside]
+            out.append(replace(view, grid=grid, pixels=pixels, sigma_px=sigma_px))
     return out
 
 

@@ -38,7 +38,7 @@ def part_scene(seed: int, lens: str, covered: bool) -> tuple[BenchScene, np.rand
         if placed is not None:
             seen = placed.see(camera, Rigid3.identity())[1].mean()
             placed = placed if (seen == 1.0 if covered else 0.33 < seen < 0.97) else None
-    placed = replace(placed, margin_squares=rng.choice([0.0, 0.3, 0.5, 1.0]), first_black=bool(rng.integers(2)))
+    placed = replace(placed, margin_squares=float(rng.choice([0.0, 0.3, 0.5, 1.0])), first_black=bool(rng.integers(2)))
     panels: tuple[Panel, ...] = ()
     if covered:
         spot = rng.uniform(-1.0, board.size) * 30.0
@@ -47,9 +47,9 @@ def part_scene(seed: int, lens: str, covered: bool) -> tuple[BenchScene, np.rand
         angle = rng.choice([0.0, 0.5 * np.pi, rng.uniform(0.0, np.pi)])
         pose = placed.world_from_board @ Rigid3(exp_so3(np.array([0.0, 0.0, angle])), np.array([*spot, -1.0]))
         width_mm, height_mm = rng.uniform(20.0, 300.0, 2)
-        panels = (Panel(pose, width_mm, height_mm, rng.choice([0.06, 0.35, 0.6, 0.8, 0.85])),)
+        panels = (Panel(pose, width_mm, height_mm, float(rng.choice([0.06, 0.35, 0.6, 0.8, 0.85]))),)
     behind = placed.world_from_board @ Rigid3(np.eye(3), np.array([100.0, 100.0, 3.0]))
-    wall = Panel(behind, 3000.0, 3000.0, rng.choice([0.05, 0.35, 0.6, 0.8]))
+    wall = Panel(behind, 3000.0, 3000.0, float(rng.choice([0.05, 0.35, 0.6, 0.8])))
     field = 185.0 if lens == "fisheye" else None
     return BenchScene("part", (placed,), (wall,), camera, field, panels), rng
 
@@ -70,7 +70,7 @@ def count(seeds: range, lens: str, covered: bool) -> tuple[int, int, int]:
     right = wrong = left = 0
     for seed in seeds:
         scene, rng = part_scene(seed, lens, covered)
-        noise, blur = rng.choice([0.0, 2.0, 5.0]), rng.choice([0.5, 0.8, 1.2])
+        noise, blur = float(rng.choice([0.0, 2.0, 5.0])), float(rng.choice([0.5, 0.8, 1.2]))
         photometry = replace(BENCH_PHOTOMETRY, noise_levels=noise)
         image = scene.render(optics=Optics(blur, supersample=2), photometry=photometry, rng=rng)
         board = scene.boards[0].board

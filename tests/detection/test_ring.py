@@ -55,7 +55,7 @@ def test_ring_beyond_the_squares_is_refused() -> None:
     """On a board of 5 px squares a ring of 4.6 px reads the next squares, though it is symmetric all the same."""
     fine = (np.arange(40 * FINE) // (5 * FINE))[:, None] + np.arange(40 * FINE) // (5 * FINE)
     image = (fine % 2 * 160.0 + 40.0).reshape(40, FINE, 40, FINE).mean(axis=(1, 3)).astype(np.float32)
-    image = cv2.GaussianBlur(image, (0, 0), 1.0)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), np.float32)
     assert len(corner_at(image, (19, 19), RING_RADIUS)) == 1
     assert len(corner_at(image, (19, 19), 6.0)) == 0
 

@@ -182,7 +182,8 @@ def _blurred_edge(x: Float32, kurtosis: Float32) -> tuple[Float32, ...]:
     slope = density * (one + part * (square * (square - six) + three))
     bow = -density * x * (one + part * (square * (square - ten) + fifteen))
     curl = density * (square - one)
-    return erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, curl, x * slope - np.float32(4.0) * third
+    orders = (erf(x * np.float32(np.sqrt(0.5))) - third, slope, bow, curl, x * slope - np.float32(4.0) * third)
+    return tuple(np.asarray(order, np.float32) for order in orders)
 
 
 def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tuple[Any, ...], ...]:

@@ -57,7 +57,7 @@ def _surface_roughness(pixels: FloatArray, sigma_px: FloatArray, degree: int) ->
     row, column = np.nonzero(known)
     if not len(row):
         return np.nan
-    y, x = (2.0 * (place - place.mean()) / max(np.ptp(place), 1) for place in (row, column))
+    y, x = (2.0 * (place - place.mean()) / max(int(np.ptp(place)), 1) for place in (row, column))
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = 1.0 / sigma_px[known]
     surface, size, _ = np.linalg.svd(terms * weight[:, None], full_matrices=False)
