@@ -11,6 +11,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.uncertainty import FarProjection, uncertainty_map
 from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
 from rigkit.core.findings import Severity, gravest_first, worst
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.plan import Plan
@@ -117,16 +118,22 @@ def focal_words(c: Calibration) -> str:
 
     fx and fy are that in some models only: those of a narrow double sphere may be several times less.
     """
-    p, sigmas = c.camera.parameters, c.parameter_sigmas
-    # Far less than is known of each number: so near every trial is a lens, and the focal length a straight line.
+    p, sigmas, here = c.camera.parameters, c.parameter_sigmas, c.camera.focal_px
+    # Far less than is known of each number: so near the focal length is a straight line.
     steps = np.where(sigmas > 0.0, FOCAL_STEP * sigmas, FOCAL_STEP * np.maximum(np.abs(p), 1.0))
 
-    def focal_px(k: int, sign: float) -> float:
-        return c.camera.with_parameters(p + sign * steps * (np.arange(p.size) == k)).focal_px
+    def moved(k: int, step: float) -> tuple[float, float]:
+        """Return the focal length beside `here`, and by how much the parameter; both 0 beyond the model."""
+        try:
+            return c.camera.with_parameters(p + step * (np.arange(p.size) == k)).focal_px - here, step
+        except InputError:
+            return 0.0, 0.0
 
-    gradient = np.array([(focal_px(k, 1.0) - focal_px(k, -1.0)) / (2.0 * steps[k]) for k in range(p.size)])
+    # A lens at the edge of its model, such as eucm with alpha = 0, has neighbours on one side.
+    sides = np.array([np.subtract(moved(k, step), moved(k, -step)) for k, step in enumerate(steps.tolist())])
+    gradient = sides[:, 0] / np.maximum(sides[:, 1], np.finfo(float).tiny)
     sigma = c.widening * float(np.sqrt(max(gradient @ c.covariance @ gradient, 0.0)))
-    return rounded_words(c.camera.focal_px, sigma)
+    return rounded_words(here, sigma)
 
 
 def _parameters(c: Calibration) -> Table:

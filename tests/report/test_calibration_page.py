@@ -16,13 +16,14 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
+from rigkit.cameras.eucm import EUCM
 from rigkit.cli.calibration_words import describe
 from rigkit.core.findings import Finding
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.report.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.calibration_facts import _reach
+from rigkit.report.calibration_facts import _reach, focal_words
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.report.plan_page import plan_words
 
@@ -128,6 +129,16 @@ def test_the_focal_length_is_told_whatever_a_model_calls_fx(calibration: Calibra
     sphere = calibrate(views, truth.size_px, model="double_sphere", board="flat")
     focal_px, sigma_px = told_focal_px(sphere)
     assert abs(sphere.camera.parameters[0] - truth.focal_px) > 50.0 > 10.0 * abs(focal_px - truth.focal_px)
+
+
+def test_the_focal_length_of_a_lens_at_the_edge_of_its_model_is_told(calibration: Calibration) -> None:
+    fx, fy, cx, cy = calibration.camera.parameters[:4].tolist()
+    camera = EUCM(calibration.camera.size_px, np.array([fx, fy, cx, cy, 0.0, 1.0]))
+    covariance = np.diag([4.0, 4.0, 1.0, 1.0, 1e-4, 1e-2])
+    edge = replace(calibration, camera=camera, covariance=covariance, frame_covariance=np.eye(12), rivals=())
+    expected = edge.widening * np.sqrt(0.25 * (fy / fx + fx / fy) * 4.0)
+    focal, sigma = (float(word) for word in focal_words(edge).removesuffix(" px").split(" ± "))
+    assert (focal, sigma) == (pytest.approx(np.sqrt(fx * fy), rel=1e-3), pytest.approx(expected, rel=0.1))
 
 
 def test_says_what_the_calibration_says(calibration: Calibration) -> None:
