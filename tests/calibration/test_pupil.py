@@ -12,6 +12,7 @@ from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
+from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
@@ -70,6 +71,9 @@ def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> No
     """Half of it, and no more than there is: corners that fit least are left out, and boards of free shape follow."""
     found = session(NEAR, MM_PER_RAD2, 0, shape)
     assert found.verdicts[0].message.startswith("training RMS") and TOLD in found.verdicts[0].message
+    # The images all say the same: that something differs between them would be another cause.
+    said = judge(found, in_force=("model", "board_shape"))
+    assert not any("something differs between images" in one.message for one in said)
     pupil, true = pupil_of(found), off_far_away(found)
     assert 0.4 * MM_PER_RAD2 < pupil.mm_per_rad2 < 1.1 * MM_PER_RAD2
     assert true > 1.0

@@ -102,7 +102,7 @@ def judge(
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
-    pattern = [] if mixed else _pattern(calibration, correlation, in_force)
+    pattern = [] if mixed else _pattern(calibration, correlation, in_force, bool(change))
     effects = _unsure(calibration, far)
     # Images that contradict each other make a lens unsure, however many there are.
     contradicting = worst(effects) is Severity.BAD
@@ -313,8 +313,8 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
     return np.asarray(0.5 * (padded[row, (count - 1) // 2] + padded[row, count // 2]))
 
 
-def _pattern(c: Calibration, correlation: float, in_force: Collection[str]) -> list[Finding]:
-    """Residuals of neighbours agree where a lens or a board is not what the model says."""
+def _pattern(c: Calibration, correlation: float, in_force: Collection[str], named: bool) -> list[Finding]:
+    """Residuals of neighbours agree where lens or board are not what the model says, or for a cause `named` already."""
     if correlation < PATTERN:
         return []
     what = f"residuals of neighbouring corners agree (correlation {correlation:.2f}): "
@@ -325,7 +325,7 @@ def _pattern(c: Calibration, correlation: float, in_force: Collection[str]) -> l
         return [Finding.look(what + "the lens model, or the board's shape, does not quite fit", 'try model = "auto"')]
     what += "neither the lens models nor the boards' shapes follow all of it, so that something differs between images"
     remedy = "fix focus and stabilisation, hold camera and board still, take a board that does not bend"
-    return [Finding.look(what, remedy)]
+    return [] if named else [Finding.look(what, remedy)]
 
 
 def _overfit(c: Calibration) -> list[Finding]:
