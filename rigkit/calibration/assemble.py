@@ -7,15 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.calibration.between_models import RivalFit, between_models
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import Carried, GlobalCovariance
-from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, ViewResult
+from rigkit.calibration.pupil import SolvedPupil
+from rigkit.calibration.result import Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.normal_equations import Residuals
 from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -37,10 +40,13 @@ def assemble(
     """Return the result, without verdicts; `rivals` are other lenses that the images support about as well."""
     state, sigma = fit.state, fit.sigma_px
     covariance, clustered = _covariance(observations, fit)
-    p = state.camera.parameters.size
-    covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:p]))
+    covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:-6]))
+    camera, pupil = far_camera(state.camera), None
+    if isinstance(state.camera, NearCamera):
+        covariance, pupil = SolvedPupil.split(state.camera.pupil, covariance)
+    p = camera.parameters.size
     return Calibration(
-        camera=state.camera,
+        camera=camera,
         rms_px=fit.rms_px,
         heldout_rms_px=heldout_px,
         covariance=covariance[:p, :p],
@@ -55,6 +61,7 @@ def assemble(
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
         rivals=tuple(one.rival for one in rivals),
+        pupil=pupil,
     )
 
 
@@ -67,7 +74,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
     unit = fit.normal.covariance[0][:n, :n]
     variance = np.diag(unit)
     if not (np.isfinite(unit).all() and (variance[:p] > 0.0).all() and (variance >= 0.0).all()):
-        raise not_identifiable(fit.state.camera.model)
+        raise not_identifiable(far_camera(fit.state.camera).model)
     prior = (fit.normal.gg - fit.data.gg)[:n, :n]
     known = GlobalCovariance.of(fit.normal, fit.data.products[0], prior, observations.clusters(), fit.sigma_px)
     views = Carried.alone(len(observations.views))

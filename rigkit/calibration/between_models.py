@@ -31,6 +31,7 @@ from rigkit.calibration.solving.state import State
 from rigkit.calibration.uncertainty import followed
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import DegenerateError, InputError
 
@@ -53,8 +54,8 @@ def rival_fits(
 ) -> list[RivalFit]:
     """Return the `options` that are likely enough the better ones, fitted to the corners kept, with the boards as the
     chosen fit has them but for their warps."""
-    own = chosen.state.camera
-    cameras = [option.fit.state.camera for option in options]
+    own = far_camera(chosen.state.camera)
+    cameras = [far_camera(option.fit.state.camera) for option in options]
     alike = [same_model(camera, own) for camera in cameras]
     if not any(alike):
         # The chosen lens stands among them in another size.
@@ -63,12 +64,14 @@ def rival_fits(
     for option, camera, same in zip(options, cameras, alike, strict=True):
         if same or likely.get(option.name, 0.0) < MIN_LIKELY:
             continue
+        if isinstance(chosen.state.camera, NearCamera):
+            camera = NearCamera.of(camera, chosen.state.camera.pupil)
         start = replace(chosen.state.with_corners_held(), camera=camera)
         try:
             fit = fit_other_lens(observations, start, chosen.kept)
         except (InputError, DegenerateError):
             continue
-        found.append(RivalFit(Rival(option.name, fit.state.camera, likely[option.name]), fit.state))
+        found.append(RivalFit(Rival(option.name, far_camera(fit.state.camera), likely[option.name]), fit.state))
     return found
 
 
@@ -81,7 +84,10 @@ def rival_shapes(chosen: Option, shapes: Sequence[Option]) -> list[RivalFit]:
     """Return the same lens as boards of the other `shapes` show it, of those that are likely enough the better ones."""
     likely = HeldOut.of([shapes]).likely()
     return [
-        RivalFit(Rival(f"board {one.fit.state.shape.kind}", one.fit.state.camera, likely[one.name]), one.fit.state)
+        RivalFit(
+            Rival(f"board {one.fit.state.shape.kind}", far_camera(one.fit.state.camera), likely[one.name]),
+            one.fit.state,
+        )
         for one in shapes
         if one.name != chosen.name and likely.get(one.name, 0.0) >= MIN_LIKELY
     ]
@@ -107,22 +113,26 @@ def _lens(name: str) -> str:
 def between_models(
     observations: Observations, chosen: Fit, rivals: Sequence[RivalFit], sigmas: FloatArray
 ) -> FloatArray:
-    """Return what the rivals add to the covariance (P + 6, P + 6) of the chosen camera's parameters and of the mean
-    motion of the boards; `sigmas` (P,) are the standard deviations of the parameters without that."""
+    """Return what the rivals add to the covariance (P + 6, P + 6) of the chosen camera's parameters, its pupil among
+    them where that moves, and of the mean motion of the boards; `sigmas` (P,) are the standard deviations of the
+    parameters without that."""
     p = chosen.state.camera.parameters.size
     out = np.zeros((p + 6, p + 6))
     if not rivals:
         return out
     points, _ = chosen.state.points_in_cam(observations)
     rays = spread_rays(points[chosen.kept])
-    here = chosen.state
+    here, far = chosen.state, far_camera(chosen.state.camera)
     for one in rivals:
-        step, turn = followed(here.camera, one.rival.camera, rays, sigmas)
+        step, turn = followed(far, one.rival.camera, rays, sigmas[: far.parameters.size])
+        # Terms of the pupil are along the axis of either lens.
+        terms = one.state.camera.parameters[one.rival.camera.parameters.size :]
+        pupil = terms - here.camera.parameters[far.parameters.size :]
         # As the axes of the chosen lens have it.
         there = (turn.T @ one.state.rotation, one.state.translation_mm @ turn)
         moved = steps_between((here.rotation, here.translation_mm), there)
         motions = motion_of_world(here.translation_mm) @ moved[..., None]
-        way = np.concatenate([step, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
+        way = np.concatenate([step, pupil, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
         out += one.rival.likely * np.outer(way, way)
     return out
 

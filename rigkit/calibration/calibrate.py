@@ -15,6 +15,7 @@ from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.judging.moved import moved_lens
+from rigkit.calibration.judging.pupil import tells_of_pupil
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.lens_choice import (
     Choice,
@@ -32,7 +33,9 @@ from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.calibration.views.usable import usable_views
+from rigkit.calibration.with_pupil import against_central, require_known, solved_with_pupil, surely_moves
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
@@ -49,6 +52,7 @@ def calibrate(
     degree: int | None = None,
     board: str = "auto",
     folds: int = FOLDS,
+    pupil: str = "auto",
     progress: Progress = silent,
 ) -> Calibration:
     """Return the calibration of a camera from views of boards.
@@ -63,16 +67,20 @@ def calibrate(
     board : "flat", "warp", "released", or "auto": chosen by held-out error.
     folds : of the cross-validation over images; 0 for none: choices then rest on BIC, halves are not compared, and that
         another model may show the images as well is not in the sigmas, which are too small beyond the boards.
+    pupil : "auto": the lens is central, but where residuals say that its entrance pupil moves, and images that took no
+        part are shown better with it, that is two more unknowns (`Calibration.pupil`); "central": never; "moving":
+        always.
     progress : told of the models tried.
 
     Raises
     ------
     InputError
-        No view, corners outside the image, unknown model or board shape, a number of folds without a meaning.
+        No view, corners outside the image, unknown model, board shape or pupil, a number of folds without a meaning.
     DegenerateError
         The views do not determine the camera.
     """
-    return calibrate_together([("", views, How(size_px, model, degree, board, folds, progress))])[0]
+    require_known(pupil)
+    return calibrate_together([("", views, How(size_px, model, degree, board, folds, progress, pupil))])[0]
 
 
 def calibrate_together(
@@ -209,9 +217,37 @@ def _on_same_images(found: Solved, again: Solved) -> list[Option]:
 def _result(
     begun: _Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
 ) -> Calibration:
-    """Return the result of a camera with its verdicts."""
+    """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
+    central, how = _judged(begun, found, tried, rivals, likely), begun.how
+    if how.pupil == "central" or (how.pupil == "auto" and not tells_of_pupil(central.verdicts)):
+        return central
+    moving = solved_with_pupil(found, how)
+    if moving is not None:
+        if len(tried.models) == 1:
+            rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()
+        better, candidates = against_central(found, moving, how)
+        moving = replace(moving, candidates=[*candidates, *moving.candidates])
+        try:
+            result = _judged(begun, moving, tried, rivals, likely)
+        except DegenerateError:
+            result = central
+        if result.pupil is not None and (how.pupil == "moving" or (better and surely_moves(result))):
+            return result
+        central = replace(central, candidates=(*central.candidates, *candidates))
+    if how.pupil == "moving":
+        raise DegenerateError(
+            "calibration: the images do not tell how the entrance pupil moves; take boards near and far, up to the "
+            'rim of the image, or pupil = "auto"'
+        )
+    return central
+
+
+def _judged(
+    begun: _Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
+) -> Calibration:
+    """Return the result of a camera as it was solved for, with its verdicts."""
     how, fit = begun.how, found.chosen.fit
-    others = _others(tried, fit.state.camera.model) if len(tried.models) > 1 else []
+    others = _others(tried, far_camera(fit.state.camera).model) if len(tried.models) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
     if not begun.name:
         # What shape boards have is a question to all cameras of a rig together, which holds lenses by what each knows.

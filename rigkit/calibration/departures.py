@@ -29,6 +29,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.normal_equations import pose_inverses
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Pixels
 from rigkit.kernels.departures import DISPLACEMENTS, POSE, LensCorners, averaged_amounts, displacements
 
@@ -58,9 +59,9 @@ class Departures:
     @classmethod
     def of(cls, calibration: Calibration) -> Departures:
         """Return what the images of a calibration leave open."""
-        sigmas = calibration.parameter_sigmas
+        sigmas = _sigmas(calibration)
         p = len(sigmas)
-        products, freedom = _products(calibration, calibration.camera, sigmas, np.eye(3))
+        products, freedom = _products(calibration, calibration.near, sigmas, np.eye(3))
         if not (np.isfinite(products).all() and products[-1, -1] >= 0.0):
             # A lens beyond all numbers, as a damaged file may have it.
             products = np.zeros_like(products)
@@ -69,7 +70,8 @@ class Departures:
         left = products[p:, p:] - products[p:, :p] @ followed
         variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
         covariance = _averaged(left[:-1, :-1] / variance, left[:-1, -1] / variance)
-        return cls(calibration.camera.size_px, covariance, sigmas[:, None] * followed[:, :-1])
+        moved = sigmas[:, None] * followed[:, :-1]
+        return cls(calibration.camera.size_px, covariance, moved[: calibration.camera.parameters.size])
 
     def left_over(self, pixels: Pixels, design: FloatArray) -> FloatArray:
         """Return the displacements (2, J, M) at pixels (M, 2) less what the parameters have followed; `design`
@@ -90,9 +92,9 @@ def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
 def amounts_of(calibration: Calibration, fields: Fields) -> FloatArray:
     """Return E[a a^T] (F, F) of the amounts a of F further displacements, `fields`: independent and of variance one
     beforehand, with what the images say of them, poses and parameters eliminated."""
-    sigmas = calibration.parameter_sigmas
+    sigmas = _sigmas(calibration)
     p = len(sigmas)
-    products, freedom = _products(calibration, calibration.camera, sigmas, np.eye(3), fields)
+    products, freedom = _products(calibration, calibration.near, sigmas, np.eye(3), fields)
     count = len(products) - p - DISPLACEMENTS - 1
     if not np.isfinite(products).all():
         return np.eye(count)
@@ -116,6 +118,14 @@ def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) ->
     return _products(calibration, camera, np.ones(p), turn)[0][:p, :p]
 
 
+def _sigmas(calibration: Calibration) -> FloatArray:
+    """Return the standard deviations of the parameters of a calibrated camera, and of its pupil where that moves."""
+    sigmas, pupil = calibration.parameter_sigmas, calibration.pupil
+    if pupil is None:
+        return sigmas
+    return np.append(sigmas, calibration.widening * np.sqrt(np.maximum(np.diag(pupil.covariance), 0.0)))
+
+
 def _products(
     calibration: Calibration, camera: Camera, sigmas: FloatArray, turn: Mat3, fields: Fields | None = None
 ) -> tuple[FloatArray, int]:
@@ -125,12 +135,18 @@ def _products(
     corners = calibration.corners
     used, count = _enough(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
-    lever = turn @ np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
-    x, y, z = lever + turn @ corners.translation_mm.T[:, view]
+    lever = np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
+    centre = corners.translation_mm.T[:, view]
+    if isinstance(calibration.near, NearCamera) and camera is not calibration.near:
+        # Other lenses are shown what this one sees as from its pupil.
+        centre = calibration.near.seen((lever + centre).T).T - lever
+    lever = turn @ lever
+    x, y, z = lever + turn @ centre
     by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
     u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
     if fields is not None:
-        more = fields(np.concatenate([by_parameters, turned_rays(np.stack([x, y, z]), by_point)], axis=1))
+        of_lens = by_parameters[:, : calibration.camera.parameters.size]
+        more = fields(np.concatenate([of_lens, turned_rays(np.stack([x, y, z]), by_point)], axis=1))
         by_parameters, sigmas = np.concatenate([by_parameters, more], axis=1), np.append(sigmas, np.ones(more.shape[1]))
     residuals = corners.residuals_px[used]
     # Corners that do not project tell nothing.

@@ -46,6 +46,8 @@ class How:
     board: str
     folds: int
     progress: Progress
+    pupil: str = "central"
+    """Cameras of a rig look from one point: the rig is solved for with such."""
 
 
 def wanted_models(how: How) -> Wanted:

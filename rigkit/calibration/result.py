@@ -9,19 +9,28 @@ from typing import Self
 
 import numpy as np
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.clustered import effective_freedom, widening
+from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Points, as_array, keep_arrays, keep_indices
-from rigkit.core.boards import Board
+from rigkit.cameras.moving_pupil import NearCamera, far_camera, pupil_shift_of_rays_mm
+from rigkit.core.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Pixels,
+    Points,
+    Rays,
+    as_array,
+    keep_arrays,
+    keep_indices,
+)
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import drawn
 from rigkit.geometry.rigid3 import Rigid3
-
-MAX_OFF_LATTICE = 0.25
-"""Of a square: the corners of a board stand nearer to where they belong, however it is bent."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -140,99 +149,6 @@ class Rival:
     likely: float
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class BoardShape:
-    """A board's corners as the solution has them.
-
-    Attributes
-    ----------
-    board_id : name of the board.
-    kind : "flat", "warp" (print scale and a low-order bow) or "released" (every corner free under a prior).
-    points_mm : (columns * rows, 3) corners in the board frame, row by row.
-    bow_mm : largest departure from a plane.
-    aspect : how much longer the squares are along x than stated, against y (0.001: by 0.1 %).
-    declared : the board as it was declared; None in a calibration read from a file of before files said so.
-    """
-
-    board_id: str
-    kind: str
-    points_mm: Points
-    bow_mm: float = 0.0
-    aspect: float = 0.0
-    declared: Board | None = None
-
-    def __post_init__(self) -> None:
-        keep_arrays(self, points_mm=(None, 3))
-        if self.declared is not None and self.declared.corner_count != len(self.points_mm):
-            raise InputError(
-                f"board '{self.board_id}': {len(self.points_mm)} corners, but {self.declared.corner_count} are declared"
-            )
-
-    def __repr__(self) -> str:
-        return (
-            f"BoardShape('{self.board_id}', {self.kind}: {len(self.points_mm)} corners, off a plane by "
-            f"{self.bow_mm:.3f} mm, x longer than y by {100.0 * self.aspect:.3f} %)"
-        )
-
-    @classmethod
-    def of(cls, board: Board, kind: str, points_mm: Points) -> BoardShape:
-        """Return the shape of `board` with its corners at `points_mm`, bow and aspect from them."""
-        if kind == "flat":
-            return cls(board.board_id, kind, points_mm, declared=board)
-        centred = points_mm - points_mm.mean(axis=0)
-        normal = np.linalg.svd(centred, full_matrices=False)[2][2]
-        bow = float(np.abs(centred @ normal).max())
-        along_x, along_y = _stretch(board, points_mm)
-        return cls(board.board_id, kind, points_mm, bow, along_x / along_y - 1.0, board)
-
-    def at(self, grid: IntArray) -> Points:
-        """Return the corners (N, 3) at places of the grid (N, 2), column and row."""
-        return np.asarray(self.points_mm[grid @ np.array([1, self.column_count])])
-
-    @property
-    def column_count(self) -> int:
-        """Number of corners in a row."""
-        return self.board.columns if self.declared is None else self.declared.columns
-
-    @property
-    def board(self) -> Board:
-        """The flat board nearest to the corners as the solution has them. Of one that no file declares it is known that
-        its corners stand row by row, and no more: a chessboard."""
-        if self.declared is None:
-            return _chessboard_of(self.board_id, self.points_mm)
-        named = replace(self.declared, board_id=self.board_id)
-        if self.kind == "flat":
-            return named
-        along_x, along_y = _stretch(named, self.points_mm)
-        return named.with_squares(along_x * named.square_x_mm, along_y * named.square_y_mm)
-
-
-def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
-    """Return how much longer a board with its points at (N, 3) mm is than stated, along x and along y."""
-    centred = points_mm - points_mm.mean(axis=0)
-    flat = board.points() - board.points().mean(axis=0)
-    along_x, along_y = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
-    return float(along_x), float(along_y)
-
-
-def _chessboard_of(board_id: str, points_mm: Points) -> Board:
-    """Return the chessboard whose corners these are, row by row; raises InputError where they are no lattice."""
-    back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
-    columns = int(back[0]) + 1 if len(back) else len(points_mm)
-    rows = len(points_mm) // max(columns, 1)
-    fault = f"board '{board_id}': its {len(points_mm)} points are no grid, row by row; calibrate again"
-    if min(columns, rows) < 2 or rows * columns != len(points_mm):
-        raise InputError(fault)
-    lattice = points_mm.reshape(rows, columns, 3)
-    steps = [np.diff(lattice, axis=axis) for axis in (1, 0)]
-    square_x, square_y = (float(np.linalg.norm(step, axis=-1).mean()) for step in steps)
-    across, down = (step.mean(axis=(0, 1)) for step in steps)
-    flat = lattice[0, 0] + np.arange(columns)[:, None] * across + np.arange(rows)[:, None, None] * down
-    if not np.linalg.norm(lattice - flat, axis=-1).max() < MAX_OFF_LATTICE * min(square_x, square_y):
-        raise InputError(fault)
-    return Board(board_id, columns, rows, square_x, square_y)
-
-
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CalibrationCorners:
     """All corners of the views of a calibration, outliers too, one view after the other.
@@ -318,6 +234,7 @@ class Calibration:
     verdicts : what is good and what is not, the headline first.
     rivals : other lenses that the images support about as well: how far they differ where boards were is in the
         covariances, elsewhere it is in the projection's uncertainty.
+    pupil : how the lens's entrance pupil moves; None: it looks from one point. Far away `camera` is exact with it too.
     """
 
     camera: Camera
@@ -336,16 +253,16 @@ class Calibration:
     overdispersion: float = 1.0
     freedom: float = float("inf")
     rivals: tuple[Rival, ...] = ()
+    pupil: SolvedPupil | None = None
 
     _repr_html_ = drawn
 
     def __post_init__(self) -> None:
         p = self.camera.parameters.size
         keep_arrays(self, covariance=(p, p), frame_covariance=(p + 6, p + 6))
+        require_of_frame(self.pupil, p + 6)
         if not self.views:
-            raise InputError(
-                "calibration: no view was used; a calibration without data cannot be built; give images with boards"
-            )
+            raise InputError("calibration: no view was used, and without data there is none; give images with boards")
 
     def __repr__(self) -> str:
         width, height = self.camera.size_px
@@ -364,6 +281,28 @@ class Calibration:
     def corners(self) -> CalibrationCorners:
         """All corners of all views."""
         return CalibrationCorners.of(self.views, self.boards)
+
+    @cached_property
+    def near(self) -> Camera:
+        """The camera of points in mm: `camera`, or where its pupil moves a `NearCamera`."""
+        return self.camera if self.pupil is None else NearCamera.of(self.camera, self.pupil.terms)
+
+    def with_near(self, camera: Camera) -> Self:
+        """Return the same with another camera of points in mm, of the same model; all else is as it was."""
+        pupil = replace(self.pupil, terms=camera.pupil) if self.pupil and isinstance(camera, NearCamera) else None
+        return replace(self, camera=far_camera(camera), pupil=pupil)
+
+    def along(self, rays: Rays, range_mm: float) -> Points:
+        """Return the points (..., 3) of the camera frame, mm, `range_mm` along rays (..., 3) from where these start."""
+        points = range_mm * rays
+        if self.pupil is not None:
+            points[..., 2] += pupil_shift_of_rays_mm(rays, self.pupil.terms)
+        return points
+
+    @property
+    def near_covariance(self) -> FloatArray:
+        """That of the parameters of `near` together with the mean motion of the boards."""
+        return self.frame_covariance if self.pupil is None else self.pupil.joint(self.frame_covariance)
 
     @property
     def parameter_sigmas(self) -> FloatArray:

@@ -70,8 +70,8 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
     if np.isinf(range_mm):
         found = far.covariance(flat)
     else:
-        known = calibration.widening**2 * calibration.frame_covariance
-        found = _propagated(known, projection_design(calibration.camera, flat, range_mm))
+        known = calibration.widening**2 * calibration.near_covariance
+        found = _propagated(known, projection_design(calibration.near, calibration.along(flat, range_mm), 1.0))
         found += far.beyond_model(Along.of(calibration.camera, flat))
     covariance = found.reshape(*valid.shape, 2, 2)
     return Uncertainty(pixels, np.where(valid[..., None, None], covariance, np.nan), valid)
@@ -141,7 +141,7 @@ class FarProjection:
         to project: it saves the way back from the pixels."""
         camera, corners = calibration.camera, calibration.corners
         chosen = _spread(corners)
-        if from_boards:
+        if from_boards and calibration.pupil is None:
             points = corners.in_cam(chosen)
             rays, valid = points / np.sqrt((points * points).sum(axis=-1, keepdims=True)), np.ones(len(points), bool)
         else:

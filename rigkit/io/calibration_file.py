@@ -16,7 +16,8 @@ from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
 
-from rigkit.calibration.result import BoardShape, Calibration, Candidate, Outlier, Rival, ViewResult
+from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.result import Calibration, Candidate, Outlier, Rival, ViewResult
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
 from rigkit.cameras.plausible import fault_of_lens

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.calibration.result import BoardShape, ViewResult
+from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.result import ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3

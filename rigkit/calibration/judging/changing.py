@@ -182,8 +182,7 @@ def _solved_for(
     for rounds in range(LENS_ROUNDS):
         if rounds:
             solved = replace(
-                calibration,
-                camera=start.camera,
+                calibration.with_near(start.camera),
                 views=view_results(observations, start, residuals, fit.kept),
                 boards=board_shapes(observations, start.shape, start.unknowns),
             )

@@ -18,6 +18,7 @@ moving entrance pupil (the E terms of CAHVORE).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,7 @@ NOT_FOLLOWED = 1e-10
 """Of what is common to all images, a direction with less than this part of the largest square is not followed."""
 DISTANCES = (0.05, 0.95)
 """Quantiles of the corners' distances that are told."""
+NOT_ONE_POINT = "the lens does not look from one point"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -155,22 +157,49 @@ def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
 def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> list[Finding]:
     """Return a finding where the lens does not look from one point, and that matters; `correlation`: that of the
     residuals of neighbouring corners."""
-    pupil = MovingPupil.of(calibration) if correlation > MIN_NEIGHBOUR_CORRELATION else None
+    asked = calibration.pupil is None and correlation > MIN_NEIGHBOUR_CORRELATION
+    pupil = MovingPupil.of(calibration) if asked else None
     if pupil is None or pupil.chance > BY_CHANCE:
         return []
     off = pupil.far_px(far)
     if off <= max(far.usual_px, SMALL_PX):
         return []
-    points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
-    distance = np.linalg.norm(points, axis=1)
-    near, away = np.quantile(distance, DISTANCES).tolist()
-    rim = float(np.arccos(np.clip(points[:, 2] / distance, -1.0, 1.0)).max())
+    near, away, rim = _shown(calibration)
     moved = abs(pupil.mm_per_rad2) * rim**2
     return [
         Finding.look(
-            f"the lens does not look from one point: its entrance pupil moves by at least {moved:.1f} mm from the "
+            f"{NOT_ONE_POINT}: its entrance pupil moves by at least {moved:.1f} mm from the "
             f"middle to the outermost corners, which boards {near:.0f} to {away:.0f} mm away show; what is far away is "
             f"off by at least {off:.2f} px",
             "take boards about as far away as what is to be measured (a larger board fills as much of the image)",
         )
     ]
+
+
+def modelled_pupil(calibration: Calibration) -> list[Finding]:
+    """Say of a lens whose pupil is part of its calibration by how much that moves."""
+    if calibration.pupil is None:
+        return []
+    near, away, rim = _shown(calibration)
+    mm, sigma = calibration.pupil.shift_mm(rim)
+    return [
+        Finding.good(
+            f"{NOT_ONE_POINT}, and is calibrated so: its entrance pupil moves by {mm:.2f} +- "
+            f"{calibration.widening * sigma:.2f} mm from the middle to the outermost corners ({np.degrees(rim):.0f} "
+            f"degrees), as boards {near:.0f} to {away:.0f} mm away show; formats of central cameras leave it out, "
+            "exact far away"
+        )
+    ]
+
+
+def tells_of_pupil(findings: Iterable[Finding]) -> bool:
+    """Say whether findings on a central camera say that its pupil moves."""
+    return any(NOT_ONE_POINT in finding.message for finding in findings)
+
+
+def _shown(calibration: Calibration) -> tuple[float, float, float]:
+    """Return from where to where boards were, mm, and the largest angle of a corner from the axis, rad."""
+    points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
+    distance = np.linalg.norm(points, axis=1)
+    near, away = np.quantile(distance, DISTANCES).tolist()
+    return near, away, float(np.arccos(np.clip(points[:, 2] / distance, -1.0, 1.0)).max())

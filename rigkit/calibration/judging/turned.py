@@ -67,8 +67,7 @@ def turned_pictures(
     for _ in range(ROUNDS):
         back = _turned_back(observations, fit, at)
         solved = replace(
-            calibration,
-            camera=back.state.camera,
+            calibration.with_near(back.state.camera),
             views=view_results(back.observations, back.state, back.residuals, fit.kept),
             boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
         )

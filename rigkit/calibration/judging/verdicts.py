@@ -22,7 +22,7 @@ from rigkit.calibration.judging.captured import (
 )
 from rigkit.calibration.judging.changing import MOTION, changing
 from rigkit.calibration.judging.mixed import two_cameras
-from rigkit.calibration.judging.pupil import moving_pupil
+from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.judging.two_kinds import APART, fewest_of_a_kind
 from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.neighbours import neighbour_correlation
@@ -134,7 +134,7 @@ def judge(
             *_boards(calibration, " if pixels are square" if upright else ""),
             *_outliers(calibration),
         ]
-    return (*with_headline(calibration, causes, effects, extent.where), *found)
+    return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
 
 
 def _residuals(

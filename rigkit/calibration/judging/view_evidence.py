@@ -174,8 +174,8 @@ def columns_of(count: int) -> dict[str, slice]:
 def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
     """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
 
-    With what is, in this order: the pose (6), what all images share (the camera's parameters and the 3 bows of the
-    boards), the other ways to change, and the residual last.
+    With what is, in this order: the pose (6), what all images share (the parameters of camera and pupil and the 3 bows
+    of the boards), the other ways to change, and the residual last.
     """
     count = np.array([np.count_nonzero(view.kept) for view in views])
     start, view = np.cumsum(count) - count, np.repeat(np.arange(len(views)), count)
@@ -187,10 +187,10 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     rotation = np.array([one.cam_from_board.rotation for one in views])[view].transpose(1, 2, 0)
     turned = (rotation * points).sum(axis=1)
     in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
-    p = calibration.camera.parameters.size
+    p = calibration.near.parameters.size
     rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
     by_point = rows[:, 3:6]
-    u, v, valid = calibration.camera.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
+    u, v, valid = calibration.near.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
     pixels = np.where(valid, [u, v], np.nan)
     lever, flat = centred(turned), centred(points[:2])
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]

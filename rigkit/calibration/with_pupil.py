@@ -1,0 +1,81 @@
+"""A camera calibrated again with its entrance pupil as two more unknowns, where the images ask for it.
+
+The central camera is calibrated first. Where its residuals say that the lens does not look from one point (`pupil` in
+`judging`), sizes of the same model and shapes of the boards are fitted anew, lens, pupil, poses and boards together,
+and chosen as before. The pupil stays where both tell of it: it lowers the error on images that took no part by as much
+as two more numbers of a lens must, and the images agree on it far beyond their scatter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rigkit.calibration.assemble import identifiable
+from rigkit.calibration.choice import SURELY, Option, choose, described
+from rigkit.calibration.judging.pupil import BY_CHANCE
+from rigkit.calibration.models_tried import How, compared
+from rigkit.calibration.one_model import Solved, with_board_shape
+from rigkit.calibration.result import Calibration, Candidate
+from rigkit.calibration.solving.fit import fit_kept, fit_other_lens
+from rigkit.calibration.solving.state import State
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
+from rigkit.core.errors import DegenerateError, InputError
+
+PUPILS = ("auto", "central", "moving")
+"""What may be asked for: a pupil where images tell of one; none; one."""
+CENTRAL, MOVING = "one point of view", "moving pupil"
+"""Names of the candidates."""
+
+
+def solved_with_pupil(found: Solved, how: How) -> Solved | None:
+    """Return what a camera comes to with a pupil that moves, its model's sizes and the boards' shape chosen again; None
+    where the images do not tell it from the rest."""
+    observations, kept = found.observations, found.chosen.fit.kept
+    poses = found.chosen.fit.state
+    options: list[Option] = []
+    for size in found.sizes:
+        lens = NearCamera.of(far_camera(size.fit.state.camera))
+        start = State.start(lens, poses.rotation, poses.translation_mm, observations)
+        try:
+            fit = fit_kept(observations, fit_other_lens(observations, start, kept).state, kept, settle=True)
+        except (InputError, DegenerateError):
+            continue
+        if identifiable(fit):
+            options.append(Option(f"{size.name}, {MOVING}", fit))
+    if not options:
+        return None
+    options = compared(observations, options, how.folds, how.progress)
+    chosen = choose(observations, options, SURELY)
+    candidates = described(options, chosen)
+    observations, chosen, shapes, tried = with_board_shape(observations, chosen, how.board, how.folds, how.progress)
+    return replace(
+        found,
+        observations=observations,
+        chosen=chosen,
+        candidates=[*candidates, *tried],
+        beyond=[],
+        sizes=options,
+        shapes=shapes,
+    )
+
+
+def against_central(central: Solved, moving: Solved, how: How) -> tuple[bool, list[Candidate]]:
+    """Return whether images that took no part are shown better with the pupil, on the same corners, and both as
+    candidates."""
+    options = [replace(central.chosen, name=CENTRAL), replace(moving.chosen, name=MOVING)]
+    if moving.observations is central.observations:
+        options = compared(central.observations, options, how.folds, how.progress)
+    chosen = choose(central.observations, options, SURELY)
+    return chosen.name == MOVING, described(options, chosen)
+
+
+def surely_moves(calibration: Calibration) -> bool:
+    """Say whether the images agree that the pupil of a calibration moves."""
+    return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
+
+
+def require_known(pupil: str, known: Sequence[str] = PUPILS) -> None:
+    """Raise InputError for an option without a meaning."""
+    if pupil not in known:
+        raise InputError(f"pupil '{pupil}' is unknown; known: {', '.join(known)}")

@@ -1,0 +1,160 @@
+"""A lens that does not look from one point, before points at a finite distance.
+
+Wide lenses see what is at the angle t from their axis from a place on it that moves with t: their entrance pupil is at
+
+    s(t) = e1 t^2 + e2 t^4        mm along the optical axis, forwards,
+
+from where it is on the axis. The ray of a pixel keeps its direction, which the central camera has; it starts at
+(0, 0, s). Far away that is nothing, and the central camera is exact. A point p is seen at the angle t for which
+
+    p - s(t) (0, 0, 1)        is at the angle t,
+
+solved by Newton's rule; a point so near that several rays meet it is not seen.
+
+Reference: D. B. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68 (2006), section 2, the E
+terms of CAHVORE.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, Rays
+from rigkit.core.errors import InputError
+
+PUPIL_TERMS = 2
+PUPIL_NAMES = ("pupil_mm_per_rad2", "pupil_mm_per_rad4")
+MAX_NEWTON_ROUNDS, ROUNDING_RAD = 12, 1e-13
+"""Newton's rule doubles its digits: points not nearer than the pupil moves need four to six rounds."""
+
+
+def pupil_shift_mm(theta_rad: FloatArray, pupil: FloatArray) -> FloatArray:
+    """Return how far (...,) the pupil (2,) has moved along the axis at angles (...,) from it."""
+    square = theta_rad * theta_rad
+    return np.asarray(square * (pupil[0] + pupil[1] * square))
+
+
+def pupil_shift_of_rays_mm(rays: Rays, pupil: FloatArray) -> FloatArray:
+    """Return how far (...,) along the axis rays (..., 3) of a lens with this pupil (2,) start."""
+    return pupil_shift_mm(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]), pupil)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NearCamera(Camera):
+    """The camera of points in mm: `project` and all derivatives take the length of a point for its distance, unlike
+    those of other cameras. `parameters` are those of its `lens`, the central camera of what is far away, and the
+    pupil's two terms. `unproject` returns the directions of rays, the lens's own."""
+
+    lens: Camera
+
+    model: ClassVar[str] = "moving pupil"
+
+    @classmethod
+    def of(cls, lens: Camera, pupil: ArrayLike = (0.0, 0.0)) -> NearCamera:
+        """Return the lens with the pupil (2,), mm rad^-2 and mm rad^-4."""
+        return cls(lens.size_px, np.append(lens.parameters, pupil), lens)
+
+    @classmethod
+    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
+        raise InputError("a radial curve says nothing of a pupil; calibrate the central camera first")
+
+    def with_parameters(self, parameters: ArrayLike) -> Self:
+        values = np.asarray(parameters, dtype=np.float64)
+        return type(self)(self.size_px, values, self.lens.with_parameters(values[:-PUPIL_TERMS]))
+
+    def parameter_names(self) -> tuple[str, ...]:
+        return (*self.lens.parameter_names(), *PUPIL_NAMES)
+
+    @property
+    def series(self) -> tuple[int, ...]:
+        return self.lens.series
+
+    @property
+    def pupil(self) -> FloatArray:
+        """The two terms of the pupil, mm rad^-2 and mm rad^-4."""
+        return self.parameters[-PUPIL_TERMS:]
+
+    @property
+    def max_angle_rad(self) -> float:
+        return self.lens.max_angle_rad
+
+    def seen(self, points: Points) -> Points:
+        """Return points (N, 3) as from the pupil that sees each: the central camera shows these where it shows those;
+        NaN where a point is too near."""
+        x, y, z = points.T
+        _, ahead, _, _, valid = self._through_pupil(x, y, z)
+        return np.where(valid[:, None], np.stack([x, y, ahead], axis=1), np.nan)
+
+    def as_from_afar(self, pixels: Pixels, points: Points) -> Pixels:
+        """Return where the pixels (N, 2) that show points (N, 3) at known places would lie if the pupil did not move;
+        NaN where a point is not seen."""
+        return np.asarray(pixels - self.project(points)[0] + self.lens.project(points)[0])
+
+    def _through_pupil(
+        self, x: FloatArray, y: FloatArray, z: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return the distance from the axis, how far before their pupil points are, at which angle, ds / dt there, and
+        which are not too near; all (N,)."""
+        e1, e2 = self.pupil.tolist()
+        across = np.hypot(x, y)
+        theta = np.arctan2(across, z)
+        for _ in range(MAX_NEWTON_ROUNDS):
+            square = theta * theta
+            ahead, slope = z - square * (e1 + e2 * square), theta * (2.0 * e1 + 4.0 * e2 * square)
+            sine, cosine = np.sin(theta), np.cos(theta)
+            step = (across * cosine - ahead * sine) / (across * sine + ahead * cosine - slope * sine)
+            theta = theta + step
+            if not np.nanmax(np.abs(step), initial=0.0) > ROUNDING_RAD:
+                break
+        square = theta * theta
+        ahead, slope = z - square * (e1 + e2 * square), theta * (2.0 * e1 + 4.0 * e2 * square)
+        sine = np.sin(theta)
+        along = across * sine + ahead * np.cos(theta)
+        # Along the ray the next one is met behind the point.
+        valid = (np.abs(step) <= 1e3 * ROUNDING_RAD) & (along > np.abs(slope * sine)) & (theta >= 0.0)
+        return across, ahead, theta, slope, valid
+
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        _, ahead, _, _, near = self._through_pupil(x, y, z)
+        u, v, valid = self.lens._project(x, y, ahead)
+        return u, v, valid & near
+
+    def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        return self.lens._unproject(u, v)
+
+    def _derivatives(
+        self,
+        x: FloatArray,
+        y: FloatArray,
+        z: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray | None,
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        across, ahead, theta, slope, near = self._through_pupil(x, y, z)
+        of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :-PUPIL_TERMS]
+        u, v, valid = self.lens._derivatives(x, y, ahead, d_pixels_d_point, of_lens)
+        # With c = (t^2, t^4), g the gradient of the angle at the point before its pupil, and R its distance:
+        # ds = s' dt + c de and dt = g dp + rho / R^2 ds give ds = (s' g dp + c de) / (1 - s' rho / R^2).
+        distance = across * across + ahead * ahead
+        grown = 1.0 / (1.0 - slope * across / distance)
+        forward = d_pixels_d_point[:, 2].copy()
+        if d_pixels_d_parameters is not None:
+            square = theta * theta
+            d_pixels_d_parameters[:, -2] = -forward * (square * grown)
+            d_pixels_d_parameters[:, -1] = -forward * (square * square * grown)
+        turn = slope * grown / distance
+        sideways = turn * ahead / np.maximum(across, np.finfo(float).tiny)
+        d_pixels_d_point[:, 0] -= forward * (sideways * x)
+        d_pixels_d_point[:, 1] -= forward * (sideways * y)
+        d_pixels_d_point[:, 2] += forward * (turn * across)
+        return u, v, valid & near
+
+
+def far_camera(camera: Camera) -> Camera:
+    """Return the central camera that is exact far away: of one with a moving pupil its lens, else the camera."""
+    return camera.lens if isinstance(camera, NearCamera) else camera
