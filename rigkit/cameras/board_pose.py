@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import Pixels, Points
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
+
+MAX_PUPIL_ROUNDS, SETTLED_PX = 30, 1e-6
+"""Each round takes off all of the error but as much as the pupil moves over the board's distance."""
 
 
 def cam_from_seen_board(camera: Camera, pixels: Pixels, points_mm: Points) -> Rigid3:
@@ -13,5 +19,25 @@ def cam_from_seen_board(camera: Camera, pixels: Pixels, points_mm: Points) -> Ri
 
     Raises as `board_pose`: DegenerateError for fewer than four, or collinear ones.
     """
+    if isinstance(camera, NearCamera):
+        pixels = board_from_afar(camera, pixels, points_mm)
     rays, valid = camera.unproject(pixels)
     return board_pose(rays[valid], points_mm[valid]).cam_from_board
+
+
+def board_from_afar(camera: NearCamera, pixels: Pixels, points_mm: Points) -> Pixels:
+    """Return where a board's corners `points_mm` (N, 3), seen at `pixels` (N, 2), would lie if the pupil did not move:
+    for whatever takes the lens for central. Corners that the lens cannot see stay where they are.
+
+    Raises as `board_pose`.
+    """
+    out = pixels
+    for _ in range(MAX_PUPIL_ROUNDS):
+        pose = cam_from_seen_board(camera.lens, out, points_mm)
+        moved = camera.as_from_afar(pixels, pose.apply(points_mm))
+        moved = np.where(np.isfinite(moved), moved, pixels)
+        change = float(np.abs(moved - out).max())
+        out = moved
+        if change <= SETTLED_PX:
+            break
+    return out

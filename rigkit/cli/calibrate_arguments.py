@@ -18,6 +18,10 @@ MODEL_NAMES = ("pinhole", "brown", "kannala_brandt", "scaramuzza", "ucm", "eucm"
 """Their names as `rigkit.cameras.registry` has them, which takes too long to load for a help text."""
 
 
+PUPILS = ("auto", "central", "moving")
+"""As `rigkit.calibration.with_pupil` has them."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
@@ -42,6 +46,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=sorted(FOREIGN_ENDINGS),
         metavar="FORMAT",
         help=f"also for other tools, beside it: {', '.join(sorted(FOREIGN_ENDINGS))}",
+    )
+    parser.add_argument(
+        "--pupil",
+        choices=PUPILS,
+        default="auto",
+        help="of one camera: whether the lens looks from one point (central), or its entrance pupil moves; default: "
+        "auto, moving where images show it",
     )
     parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
     parser.add_argument(
@@ -102,6 +113,7 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
         force=args.force,
         cache=Cache.OFF if args.no_cache else Cache.UPDATE,
         corners=args.corners,
+        pupil=args.pupil,
         exports=tuple(dict.fromkeys(args.export)),
         known=Known(tuple(args.only_extrinsics), args.add_camera),
     )

@@ -342,7 +342,7 @@ def _calibrated(views: Sequence[BoardView], size_px: tuple[int, int]) -> Calibra
         best: Calibration | None = None
         for model, degree in MODELS_TRIED:
             try:
-                found = calibrate(named, size_px, model=model, degree=degree, board=board, folds=0)
+                found = calibrate(named, size_px, model=model, degree=degree, board=board, folds=0, pupil="central")
             except (InputError, DegenerateError):
                 continue
             if best is None or found.rms_px < best.rms_px:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration, Candidate, Outlier, Rival, ViewResult
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
@@ -37,8 +38,9 @@ CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
 Made = Mapping[str, Any]
 """By what, when and from what a file was made: see `rigkit.workflows.provenance.made`."""
-LATER_KEYS = {"overdispersion", "freedom", "made", "rivals"}
-"""Former files do not have them."""
+LATER_KEYS = {"overdispersion", "freedom", "made", "rivals", "pupil"}
+"""Former files do not have them, and cameras that look from one point have no pupil."""
+TERMS_OF_PUPIL = ("mm_per_rad2", "mm_per_rad4")
 
 
 def save_calibration(path: str | Path, calibration: Calibration, *, force: bool = False) -> None:
@@ -66,6 +68,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
         "freedom": c.freedom,
         "covariance": c.covariance.tolist(),
         "frame_covariance": c.frame_covariance.tolist(),
+        **({} if c.pupil is None else {"pupil": _pupil_out(c.pupil)}),
         "boards": [
             {
                 "board_id": b.board_id,
@@ -143,6 +146,7 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
             overdispersion=positive(data.get("overdispersion", 1.0)),
             freedom=freedom(data.get("freedom")),
             rivals=tuple(_rival_in(v, path) for v in data.get("rivals", ())),
+            pupil=_pupil_in(data["pupil"]) if "pupil" in data else None,
         )
 
 
@@ -232,6 +236,21 @@ def _view_out(view: ViewResult) -> dict[str, Any]:
 
 def _rival_in(data: dict[str, Any], path: str | Path) -> Rival:
     return Rival(str(data["name"]), camera_from_json(data["camera"], path), real(data["likely"]))
+
+
+def _pupil_out(pupil: SolvedPupil) -> dict[str, Any]:
+    return {
+        **dict(zip(TERMS_OF_PUPIL, pupil.terms.tolist(), strict=True)),
+        "covariance": pupil.covariance.tolist(),
+        "with_frame": pupil.with_frame.tolist(),
+    }
+
+
+def _pupil_in(data: dict[str, Any]) -> SolvedPupil:
+    if set(data) != {*TERMS_OF_PUPIL, "covariance", "with_frame"}:
+        raise ValueError(f"'pupil' must have the keys {', '.join(TERMS_OF_PUPIL)}, covariance, with_frame")
+    terms = np.array([real(data[name]) for name in TERMS_OF_PUPIL])
+    return SolvedPupil(terms, as_covariance(data["covariance"], "pupil", len(terms)), reals(data["with_frame"]))
 
 
 def _view_in(data: dict[str, Any], sizes: Mapping[str, tuple[int, int]]) -> ViewResult:

@@ -44,6 +44,9 @@ class CalibrateOptions:
     """File of corners (ours, or another detector's) to use instead of looking for them; None: they are looked for."""
     known: Known = field(default_factory=Known)
     """Of a rig: files of lenses that stay as they are, or of a rig to which the others of the session are added."""
+    pupil: str = "auto"
+    """Of one camera: whether its entrance pupil may move, as `rigkit.calibrate` has it. Cameras of a rig look from one
+    point each."""
     exports: tuple[str, ...] = ()
     """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.inputs.formats`)."""
 
@@ -88,7 +91,7 @@ def calibrate_session(
     )
     with about(session.path):
         corners = corners_of(session, options, progress=progress)
-    calibration = calibration_from(session, corners, progress=progress)
+    calibration = calibration_from(session, corners, pupil=options.pupil, progress=progress)
     files: dict[Path, str] = {}
     if options.output is not None:
         files[options.output] = calibration_text(calibration, made(session.path, {"": session.images}))
@@ -118,7 +121,9 @@ def session_inputs(session: Session | RigSession, options: CalibrateOptions) -> 
     return out if options.corners is None else [*out, options.corners]
 
 
-def calibration_from(session: Session, corners: SessionCorners, *, progress: Progress = silent) -> Calibration:
+def calibration_from(
+    session: Session, corners: SessionCorners, *, pupil: str = "auto", progress: Progress = silent
+) -> Calibration:
     """Return the calibration of a session from its corners.
 
     Raises InputError where no image shows a board of the session, DegenerateError where the views do not determine the
@@ -128,7 +133,13 @@ def calibration_from(session: Session, corners: SessionCorners, *, progress: Pro
     with about(session.path):
         try:
             result = calibrate(
-                views, size_px, model=session.model, degree=session.degree, board=session.board_shape, progress=progress
+                views,
+                size_px,
+                model=session.model,
+                degree=session.degree,
+                board=session.board_shape,
+                pupil=pupil,
+                progress=progress,
             )
         except DegenerateError as error:
             shown = misread(session.images, session.boards)

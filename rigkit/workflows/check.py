@@ -260,7 +260,7 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [FreshView(name, c, _counted_alike(watched, c, view, name, out)) for view in views]
+            out += [FreshView(name, c, _counted_alike(watched, c, watched.from_afar(v), name, out)) for v in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out

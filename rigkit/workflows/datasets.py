@@ -29,7 +29,7 @@ from rigkit.io.calibration_file import calibration_text, load_calibration_or_cam
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
-from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
 from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
@@ -204,7 +204,10 @@ def _file_of(camera_id: str, index: int) -> str:
 
 def _load(path: Path) -> LoadedCamera:
     known = load_calibration_or_camera(path)
-    return LoadedCamera(known.camera, known) if isinstance(known, Calibration) else LoadedCamera(known, None)
+    if not isinstance(known, Calibration):
+        return LoadedCamera(known, None)
+    warn_of_pupil(path, known)
+    return LoadedCamera(known.camera, known)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

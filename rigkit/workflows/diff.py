@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,8 @@ from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.report.figures import difference_png
 from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,10 +128,17 @@ def _boards(a: Path, b: Path) -> BoardsPair:
 
 
 def _cameras(a: Path, b: Path) -> CameraPair:
-    cameras = import_camera(a), import_camera(b)
     first, second = own_calibration(a), own_calibration(b)
     if first is None or second is None:
-        return CameraPair(compare_cameras(*cameras), None)
+        return CameraPair(compare_cameras(import_camera(a), import_camera(b)), None)
+    warn_if_bad(a, first.verdicts)
+    warn_if_bad(b, second.verdicts)
+    if (first.pupil is None) != (second.pupil is None):
+        _log.warning(
+            "'%s' has an entrance pupil that moves, '%s' was calibrated without: as if from one point, a lens is right "
+            "at the boards' distance alone, and this compares what is far away",
+            *((b, a) if first.pupil is None else (a, b)),
+        )
     judged = compare_calibrations(first, second)
     return CameraPair(judged.difference, judged)
 

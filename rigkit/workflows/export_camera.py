@@ -20,7 +20,7 @@ from rigkit.io.calibration_file import save_camera
 from rigkit.io.files import ensure_writable, write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
-from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad
+from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 
 RIG_ENDINGS = {"colmap": ".json"}
@@ -163,6 +163,7 @@ def foreign_files(calibration: Calibration, beside: Path, kinds: Sequence[str]) 
     files = {}
     outline = outline_of_corners(calibration) if kinds else None
     for kind, path in zip(kinds, foreign_paths(beside, kinds), strict=True):
+        warn_of_pupil(path, calibration)
         done = _foreign(calibration.camera, kind, outline)
         files[path] = done.text
         if done.note:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,8 @@ from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.hand_eye import HandEye, hand_eye
 from rigkit.calibration.uncertainty import pose_covariance_of_lens
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import board_from_afar
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
@@ -28,7 +30,7 @@ from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.inputs.camera_files import import_camera
+from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import explained
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
@@ -101,11 +103,11 @@ def calibrate_hand_eye(
     missing = [path.name for path in paths if path.name not in robot]
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
-    board, camera = _one_way_up(board_of_words(str(options.board))), import_camera(options.camera)
+    board, camera = _one_way_up(board_of_words(str(options.board))), import_near_camera(options.camera)
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
-            view = _view_of(path, _boards_in(path, board, camera, options.camera), board)
+            view = _view_of(path, _boards_in(path, board, far_camera(camera), options.camera), board)
         except InputError as error:
             if len(paths) == 1:
                 raise
@@ -115,14 +117,14 @@ def calibrate_hand_eye(
             progress("board", done, len(paths))
         if view is not None:
             base_from_hand = robot[path.name].inverse() if options.inverse else robot[path.name]
-            views.append(view)
+            views.append(_from_afar(camera, view))
             stands.append(base_from_hand if options.board_on_hand else base_from_hand.inverse())
     if not views:
         if unreadable:
             raise InputError(f"no image of {len(paths)} shows board '{board.board_id}': {unreadable[0]}")
         raise CheckFailed(f"no image of {len(paths)} shows board '{board.board_id}'; check the board's file")
     with about(poses):
-        result = hand_eye(camera, views, stands)
+        result = hand_eye(far_camera(camera), views, stands)
     if options.output is not None:
         write_atomic(options.output, hand_eye_text(result, options), force=options.force)
     return HandEyeCalibration(result, tuple(unreadable))
@@ -133,7 +135,8 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
 
     Raises InputError for files that cannot be read, CheckFailed where the image does not show the board.
     """
-    known, lens = board_of_words(str(board)), import_camera(camera)
+    known, near = board_of_words(str(board)), import_near_camera(camera)
+    lens = far_camera(near)
     seen = _boards_in(Path(image), known, lens, camera)
     view = _view_of(Path(image), seen, known)
     if view is None:
@@ -145,6 +148,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
             )
         why = explained([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
+    view = _from_afar(near, view)
     rays, valid = lens.unproject(view.pixels)
     unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
     points = view.points()[valid]
@@ -165,6 +169,13 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
         covariance[3:, 3:] += np.outer(shift, shift)
     placed = BoardPose(pose, found[0].rms_rad, covariance)
     return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None)
+
+
+def _from_afar(camera: Camera, view: BoardView) -> BoardView:
+    """Return a view as the central camera has it, without what the pupil's motion does to it."""
+    if not isinstance(camera, NearCamera):
+        return view
+    return replace(view, pixels=board_from_afar(camera, view.pixels, view.points()))
 
 
 def _known(camera: str | Path) -> UncertainCamera | None:

@@ -30,7 +30,7 @@ from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
 from rigkit.workflows.check import load_watched
-from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.next_frames import next_frames
 from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
@@ -122,6 +122,7 @@ def plan_session(
             boards = without_parts(shape.board for shape in calibration.boards)
         if not boards:
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
+    warn_of_pupil(source, calibration)
     taken = calibration.corners.used[0]
     if options.check:
         return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)

@@ -21,7 +21,8 @@ from rigkit.calibration.solving.poses import refine_poses
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.cameras.board_pose import board_from_afar, cam_from_seen_board
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -52,6 +53,7 @@ class Watched:
     freedom : degrees of freedom of the covariance.
     boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
         that have the name, are as stated.
+    pupil : (2,) of one camera alone, how its entrance pupil moves; None: it looks from one point.
     """
 
     names: tuple[str, ...]
@@ -63,6 +65,17 @@ class Watched:
     freedom: float = float("inf")
     scale_sigma: float = 0.0
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
+    pupil: FloatArray | None = None
+
+    def from_afar(self, view: BoardView) -> BoardView:
+        """Return a view as the central camera has it: with the pupil's motion taken out, as it was calibrated; raises
+        DegenerateError where the board has no pose."""
+        if self.pupil is None:
+            return view
+        near = NearCamera.of(self.cameras[0], self.pupil)
+        found = self.boards_mm.get(view.board.board_id)
+        points = self._shape(view.board) if found is not None else view.board.points()
+        return replace(view, pixels=board_from_afar(near, view.pixels, points[view.grid @ [1, view.board.columns]]))
 
     @property
     def fresh_sigma_px(self) -> float:

@@ -26,6 +26,7 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
         overdispersion=calibration.overdispersion,
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
+        pupil=None if calibration.pupil is None else calibration.pupil.terms,
     )
 
 

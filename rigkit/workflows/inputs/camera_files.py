@@ -8,8 +8,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import pupil_shift_of_rays_mm
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
@@ -32,13 +35,28 @@ STEREO = re.compile(r'^\s*["<]?M1\b', re.MULTILINE)
 
 
 def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
-    """Return the camera of a file, of ours or of another tool's; `kind` is told by the content where it is None.
+    """Return the camera of a file, of ours or of another tool's; `kind` is told by the content where it is None. That
+    the lens of a file looks from several points is warned of: the camera is the central one.
 
     `size_px` is what py-OCamCalib's files do not say, the images' size; all others say it, and need none.
 
     Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
     """
-    source = Path(path)
+    known = _camera_or_calibration(Path(path), kind, size_px)
+    if isinstance(known, Camera):
+        return known
+    warn_of_pupil(path, known)
+    return known.camera
+
+
+def import_near_camera(path: str | Path) -> Camera:
+    """Return the camera of points in mm of a file as of `import_camera`: where its pupil moves a `NearCamera`."""
+    known = _camera_or_calibration(Path(path), None, None)
+    return known if isinstance(known, Camera) else known.near
+
+
+def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, int] | None) -> Camera | Calibration:
+    """Return what a file holds; of a calibration that is not to be trusted that is said."""
     text, name = camera_text(source), str(source)
     kind = kind or camera_format(text)
     if kind is None:
@@ -47,10 +65,9 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
         raise InputError(f"'{kind}' is no camera format; known are {', '.join(READ_FORMATS)}")
     if kind == "rigkit":
         known = load_calibration_or_camera(source)
-        if not isinstance(known, Calibration):
-            return known
-        warn_if_bad(source, known.verdicts)
-        return known.camera
+        if isinstance(known, Calibration):
+            warn_if_bad(source, known.verdicts)
+        return known
     return FOREIGN_FORMATS[kind].read(text, name, size_px)
 
 
@@ -95,6 +112,24 @@ def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> 
     bad = called_bad(path) if verdicts is None else bad_of(verdicts)
     if bad is not None:
         _log.warning("'%s': %s", path, bad.message)
+
+
+def told_of_pupil(calibration: Calibration) -> str | None:
+    """Return what is to be said where a lens is taken for one that looks from one point; None where it does."""
+    if calibration.pupil is None:
+        return None
+    rays = calibration.camera.unproject(calibration.corners.used[0])[0]
+    off = pupil_shift_of_rays_mm(rays, calibration.pupil.terms) * np.hypot(rays[:, 0], rays[:, 1])
+    return (
+        "the entrance pupil of this lens moves, which is left out here: what is far away is exact, near the camera "
+        f"rays are off by up to {float(np.nanmax(np.abs(off))):.1f} mm"
+    )
+
+
+def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
+    """Say where the lens of a file is taken for one that looks from one point, and does not."""
+    if (told := told_of_pupil(calibration)) is not None:
+        _log.warning("'%s': %s", path, told)
 
 
 def is_rig(path: str | Path) -> bool:

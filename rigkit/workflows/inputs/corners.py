@@ -219,9 +219,9 @@ def first_camera(session: Session, found: Mapping[str, FoundCorners]) -> Camera 
         views, size_px, _ = session_views(session, corners)
         # Scaramuzza's model takes any lens; what it does not follow closely, another may.
         model = "scaramuzza" if session.model == "auto" else session.model
-        first = calibrate(views, size_px, model=model, degree=session.degree, board="flat", folds=0)
+        first = calibrate(views, size_px, model=model, degree=session.degree, board="flat", folds=0, pupil="central")
         if session.model == "auto" and first.sigma_px > LOOSE * median(s for v in views for s in v.sigma_px.tolist()):
-            first = calibrate(views, size_px, model="auto", board="flat", folds=0)
+            first = calibrate(views, size_px, model="auto", board="flat", folds=0, pupil="central")
         return first.camera
     except (InputError, DegenerateError):
         return None

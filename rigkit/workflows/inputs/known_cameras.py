@@ -17,7 +17,14 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.rig_file import SavedRig, is_rig_file
 from rigkit.io.rig_session import RigSession
-from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+from rigkit.workflows.inputs.camera_files import (
+    import_camera,
+    is_rig,
+    own_calibration,
+    saved_rig,
+    warn_if_bad,
+    warn_of_pupil,
+)
 from rigkit.workflows.inputs.folder_session import Known
 
 _log = logging.getLogger(__name__)
@@ -136,5 +143,6 @@ def _lens(path: Path, name: str, names: Sequence[str]) -> tuple[Camera, FloatArr
         return rig.cameras[name][0], None if rig.covariance is None else rig.covariance[np.ix_(own, own)]
     if (calibration := own_calibration(path)) is not None:
         warn_if_bad(path, calibration.verdicts)
+        warn_of_pupil(path, calibration)
         return calibration.camera, np.asarray(calibration.covariance)
     return import_camera(path), None
