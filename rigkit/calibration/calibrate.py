@@ -15,7 +15,7 @@ from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.judging.moved import moved_lens
-from rigkit.calibration.judging.pupil import tells_of_pupil
+from rigkit.calibration.judging.pupil import may_move
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.lens_choice import (
     Choice,
@@ -80,7 +80,23 @@ def calibrate(
         The views do not determine the camera.
     """
     require_known(pupil)
-    return calibrate_together([("", views, How(size_px, model, degree, board, folds, progress, pupil))])[0]
+    return calibrate_together(
+        [
+            (
+                "",
+                views,
+                How(
+                    size_px=size_px,
+                    model=model,
+                    degree=degree,
+                    board=board,
+                    folds=folds,
+                    progress=progress,
+                    pupil=pupil,
+                ),
+            )
+        ]
+    )[0]
 
 
 def calibrate_together(
@@ -219,7 +235,7 @@ def _result(
 ) -> Calibration:
     """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
     central, how = _judged(begun, found, tried, rivals, likely), begun.how
-    if how.pupil == "central" or (how.pupil == "auto" and not tells_of_pupil(central.verdicts)):
+    if how.pupil == "central" or (how.pupil == "auto" and not may_move(central)):
         return central
     moving = solved_with_pupil(found, how)
     if moving is not None:

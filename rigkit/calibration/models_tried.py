@@ -36,7 +36,7 @@ Wanted = list[tuple[str, type[Camera], int | None]]
 """Name, camera model and size of what is to be fitted."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class How:
     """What `calibrate` was asked for."""
 

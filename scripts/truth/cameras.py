@@ -49,15 +49,21 @@ def kept_views(found: Calibration, boards: Sequence[Board]) -> list[BoardView]:
 def again(found: Calibration, size_px: Size) -> Callable[[Views], Fit]:
     """Return how rigkit fits some of the images with the model, the size and the board's shape that it chose of all."""
     model, kind = found.camera.model, found.boards[0].kind
+    pupil = "central" if found.pupil is None else "moving"
     # Of models that come in several sizes the candidates' names tell the size, such as "scaramuzza 6".
-    sizes = [c.name.split()[1:] for c in found.candidates if c.chosen and c.name.split()[0] == model]
+    sizes = [c.name.partition(",")[0].split()[1:] for c in found.candidates if c.chosen and c.name.startswith(model)]
     degree = next((int(words[0]) for words in sizes if words and words[0].isdigit()), None)
 
     def fitted(views: Views) -> Fit:
-        one = calibrate(views, size_px, model=model, degree=degree, board=kind, folds=0)
-        return Fit(one.camera, one.rms_px, one.boards[0].points_mm)
+        one = calibrate(views, size_px, model=model, degree=degree, board=kind, folds=0, pupil=pupil)
+        return Fit(one.near, one.rms_px, one.boards[0].points_mm)
 
     return fitted
+
+
+def pupil_words(found: Calibration) -> str:
+    """Return what is to be said of a lens that does not look from one point."""
+    return "" if found.pupil is None else " with a moving pupil"
 
 
 def seen(count: int, total: int) -> str:
@@ -74,7 +80,8 @@ def compared(bench: Bench, found: Calibration, fisheye: bool) -> Iterator[Row]:
         return
     total = sum(len(view.grid) for view in views)
     rms, count = held_out_rms(views, again(found, size_px))
-    about = f"{found.camera.model}, board {found.boards[0].kind}; {len(views)} images; {seen(count, total)}"
+    about = f"{found.camera.model}{pupil_words(found)}, board {found.boards[0].kind}; {len(views)} images; "
+    about += seen(count, total)
     yield bench.row(HELD_OUT, RIGKIT, rms, how=about)
     large = views[0].board.corner_count > MAX_RELEASED
     for peer, fit in peers.CAMERA_FITS.items():
@@ -187,8 +194,8 @@ def ov_plane(bench: Bench) -> Iterator[Row]:
     quantity = "rms on the published test images"
     for shape in ("flat", "auto"):
         found = calibrate(train, size_px, model=bench.model, board=shape)
-        rms, count = rms_of(Fit(found.camera, found.rms_px, found.boards[0].points_mm), test)
-        about = f"{found.camera.model}; {seen(count, total)}"
+        rms, count = rms_of(Fit(found.near, found.rms_px, found.boards[0].points_mm), test)
+        about = f"{found.camera.model}{pupil_words(found)}; {seen(count, total)}"
         yield bench.row(quantity, RIGKIT, rms, variant=f"board {found.boards[0].kind}", how=about)
     for peer, fit in peers.CAMERA_FITS.items():
         if peer.variant:

@@ -185,14 +185,14 @@ def test_where_no_board_was_a_richer_rival_counts_with_what_it_leaves_open() -> 
 
 def test_errors_name_the_camera_of_a_rig() -> None:
     views, *_ = random_views(lens("reg"), 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
-    how = How(SIZE, "nonsense", None, "flat", 0, silent)
+    how = How(size_px=SIZE, model="nonsense", degree=None, board="flat", folds=0, progress=silent)
     with pytest.raises(Exception, match=r"camera 'left': .*nonsense"):
         calibrate_together([("left", views, how)])
 
 
 def test_cameras_of_a_rig_come_in_their_order() -> None:
     rng = np.random.default_rng(2)
-    how = How(SIZE, "auto", None, "flat", 0, silent)
+    how = How(size_px=SIZE, model="auto", degree=None, board="flat", folds=0, progress=silent)
     asked = [
         (name, random_views(lens(name), 8, rng, reach_deg=REACH_DEG[name])[0], how) for name in ("reg", "wide", "reg")
     ]
@@ -231,7 +231,15 @@ def test_boards_in_doubt_widen_the_sigmas_by_what_they_make_of_the_lens(monkeypa
     rng = np.random.default_rng(0)
     views, *_ = random_views(lens("reg"), 5, rng, reach_deg=REACH_DEG["reg"], noise_px=0.4, points_mm=bowed)
     found = calibrate(views, SIZE, model="kannala_brandt")
-    (in_rig,) = calibrate_together([("left", views, How(SIZE, "kannala_brandt", None, "auto", 5, silent))])
+    (in_rig,) = calibrate_together(
+        [
+            (
+                "left",
+                views,
+                How(size_px=SIZE, model="kannala_brandt", degree=None, board="auto", folds=5, progress=silent),
+            )
+        ]
+    )
     assert not in_rig.rivals  # All cameras of a rig together ask what shape its boards have.
     monkeypatch.setattr(module, "rival_shapes", lambda *_: [])
     alone = calibrate(views, SIZE, model="kannala_brandt")

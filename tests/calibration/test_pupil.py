@@ -14,11 +14,16 @@ from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.neighbours import neighbour_correlation
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
+from rigkit.calibration.with_pupil import MOVING
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
+from rigkit.core.findings import Severity
 
 NEAR, FAR = Board("near", 9, 6, 12.0, 12.0), Board("far", 9, 6, 120.0, 120.0)
 """They fill the image at 90 to 210 mm, and at ten times that."""
@@ -36,8 +41,8 @@ def from_the_pupil(points_mm: Points, mm_per_rad2: float) -> Points:
     return seen
 
 
-def session(board: Board, mm_per_rad2: float, seed: int, shape: str = "flat") -> Calibration:
-    """Return a calibration from 20 images of a fisheye with such a pupil."""
+def views_of_session(board: Board, mm_per_rad2: float, seed: int) -> list[BoardView]:
+    """Return 20 views of a fisheye with such a pupil."""
     rng, camera = np.random.default_rng(seed), lens("fish")
     views, turns, shifts = random_views(camera, 20, rng, reach_deg=80.0, board=board, noise_px=0.0)
     noisy = []
@@ -46,7 +51,13 @@ def session(board: Board, mm_per_rad2: float, seed: int, shape: str = "flat") ->
         assert valid.all()
         pixels = np.clip(pixels + NOISE_PX * rng.normal(size=pixels.shape), -0.5, np.array(SIZE) - 0.5)
         noisy.append(replace(view, pixels=pixels, sigma_px=np.full(len(pixels), NOISE_PX)))
-    return calibrate(noisy, SIZE, model="kannala_brandt", board=shape, folds=0)
+    return noisy
+
+
+def session(board: Board, mm_per_rad2: float, seed: int, shape: str = "flat", pupil: str = "central") -> Calibration:
+    """Return a calibration from them."""
+    views = views_of_session(board, mm_per_rad2, seed)
+    return calibrate(views, SIZE, model="kannala_brandt", board=shape, folds=0, pupil=pupil)
 
 
 def pupil_of(found: Calibration) -> MovingPupil:
@@ -82,7 +93,8 @@ def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> No
 
 def test_a_lens_that_looks_from_one_point_is_not_accused() -> None:
     for seed in range(4):
-        found = session(NEAR, 0.0, seed)
+        found = session(NEAR, 0.0, seed, pupil="auto")
+        assert found.pupil is None
         assert TOLD not in str(found.verdicts)
         pupil = pupil_of(found)
         assert pupil.chance > BY_CHANCE
@@ -106,7 +118,8 @@ def test_a_pupil_that_moves_is_not_taken_for_what_changes_from_image_to_image() 
 
 
 def test_boards_far_away_do_not_show_a_pupil_that_moves() -> None:
-    found = session(FAR, MM_PER_RAD2, 0)
+    found = session(FAR, MM_PER_RAD2, 0, pupil="auto")
+    assert found.pupil is None
     assert TOLD not in str(found.verdicts)
     assert off_far_away(found) < 0.2
 
@@ -117,3 +130,71 @@ def test_a_narrow_lens_leaves_its_pupil_open() -> None:
     found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
     pupil = pupil_of(found)
     assert pupil.sigma_mm_per_rad2 > 0.1 and TOLD not in str(found.verdicts)
+
+
+@pytest.mark.parametrize("folds", [0, 5])
+def test_a_pupil_that_moves_is_solved_for(folds: int) -> None:
+    """All of it is found, what is far away is right again, and how sure both are is known."""
+    views = views_of_session(NEAR, MM_PER_RAD2, 0)
+    found = calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=folds)
+    assert found.pupil is not None
+    angle = np.radians(80.0)
+    shift, sigma = found.pupil.shift_mm(angle)
+    assert sigma < 0.05 and abs(shift - MM_PER_RAD2 * angle**2) < 3.0 * sigma
+    off = found.pupil.terms - [MM_PER_RAD2, 0.0]
+    assert (np.abs(off) < 3.0 * np.sqrt(np.diag(found.pupil.covariance))).all()
+    far = FarProjection.of(found)
+    assert off_far_away(found) < 2.0 * far.usual_px < 0.2
+    assert off_far_away(session(NEAR, MM_PER_RAD2, 0)) > 1.0
+    assert found.rms_px < 1.1 * NOISE_PX * np.sqrt(2.0)
+    (said,) = (one for one in found.verdicts if TOLD in one.message)
+    assert said.severity is Severity.GOOD and f"{found.pupil.shift_mm(_rim(found))[0]:.2f} +- " in said.message
+    assert any(one.name == MOVING and one.chosen for one in found.candidates)
+
+
+def test_residuals_are_those_of_points_in_mm() -> None:
+    found = session(NEAR, MM_PER_RAD2, 0, pupil="moving")
+    used = np.flatnonzero(found.corners.kept)
+    points = found.corners.in_cam(used)
+    shown, valid = found.near.project(points)
+    assert valid.all()
+    np.testing.assert_allclose(found.corners.pixels[used] - shown, found.corners.residuals_px[used], atol=1e-9)
+    assert np.linalg.norm(found.camera.project(points)[0] - shown, axis=1).max() > 1.0
+
+
+def test_the_pupil_is_neither_asked_for_nor_left_in_vain() -> None:
+    assert session(NEAR, MM_PER_RAD2, 0).pupil is None
+    forced = session(NEAR, 0.0, 1, pupil="moving").pupil
+    assert forced is not None and forced.chance(1e9) > BY_CHANCE
+    with pytest.raises(InputError, match="auto, central, moving"):
+        session(NEAR, 0.0, 1, pupil="perhaps")
+
+
+def test_far_sigmas_count_the_pupil_in() -> None:
+    """A lens of which the pupil is found, too, is less sure than one whose pupil is known not to move."""
+    views = views_of_session(NEAR, 0.0, 1)
+    central, moving = (
+        calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0, pupil=pupil)
+        for pupil in ("central", "moving")
+    )
+    assert FarProjection.of(moving).usual_px > 1.05 * FarProjection.of(central).usual_px
+    near = projection_uncertainty(moving, np.array([[800.0, 600.0], [1100.0, 700.0]]), range_mm=120.0)
+    assert near.valid.all() and (near.worst_px < 0.1).all()
+
+
+def test_what_a_pupil_says_of_its_shift_is_propagated() -> None:
+    found = session(NEAR, MM_PER_RAD2, 0, pupil="moving")
+    assert found.pupil is not None
+    joint = found.near_covariance
+    p = found.camera.parameters.size
+    assert joint.shape == (p + 8, p + 8)
+    frame, again = SolvedPupil.split(found.pupil.terms, joint)
+    np.testing.assert_array_equal(frame, found.frame_covariance)
+    np.testing.assert_array_equal(again.with_frame, found.pupil.with_frame)
+    np.testing.assert_array_equal(joint[p : p + 2, p : p + 2], found.pupil.covariance)
+    assert np.linalg.eigvalsh(joint / np.outer(*2 * [np.sqrt(np.diag(joint))])).min() > -1e-9
+
+
+def _rim(found: Calibration) -> float:
+    points = found.corners.in_cam(np.flatnonzero(found.corners.kept))
+    return float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())

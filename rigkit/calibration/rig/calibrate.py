@@ -187,7 +187,20 @@ class _Options:
                 continue
             model = self.model if isinstance(self.model, str) else self.model[name]
             degree = self.degree[name] if isinstance(self.degree, Mapping) else self.degree
-            asked.append((name, alone, How(self.sizes_px[name], model, degree, self.board, self.folds, silent)))
+            asked.append(
+                (
+                    name,
+                    alone,
+                    How(
+                        size_px=self.sizes_px[name],
+                        model=model,
+                        degree=degree,
+                        board=self.board,
+                        folds=self.folds,
+                        progress=silent,
+                    ),
+                )
+            )
         names = [name for name, _, _ in asked]
         found |= dict(zip(names, calibrate_together(asked, progress=progress), strict=True))
         seen = [frame_observations(own, found[name]) for name, own in views.items()]
