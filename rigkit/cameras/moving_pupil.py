@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigkit.cameras.base import Camera, RadialCurve
-from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, Rays
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays
 from rigkit.core.errors import InputError
 
 PUPIL_TERMS = 2
@@ -82,6 +82,18 @@ class NearCamera(Camera):
     @property
     def max_angle_rad(self) -> float:
         return self.lens.max_angle_rad
+
+    # Rays have directions alone: what is asked of them is the lens's.
+    def ray_jacobian(self, pixels: Pixels) -> RayJacobians:
+        return self.lens.ray_jacobian(pixels)
+
+    @property
+    def axis_px(self) -> Pixels:
+        return self.lens.axis_px
+
+    @property
+    def focal_px(self) -> float:
+        return self.lens.focal_px
 
     def seen(self, points: Points) -> Points:
         """Return points (N, 3) as from the pupil that sees each: the central camera shows these where it shows those;

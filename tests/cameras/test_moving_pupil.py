@@ -62,6 +62,9 @@ def test_far_away_it_is_the_lens(rng: np.random.Generator) -> None:
     near = NearCamera.of(lens, PUPIL)
     points = 1e9 * points_before(near, rng)
     np.testing.assert_allclose(near.project(points)[0], lens.project(points)[0], atol=1e-5)
+    pixels = np.array([[100.0, 50.0], [648.0, 467.0], [1200.0, 900.0]])
+    np.testing.assert_array_equal(near.ray_jacobian(pixels), lens.ray_jacobian(pixels))
+    assert near.focal_px == lens.focal_px and (near.axis_px == lens.axis_px).all()
     assert far_camera(near) is lens and far_camera(lens) is lens
 
 
