@@ -1,0 +1,137 @@
+"""A calibration with a pupil that moves: its file, and what uses the pupil or says that it does not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import SIZE, lens, random_views
+from helpers.schemas import faults
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.cameras.moving_pupil import NearCamera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
+from rigkit.io.calibration_file import calibration_text, load_calibration, load_camera, save_calibration
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.sentinel.evidence import FreshView
+from rigkit.validation.sentinel.judge import check_views
+from rigkit.workflows.certify import certify_file
+from rigkit.workflows.check import load_watched
+from rigkit.workflows.diff import CameraPair, diff
+from rigkit.workflows.export_camera import ExportCameraOptions, export_camera
+from rigkit.workflows.handeye import _from_afar
+from rigkit.workflows.inputs.camera_files import import_camera, import_near_camera
+
+NEAR = Board("near", 9, 6, 12.0, 12.0)
+TRUE = NearCamera.of(lens("fish"), (2.0, 0.3))
+LEFT_OUT = "entrance pupil of this lens moves"
+
+
+def views_of(seed: int, count: int = 14) -> list[BoardView]:
+    rng = np.random.default_rng(seed)
+    return random_views(TRUE, count, rng, reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
+
+
+@pytest.fixture(scope="module")
+def moving() -> Calibration:
+    return calibrate(views_of(0), SIZE, model="kannala_brandt", board="flat", folds=0)
+
+
+@pytest.fixture(scope="module")
+def saved(moving: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pupil") / "calibration.json"
+    save_calibration(path, moving)
+    return path
+
+
+def test_the_file_holds_the_pupil(moving: Calibration, saved: Path) -> None:
+    assert moving.pupil is not None
+    back = load_calibration(saved)
+    assert back.pupil is not None
+    for name in ("terms", "covariance", "with_frame"):
+        np.testing.assert_array_equal(getattr(back.pupil, name), getattr(moving.pupil, name))
+    assert (load_camera(saved).parameters == moving.camera.parameters).all()
+    assert not faults(json.loads(saved.read_text(encoding="utf-8")))
+    assert back.verdicts == moving.verdicts
+
+
+def test_without_a_pupil_the_file_says_nothing_of_one(tmp_path: Path) -> None:
+    central = calibrate(views_of(0), SIZE, model="kannala_brandt", board="flat", folds=0, pupil="central")
+    assert '"pupil"' not in calibration_text(central)
+    path = tmp_path / "central.json"
+    save_calibration(path, central)
+    assert load_calibration(path).pupil is None
+
+
+def _without_rows(data: dict[str, Any]) -> None:
+    data["pupil"]["with_frame"] = data["pupil"]["with_frame"][:-1]
+
+
+def _other_key(data: dict[str, Any]) -> None:
+    data["pupil"]["mm"] = 1.0
+
+
+def _negative(data: dict[str, Any]) -> None:
+    data["pupil"]["covariance"] = [[-1.0, 0.0], [0.0, 1.0]]
+
+
+def _text(data: dict[str, Any]) -> None:
+    data["pupil"]["mm_per_rad2"] = "2"
+
+
+@pytest.mark.parametrize("spoil", [_without_rows, _other_key, _negative, _text])
+def test_a_damaged_pupil_is_named(spoil: Callable[[dict[str, Any]], None], saved: Path, tmp_path: Path) -> None:
+    data = json.loads(saved.read_text(encoding="utf-8"))
+    spoil(data)
+    path = tmp_path / "spoilt.json"
+    path.write_text(json.dumps(data), encoding="utf-8")
+    with pytest.raises(InputError, match=r"spoilt\.json.*damaged.*calibrate again"):
+        load_calibration(path)
+
+
+def test_whoever_takes_the_lens_for_central_says_so(
+    saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert import_camera(saved).model == "kannala_brandt"
+    assert LEFT_OUT in caplog.text and "rays are off by up to" in caplog.text
+    caplog.clear()
+    assert isinstance(import_near_camera(saved), NearCamera) and LEFT_OUT not in caplog.text
+    export_camera(saved, ExportCameraOptions(output=tmp_path / "camera.yaml", kind="opencv"))
+    assert LEFT_OUT in caplog.text
+    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=200.0)
+    said = certify_file(saved, task).certificate.findings
+    assert any(LEFT_OUT in finding.message for finding in said)
+
+
+def test_diff_compares_what_is_far_away(saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    other, central = tmp_path / "other.json", tmp_path / "central.json"
+    save_calibration(other, calibrate(views_of(1), SIZE, model="kannala_brandt", board="flat", folds=0))
+    same = diff(saved, other)
+    assert isinstance(same, CameraPair) and same.judged is not None and same.judged.same and LEFT_OUT not in caplog.text
+    views = views_of(1)
+    save_calibration(central, calibrate(views, SIZE, model="kannala_brandt", board="flat", folds=0, pupil="central"))
+    diff(saved, central)
+    assert "'" + str(central) + "' was calibrated without" in caplog.text
+
+
+def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
+    watched, _ = load_watched(saved)
+    fresh = views_of(2, 6)
+    seen = [FreshView(f"{k}", 0, watched.from_afar(view)) for k, view in enumerate(fresh)]
+    assert check_views(watched, seen).rms_px < 0.06
+    raw = [FreshView(f"{k}", 0, view) for k, view in enumerate(fresh)]
+    assert check_views(watched, raw).rms_px > 0.2
+
+
+def test_a_pose_takes_the_pupil_out(saved: Path) -> None:
+    view, near = views_of(3, 1)[0], import_near_camera(saved)
+    afar = _from_afar(near, view)
+    assert np.abs(afar.pixels - view.pixels).max() > 1.0
+    assert _from_afar(import_camera(saved), view) is view
