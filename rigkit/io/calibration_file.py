@@ -68,7 +68,7 @@ def calibration_text(calibration: Calibration, made: Made | None = None) -> str:
         "freedom": c.freedom,
         "covariance": c.covariance.tolist(),
         "frame_covariance": c.frame_covariance.tolist(),
-        **({} if c.pupil is None else {"pupil": _pupil_out(c.pupil)}),
+        **({} if c.pupil is None else {"pupil": pupil_to_json(c.pupil)}),
         "boards": [
             {
                 "board_id": b.board_id,
@@ -146,7 +146,7 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
             overdispersion=positive(data.get("overdispersion", 1.0)),
             freedom=freedom(data.get("freedom")),
             rivals=tuple(_rival_in(v, path) for v in data.get("rivals", ())),
-            pupil=_pupil_in(data["pupil"]) if "pupil" in data else None,
+            pupil=pupil_from_json(data["pupil"]) if "pupil" in data else None,
         )
 
 
@@ -238,7 +238,8 @@ def _rival_in(data: dict[str, Any], path: str | Path) -> Rival:
     return Rival(str(data["name"]), camera_from_json(data["camera"], path), real(data["likely"]))
 
 
-def _pupil_out(pupil: SolvedPupil) -> dict[str, Any]:
+def pupil_to_json(pupil: SolvedPupil) -> dict[str, Any]:
+    """Return a pupil as it stands in files."""
     return {
         **dict(zip(TERMS_OF_PUPIL, pupil.terms.tolist(), strict=True)),
         "covariance": pupil.covariance.tolist(),
@@ -246,7 +247,8 @@ def _pupil_out(pupil: SolvedPupil) -> dict[str, Any]:
     }
 
 
-def _pupil_in(data: dict[str, Any]) -> SolvedPupil:
+def pupil_from_json(data: dict[str, Any]) -> SolvedPupil:
+    """Return the pupil that `pupil_to_json` wrote; raises KeyError, TypeError, ValueError or InputError for another."""
     if set(data) != {*TERMS_OF_PUPIL, "covariance", "with_frame"}:
         raise ValueError(f"'pupil' must have the keys {', '.join(TERMS_OF_PUPIL)}, covariance, with_frame")
     terms = np.array([real(data[name]) for name in TERMS_OF_PUPIL])

@@ -13,6 +13,7 @@ import numpy as np
 
 from rigkit.calibration.clustered import with_block
 from rigkit.calibration.displaced import lens_of
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
@@ -22,7 +23,13 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.calibration_file import camera_to_json, findings_to_json, load_calibration
+from rigkit.io.calibration_file import (
+    camera_to_json,
+    findings_to_json,
+    load_calibration,
+    pupil_from_json,
+    pupil_to_json,
+)
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
 from rigkit.io.images import read_image_of
@@ -359,7 +366,12 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
     else:
         data["camera"] = camera_to_json(lens_of(fixed.cameras[0]))
         frame = np.array(data["frame_covariance"], dtype=np.float64)
-        data["frame_covariance"] = with_block(frame, covariance, 1.0).tolist()
+        if "pupil" in data:
+            pupil = pupil_from_json(data["pupil"])
+            frame, pupil = SolvedPupil.split(pupil.terms, with_block(pupil.joint(frame), covariance, 1.0))
+            data |= {"frame_covariance": frame.tolist(), "pupil": pupil_to_json(pupil)}
+        else:
+            data["frame_covariance"] = with_block(frame, covariance, 1.0).tolist()
     data["covariance"] = covariance.tolist()
     data["verdicts"] = [*findings_to_json([said]), *data.get("verdicts", [])]
     return json_text(data)

@@ -23,7 +23,7 @@ from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
 from rigkit.workflows.certify import certify_file
-from rigkit.workflows.check import load_watched
+from rigkit.workflows.check import fixed_text, load_watched
 from rigkit.workflows.diff import CameraPair, diff
 from rigkit.workflows.export_camera import ExportCameraOptions, export_camera
 from rigkit.workflows.handeye import _from_afar
@@ -128,6 +128,27 @@ def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
     assert check_views(watched, seen).rms_px < 0.06
     raw = [FreshView(f"{k}", 0, view) for k, view in enumerate(fresh)]
     assert check_views(watched, raw).rms_px > 0.2
+
+
+def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path: Path) -> None:
+    """Surer of the lens, it is surer of the pupil, and of both together."""
+    watched, _ = load_watched(saved)
+    zoomed = watched.cameras[0].parameters.copy()
+    zoomed[:2] *= 1.01
+    changed = NearCamera.of(watched.cameras[0].with_parameters(zoomed), watched.pupil)
+    views = random_views(changed, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
+    check = check_views(watched, [FreshView(f"{k}", 0, watched.from_afar(v)) for k, v in enumerate(views)])
+    assert not check.holds and check.change is not None
+    path = tmp_path / "fixed.json"
+    path.write_text(fixed_text(saved, check), encoding="utf-8")
+    before, after = load_calibration(saved), load_calibration(path)
+    assert before.pupil is not None and after.pupil is not None
+    assert abs(after.camera.focal_px / before.camera.focal_px - 1.01) < 3e-3
+    joint = after.near_covariance
+    scale = np.sqrt(np.diag(joint))
+    assert np.linalg.eigvalsh(joint / np.outer(scale, scale)).min() > -1e-9
+    p = after.camera.parameters.size
+    np.testing.assert_array_equal(joint[:p, :p], after.covariance)
 
 
 def test_a_pose_takes_the_pupil_out(saved: Path) -> None:
