@@ -8,6 +8,8 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.io.board_file import load_board
+from rigkit.io.board_words import board_of_words
+from rigkit.workflows.inputs.identify_board import IdentifiedBoard
 
 READ = ["--ruler-x-mm", "249", "--ruler-y-mm", "169.49"]
 """Of rulers of 250 and 170 mm."""
@@ -35,6 +37,17 @@ def test_another_print_of_a_measured_board_is_the_same_sheet(board: Path) -> Non
     assert main(["board", str(board), "-o", str(board.with_name("again"))]) == 0
     before, again = (board.with_name(name).read_text(encoding="utf-8") for name in ("b.svg", "again.svg"))
     assert before == again
+
+
+def test_a_board_of_either_pattern_is_said_to_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.png").touch()
+    board = board_of_words("charuco:9x6x30,dictionary=DICT_5X5_250,marker_mm=22")
+    seen = IdentifiedBoard(board=board, seen=("a",), looked_at=("a",), words="charuco", either_pattern=True)
+    monkeypatch.setattr("rigkit.workflows.inputs.identify_board.identify_board", lambda *_, **__: seen)
+    assert main(["board", "identify", str(tmp_path)]) == 0
+    assert "set legacy_pattern by its version" in capsys.readouterr().err
 
 
 def test_a_board_keeps_its_name(board: Path) -> None:

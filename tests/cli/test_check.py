@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -33,8 +34,9 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.judge import SentinelCheck
 from rigkit.validation.sentinel.power import Power
-from rigkit.workflows.check import CheckOptions, _frames, check_pictures
+from rigkit.workflows.check import CheckOptions, _frames, _require_right_order, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -128,6 +130,23 @@ def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) 
         check_pictures(rig, [pictures[k] for k in (1, 0, 3, 2)], options)
     # Of different moments: that no order puts right.
     assert check_pictures(rig, [pictures[k] for k in (0, 3)], options).check.unexplained
+
+
+def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> SentinelCheck:
+        raise DegenerateError("no camera sees enough")
+
+    def found(*, holds: bool, unexplained: bool) -> SentinelCheck:
+        names = SimpleNamespace(names=("left", "right"))
+        return cast(SentinelCheck, SimpleNamespace(watched=names, holds=holds, unexplained=unexplained))
+
+    odd, moved, holding = (found(holds=h, unexplained=u) for h, u in ((False, True), (False, False), (True, False)))
+    for given, other, wrong in ((odd, odd, False), (moved, moved, False), (odd, moved, True), (moved, holding, True)):
+        monkeypatch.setattr("rigkit.workflows.check.check_views", lambda *_, other=other: other)
+        with pytest.raises(InputError, match="'left' and 'right' are exchanged") if wrong else nullcontext():
+            _require_right_order(given, [])
+    monkeypatch.setattr("rigkit.workflows.check.check_views", refused)
+    _require_right_order(odd, [])
 
 
 @pytest.mark.parametrize(("flip", "words"), [(-1, "turned by half a turn"), (0, "mirrored top to bottom")])

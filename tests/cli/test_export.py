@@ -54,8 +54,8 @@ def test_a_camera_goes_out_and_comes_back(kind: str, tmp_path: Path, capsys: pyt
 
 def test_what_is_lost_beside_a_calibration_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
-        files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["opencv", "kalibr"])
-    assert [path.name for path in files] == ["fish-opencv.yaml", "fish-kalibr.yaml"]
+        files = foreign_files(load_calibration(CALIBRATION), tmp_path / "fish.json", ["kalibr"])
+    assert [path.name for path in files] == ["fish-kalibr.yaml"]
     assert "fish-kalibr.yaml: " in caplog.text
 
 

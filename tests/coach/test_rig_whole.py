@@ -164,6 +164,8 @@ def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig:
         assert all(own.reached for own in now.left[:-1]) and now.left[-1].reached is enough
         assert now.enough is enough or f"not {0.5 * in_mm.error:g} mm" in now.words
 
+
+def test_a_length_that_is_nowhere_in_view_is_said(frames: list[list[Glance]], rig: RigCalibration) -> None:
     def nowhere(*_: object) -> Any:
         raise DegenerateError("nowhere is it in view")
 

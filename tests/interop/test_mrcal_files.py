@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from helpers.cameras import sample_cameras
 
+from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras
+from rigkit.cameras.convert import fit_camera
+from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.interop.mrcal import _spline_project, read_cameramodel, write_cameramodel
@@ -40,13 +45,38 @@ def test_mrcal_spline_of_a_fisheye(label: str, limit_px: float) -> None:
     assert compare_cameras(camera, again, fit_rotation=False).max_px < BETWEEN_SAMPLES * error_px + limit_px
 
 
+WAVY = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=8_Ny=6_fov_x_deg=150"
+WAVY_INTRINSICS = np.concatenate([[300.0, 310.0, 640.0, 480.0], 0.05 * np.sin(np.arange(96))])
+
+
+def test_a_spline_that_no_model_follows_comes_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All models are tried, though one cannot be fitted; the error of the best is that against the spline itself."""
+
+    def fitted(model: type[Camera], *given: Any, **more: Any) -> Camera:
+        if model.model == "double_sphere":
+            raise InputError("it cannot be fitted")
+        return fit_camera(model, *given, **more)
+
+    monkeypatch.setattr("rigkit.interop.mrcal.fit_camera", fitted)
+    monkeypatch.setattr("rigkit.interop.mrcal.SPLINE_GRID", (41, 31))
+    values = ", ".join(map(repr, WAVY_INTRINSICS.tolist()))
+    camera, pose, error_px = read_cameramodel(
+        f"{{'lensmodel': '{WAVY}', 'intrinsics': [{values}], 'extrinsics': [0, 0, 0, 0, 0, 0], "
+        "'imagersize': [1280, 960]}"
+    )
+    assert pose.allclose(Rigid3.identity()) and error_px > 1.0
+    rays = np.dstack(np.meshgrid(np.linspace(-1.0, 1.0, 60), np.linspace(-0.8, 0.8, 50), [1.0])).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    pixels, _ = _spline_project(rays, WAVY, WAVY_INTRINSICS)
+    off = np.linalg.norm(camera.project(rays)[0] - pixels, axis=-1)
+    assert 0.5 * error_px < off.max() < BETWEEN_SAMPLES * error_px
+
+
 def test_mrcal_spline_is_mrcals() -> None:
     """Pixels as mrcal 2.2 itself projects these rays (mrcal.project), the third near the edge of the knots."""
-    lens = "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3_Nx=8_Ny=6_fov_x_deg=150"
-    intrinsics = np.concatenate([[300.0, 310.0, 640.0, 480.0], 0.05 * np.sin(np.arange(96))])
     rays = np.array([[0.0, 0.0, 1.0], [0.5, -0.2, 1.0], [-1.5, 0.6, 1.0]])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    pixels, inside = _spline_project(rays, lens, intrinsics)
+    pixels, inside = _spline_project(rays, WAVY, WAVY_INTRINSICS)
     theirs = [
         [639.8924447898148, 480.6909602676],
         [781.5908149961523, 420.9743781906921],

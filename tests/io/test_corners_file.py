@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +13,8 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.io.corner_cache import CornerCache, FoundCorners
 from rigkit.io.corners_file import COLUMNS, read_corners, write_corners
+from rigkit.io.session import Session, load_session
+from rigkit.workflows.inputs.corners import given_corners
 
 WRITTEN_PX = 1e-5
 """Five decimals."""
@@ -24,6 +27,25 @@ def detections() -> dict[str, tuple[BoardDetection, ...]]:
     named = BoardDetection("a", 4, 3, grid, pixels, np.full(12, 0.0123))
     partial = BoardDetection(None, 5, 4, grid[:7], pixels[:7] + 200.0, np.full(7, 0.02))
     return {"one, with comma.png": (named, partial), "two.png": (partial,)}
+
+
+def session_of(folder: Path, images: str) -> Session:
+    """Return a session of a blank picture called 'Bild [4].png'."""
+    cv2.imwrite(str(folder / "Bild [4].png"), np.zeros((8, 8), dtype=np.uint8))
+    (folder / "board.toml").write_text('schema = "rigkit.board/1"\ncolumns = 4\nrows = 3\nsquare_mm = 30.0\n')
+    (folder / "session.toml").write_text(
+        f'schema = "rigkit.session/1"\nimages = "{images}"\nboard = "board.toml"\nmodel = "brown"\n'
+    )
+    return load_session(folder / "session.toml")
+
+
+@pytest.mark.parametrize("images", ["*.png", "Bild [4].png"])
+def test_corners_of_other_images_than_the_session_s_are_refused(tmp_path: Path, images: str) -> None:
+    session = session_of(tmp_path, images)
+    assert [path.name for path in session.images] == ["Bild [4].png"]
+    write_corners(tmp_path / "corners.csv", detections())
+    with pytest.raises(InputError, match=r"names none of the 1 images.*here 'one, with comma.png'"):
+        given_corners(session, tmp_path / "corners.csv")
 
 
 def test_round_trip(tmp_path: Path) -> None:
