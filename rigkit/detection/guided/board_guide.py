@@ -96,14 +96,7 @@ class BoardState:
 
     def with_fit(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
         """Return the state with the `good` of the corners fitted at `cells` put in."""
-        return self._filled([old.copy() for old in self._values()], cells, fit, good)
-
-    def fitted_anew(self, cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
-        """Return the state with nothing but the `good` of the corners fitted at `cells`."""
-        return self._filled([np.full(old.shape, np.nan) for old in self._values()], cells, fit, good)
-
-    def _filled(self, values: list[FloatArray], cells: BoolArray, fit: EdgeFit, good: BoolArray) -> BoardState:
-        mine = good.nonzero()[0]
+        values, mine = self._copied(), good.nonzero()[0]
         where = cells.reshape(-1).nonzero()[0][mine]
         for value, name in zip(values, FITTED, strict=True):
             new = getattr(fit, name)
@@ -112,13 +105,14 @@ class BoardState:
 
     def without(self, drop: BoolArray) -> BoardState:
         """Return the state with the corners `drop` (R, C) forgotten."""
-        values = [old.copy() for old in self._values()]
+        values = self._copied()
         for value in values:
             value[drop] = np.nan
         return BoardState(*values, signs=self.signs, together=self.together)
 
-    def _values(self) -> list[FloatArray]:
-        return [getattr(self, name) for name in FITTED]
+    def _copied(self) -> list[FloatArray]:
+        """Return copies of what fits say of corners."""
+        return [getattr(self, name).copy() for name in FITTED]
 
 
 @dataclass(frozen=True, eq=False, slots=True)

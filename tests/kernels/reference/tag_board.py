@@ -190,7 +190,8 @@ class _Fitter:
         fit = self.fit(cells, surface, start, blur, LAST_PASS)
         self._fitted = fit, surface.sides, smooth.scatter()
         self._vain[:] = self._waiting[:] = False
-        return state.fitted_anew(cells, fit, fit.valid & (fit.contrast > 0.0))
+        nothing = state.without(np.ones(cells.shape, dtype=bool))
+        return nothing.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0))
 
     def again(self, state: BoardState) -> BoardState:
         """Return the state with those corners fitted again whose lines bend otherwise than when they were fitted, if
