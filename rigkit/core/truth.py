@@ -111,7 +111,7 @@ class MeasuredDistance:
 
 @dataclass(frozen=True, slots=True)
 class PairTruth:
-    """Everything that a person measured of one pair, each once by one means; empty where nobody did."""
+    """What a person measured of one pair, each thing once by one means; empty where nothing was measured."""
 
     baseline: MeasuredLength | None = None
     angles: tuple[MeasuredAngle, ...] = ()

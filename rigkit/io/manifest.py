@@ -174,8 +174,13 @@ class Pair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dataset:
-    """A manifest as read; every path is absolute; `sources` are the files of boards and truth that it names; `images`
-    says "real" or "rendered", None where the manifest does not."""
+    """A manifest as it was read, with absolute paths.
+
+    Attributes
+    ----------
+    sources : the files of boards and of truth that the manifest names.
+    images : "real" or "rendered"; None where the manifest does not say.
+    """
 
     name: str
     root: Path

@@ -55,8 +55,13 @@ VERDICTS = {"good": "pass", "look": "look", "bad": "fail"}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationSection:
-    """One calibrated camera on the page: thumbnails are JPEG by image name; images without one are shown without.
-    `plan` are the pictures that would help most next; None shows none."""
+    """One calibrated camera on the page.
+
+    Attributes
+    ----------
+    thumbnails : JPEG, by name of the image; not every image needs one.
+    plan : the pictures that would help most next; None: the page shows none.
+    """
 
     name: str
     calibration: Calibration
@@ -74,8 +79,10 @@ def build_calibration_page(
     rig: RigCalibration | None = None,
     checks: Sequence[Check] = (),
 ) -> str:
-    """Return the page as text; everything it needs is inside it. `rig` is what the cameras share, `checks` what a
-    person measured of it."""
+    """Return the page as HTML that needs no other file.
+
+    `rig` is what the cameras share; `checks` compare it with what a person measured.
+    """
     return render(
         "calibration.html",
         title=title,

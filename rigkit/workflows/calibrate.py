@@ -53,7 +53,7 @@ class CalibrateOptions:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SessionCalibration:
-    """What a session came to.
+    """The calibration of a session.
 
     Attributes
     ----------

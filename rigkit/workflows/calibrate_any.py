@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FolderOptions:
-    """What folders of images do not tell of themselves."""
+    """What is needed besides the folders of images."""
 
     boards: tuple[str, ...] = ()
     """COLUMNSxROWSxMM (inner corners along and across, mm a square), or files of boards."""
@@ -75,8 +75,9 @@ def calibrate_sources(
 def calibrate_session_file(
     path: str | Path, options: CalibrateOptions, *, progress: Progress = silent
 ) -> SessionCalibration | RigSessionCalibration:
-    """Calibrate what a session's file lists, one camera or a rig; `options.output` None: beside the session; a report
-    of no name, Path(""): beside the output.
+    """Calibrate the camera or the rig of a session's file.
+
+    Without `options.output` the result lies beside the session. The report Path("") lies beside the result.
 
     Raises as `calibrate_session` and `calibrate_rig_session` do.
     """
@@ -110,11 +111,11 @@ def calibrate_folders(
     *,
     progress: Progress = silent,
 ) -> SessionCalibration | RigSessionCalibration:
-    """Calibrate the camera, or cameras, whose images lie in folders, and write the session that says so, for the next
-    time: beside `options.output`, or in the one folder that holds all of them.
+    """Calibrate the camera, or the rig, whose images lie in folders.
 
-    A session that is there is kept where it says the same, refused where it says something else, and replaced with
-    `options.force`. Where nothing comes out, all is as before, but for the corners kept for the next try
+    Also writes a session's file for the next time: beside `options.output`, or in the one folder that holds all images.
+    A session's file that is there is kept where it says the same; another one is refused, or replaced with
+    `options.force`. Where the calibration fails, no file changes but that of the corners, kept for the next try
     (`options.cache`).
 
     Raises InputError: no board told, no images, a file that cannot be written, and as `calibrate_session_file`;

@@ -36,7 +36,7 @@ from rigkit.workflows.session_page import rig_page
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigSessionCalibration:
-    """What a rig's session came to.
+    """The calibration of a rig's session.
 
     Attributes
     ----------

@@ -25,7 +25,7 @@ from rigkit.workflows.provenance import digest_line, software_facts
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CertifyOptions:
-    """What a certificate is held against, and where it goes."""
+    """The limit that a certificate is compared with, and where to write it."""
 
     limit: float | None = None
     """Largest error allowed, in the unit of the task."""
@@ -53,7 +53,7 @@ class CertifiedFile:
 
 
 def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = None) -> CertifiedFile:
-    """Certify what a calibration, or a rig, measures `task` to, and write what `options` ask for.
+    """Certify how well a calibration or a rig measures `task`, and write what `options` ask for.
 
     Raises InputError: no calibration, one without a covariance, a camera that the rig does not have, or a file that
     cannot be written; DegenerateError: nowhere do all cameras see what is measured.

@@ -56,8 +56,14 @@ class DetectOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DetectionResult:
-    """What was found, by image, in the order given; by image why others could not be looked at; and what is seen, but
-    not trusted, in those that show no board, or twice, of boards alike."""
+    """The boards found in images.
+
+    Attributes
+    ----------
+    found : by image, in the order given.
+    failures : by image, why it could not be read.
+    doubtful : by image, what is seen but not trusted where no board is found, or that boards alike are seen twice.
+    """
 
     found: Mapping[str, tuple[BoardDetection, ...]]
     failures: Mapping[str, InputError]

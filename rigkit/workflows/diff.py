@@ -35,8 +35,14 @@ class DiffOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraPair:
-    """The difference of two cameras, and what their covariances say of it; None where a file has none (another tool's
-    camera)."""
+    """The difference of two cameras.
+
+    Attributes
+    ----------
+    difference : over the image of the first.
+    judged : the difference compared with what both covariances predict; None where a file has no covariance, as those
+        of other tools.
+    """
 
     difference: CameraDifference
     judged: CalibrationComparison | None
@@ -51,8 +57,13 @@ class CameraPair:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigPair:
-    """The differences of two rigs' mounts, and by name those of their lenses: judged where the calibrations lie beside
-    both rigs."""
+    """The difference of two rigs.
+
+    Attributes
+    ----------
+    mounts : the difference of where the cameras are.
+    cameras : by name, the difference of each lens; it is judged where the calibrations lie beside both rigs.
+    """
 
     mounts: RigDifference
     cameras: Mapping[str, CameraPair]

@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportCameraOptions:
-    """Which format goes where."""
+    """The format of an exported camera, and where to write it."""
 
     output: Path
     """File to write."""

@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportCloudOptions:
-    """Which cloud goes where."""
+    """Which cloud to export, in which format, and where to write it."""
 
     output: Path
     """File to write; a folder for a COLMAP model."""

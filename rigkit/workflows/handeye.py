@@ -42,7 +42,7 @@ PLANAR_AMBIGUITY = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HandEyeOptions:
-    """What the images and the robot's poses do not tell."""
+    """What is needed besides the images and the robot's poses."""
 
     camera: Path
     """The camera's calibration, ours or another tool's."""
@@ -70,11 +70,16 @@ class HandEyeCalibration:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
-    """Where a camera is against a board, from which image, the RMS in px, and whether the board tilted the other way
-    fits too.
+    """The pose of a camera against a board.
 
-    The pose's covariance counts the corners, the size of the board's squares where its file says how well that is
-    known, and, as `lens_known` says, the lens.
+    Attributes
+    ----------
+    pose : with its covariance, which counts the noise of the corners, the size of the squares where the board's file
+        says how well that is known, and, as `lens_known` says, the lens.
+    image : the image that shows the board.
+    rms_px : of the corners.
+    ambiguous : whether the board fits as well when it is tilted the other way.
+    lens_known : whether the calibration has a covariance.
     """
 
     pose: BoardPose

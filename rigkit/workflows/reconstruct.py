@@ -43,7 +43,7 @@ class PairReconstruction:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DatasetReconstruction:
-    """What the pairs of a data set came to.
+    """The reconstructed pairs of a data set.
 
     Attributes
     ----------

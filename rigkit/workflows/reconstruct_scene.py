@@ -66,7 +66,7 @@ class CloudOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneOptions(CloudOptions):
-    """What is there of a scene, and how to reconstruct it."""
+    """The images or correspondences of a scene, its cameras, and how to reconstruct it."""
 
     camera: Path | None = None
     """Calibration of the camera (of the first image); None: `rig` has it."""
@@ -104,7 +104,7 @@ class SceneOptions(CloudOptions):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SceneResult:
-    """What a scene came to.
+    """The reconstruction of a scene.
 
     Attributes
     ----------

@@ -55,7 +55,7 @@ EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RectifyOptions:
-    """The view, and where it goes; a stereo pair's view is decided by its baseline, but for the projection."""
+    """The view, and where to write it. A stereo pair's baseline decides its view, all but the projection."""
 
     output: Path
     """Image to write (of a pair, NAME-1 and NAME-2 beside it), or, without an ending, the folder to write into: images
@@ -80,7 +80,7 @@ class RectifyOptions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RectifiedImage:
-    """What was written, through which map, and the share of it (0 to 1) that the camera sees."""
+    """An image that was written, its map, and the share of it (0 to 1) that the camera sees."""
 
     path: Path
     map: RectifyMap
@@ -91,7 +91,13 @@ class RectifiedImage:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RectificationResult:
-    """What was written, by image why others were not, and of stereo pairs the geometry."""
+    """The images that were written.
+
+    Attributes
+    ----------
+    failures : by image, why it could not be rectified.
+    pair : the geometry of a stereo pair.
+    """
 
     images: tuple[RectifiedImage, ...]
     failures: Mapping[str, InputError]
@@ -148,12 +154,19 @@ def rectify_stereo_images(
     *,
     progress: Progress = silent,
 ) -> RectificationResult:
-    """Write two images taken at once by cameras `names` of a rig's file (None: its first two) so that a point has the
-    same row in both; or two folders of such images, or one folder of both cameras' (left01, right01, or folders left
-    and right), of which those of one name or number belong together, as for `calibrate_folders`; or two videos, of
-    which the frames of one number do. Where both are called as the cameras are, that says which is whose.
+    """Write images taken at once by two cameras of a rig so that a point has the same row in both.
 
-    Two images of which one cannot be read or has no partner are left out, as by `rectify_image`. Raises InputError for
+    Parameters
+    ----------
+    images : two images; two folders; one folder of both cameras' images (left01, right01, or folders left and right);
+        or two videos. Images of one name or number, and frames of one number, belong together, as for
+        `calibrate_folders`. Where both are called as the cameras are, the names decide which image is whose; else the
+        order does.
+    rig : file of the rig, ours or another tool's.
+    options : the view, without angles or a size.
+    names : the two cameras; None: the rig's first two.
+
+    Pairs of which an image cannot be read or is missing are left out, as by `rectify_image`. Raises InputError for
     cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be written.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):

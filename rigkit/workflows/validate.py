@@ -55,7 +55,7 @@ class ValidateOptions(DatasetOptions):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class DatasetValidation:
-    """What a data set came to.
+    """The validation of a data set.
 
     Attributes
     ----------

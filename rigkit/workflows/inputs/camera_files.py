@@ -35,10 +35,10 @@ STEREO = re.compile(r'^\s*["<]?M1\b', re.MULTILINE)
 
 
 def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[int, int] | None = None) -> Camera:
-    """Return the camera of a file, of ours or of another tool's; `kind` is told by the content where it is None. That
-    the lens of a file looks from several points is warned of: the camera is the central one.
+    """Return the camera of a file, ours or another tool's: the central one, with a warning where its pupil moves.
 
-    `size_px` is what py-OCamCalib's files do not say, the images' size; all others say it, and need none.
+    `kind` is the format; None: the content tells it. `size_px`, the size of the images, is needed for files of
+    py-OCamCalib alone; all others state it.
 
     Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
     """

@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class Cache(StrEnum):
-    """What becomes of the corners kept beside a session; they change the time that a result takes, never the result."""
+    """What to do with the corners kept beside a session. They save time and never change a result."""
 
     OFF = "off"
     """They are neither used nor written."""
