@@ -17,11 +17,12 @@ from rigkit.core.errors import InputError
 from rigkit.interop.colmap_cameras import read_colmap_cameras, write_colmap_cameras
 from rigkit.interop.exchange import Written
 from rigkit.interop.kalibr import read_kalibr, write_kalibr
+from rigkit.interop.matlab import MAT_SIGN, read_matlab
 from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
 from rigkit.interop.ocamcalib import read_ocamcalib, read_py_ocamcalib, write_ocamcalib
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.opencv_storage import STORAGE
-from rigkit.interop.ros import read_camera_info, write_camera_info
+from rigkit.interop.ros import OST, read_camera_info, write_camera_info
 
 SizePx = tuple[int, int]
 
@@ -47,7 +48,7 @@ class CameraFormat(NamedTuple):
 def _read_mrcal(text: str, name: str, size_px: SizePx | None) -> Camera:
     camera, _, worst = read_cameramodel(text, name)
     if worst > 0.0:
-        _log.info(f"the spline was refitted as '{camera.model}', at most {worst:.4g} px away")
+        _log.info(f"{name}: the lens was refitted as '{camera.model}', at most {worst:.2g} px away")
     return camera
 
 
@@ -83,13 +84,14 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
         lambda text, name, _: _only(read_kalibr(text, name)[0], name),
         lambda c, outline: write_kalibr([c], outlines=[outline]).cameras[0],
     ),
+    "matlab": CameraFormat(MAT_SIGN, read_matlab),
     "opencv": CameraFormat(
         STORAGE,
         lambda text, name, _: read_opencv(text, name),
         write_opencv,
     ),
     "ros": CameraFormat(
-        re.compile(r"^distortion_model\s*:", re.MULTILINE),
+        re.compile(rf"^distortion_model\s*:|{OST.pattern}", re.MULTILINE),
         lambda text, name, _: read_camera_info(text, name),
         lambda c, outline: write_camera_info(c, outline=outline),
     ),

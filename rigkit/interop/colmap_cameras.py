@@ -1,10 +1,12 @@
 """COLMAP's cameras.txt and cameras.bin, without COLMAP.
 
-Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that.
+Pixel (0.5, 0.5) is the centre of its first pixel: cx and cy move by that. Models that are not here are read as the
+camera of ours that follows best; how far it is off goes to the log.
 """
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,10 +17,15 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.interop.colmap import HALF_PIXEL
-from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, camera_of, image_size
+from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, camera_of, image_size, numbers
+from rigkit.interop.foreign_lenses import fisheye_prism_lens, fov_lens, thin_prism_fisheye_lens
+from rigkit.interop.nearest import Lens, nearest_camera_of
+
+_log = logging.getLogger(__name__)
 
 COLMAP_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("eucm"))
 MAX_COLMAP_DIGITS = 9
+CORE = ("fx", "fy", "cx", "cy")
 BEHIND = "COLMAP projects no point at or beyond 90 degrees"
 
 # COLMAP's model -> our model, and where its parameters go in ours; f1 stands for one focal length used twice.
@@ -36,6 +43,17 @@ LAYOUTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "OPENCV_FISHEYE": ("kannala_brandt", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
     "EUCM": ("eucm", ("fx", "fy", "cx", "cy", "alpha", "beta")),
 }
+
+FURTHER = {
+    "SIMPLE_DIVISION": ("f", "cx", "cy", "k"),
+    "DIVISION": ("fx", "fy", "cx", "cy", "k"),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        "fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5", "p0", "p1", "s0", "s1", "s2", "s3",
+    ),
+}  # fmt: skip
+"""Parameters of COLMAP's models that no model of ours is by the same parameters."""
 
 COUNT, HEAD = struct.Struct("<Q"), struct.Struct("<iiQQ")
 MODEL_IDS = (
@@ -85,11 +103,11 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        where = f"'{name}', line {number}"
-        if len(words) < 5 or words[1] not in LAYOUTS:
+        where, at = f"'{name}', line {number}", f"{name}, line {number}"
+        if len(words) < 5 or words[1] not in (*LAYOUTS, *FURTHER):
             model = words[1] if len(words) > 1 else ""
-            raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join(LAYOUTS)}")
-        model, keys = LAYOUTS[words[1]]
+            raise InputError(f"{where}: camera model '{model}' is unknown; known: {', '.join((*LAYOUTS, *FURTHER))}")
+        keys = LAYOUTS[words[1]][1] if words[1] in LAYOUTS else FURTHER[words[1]]
         try:
             camera_id, *size, values = (*(_whole(words[i]) for i in (0, 2, 3)), [float(w) for w in words[4:]])
         except ValueError as error:
@@ -98,8 +116,8 @@ def read_colmap_cameras(text: str, name: str = "cameras.txt") -> dict[int, Camer
             raise InputError(f"{where}: camera {camera_id} is there twice; leave one")
         if len(values) != len(keys):
             raise InputError(f"{where}: {words[1]} has {len(keys)} parameters, found {len(values)}; correct the line")
-        parameters = _parameters(model, dict(zip(keys, values, strict=True)))
-        cameras[camera_id] = camera_of(model, image_size(size, where.strip("'"), "size"), parameters, where.strip("'"))
+        size_px = image_size(size, at, "size")
+        cameras[camera_id] = _camera(words[1], size_px, dict(zip(keys, values, strict=True)), at)
     if not cameras:
         raise InputError(f"'{name}': no camera in it; is it COLMAP's cameras.txt?")
     return cameras
@@ -136,6 +154,35 @@ def _whole(word: str) -> int:
     return int(word)
 
 
+def _camera(kind: str, size_px: tuple[int, int], theirs: dict[str, float], name: str) -> Camera:
+    """Return the camera of one of COLMAP's models: ours, or the nearest, how far it is off goes to the log."""
+    if "f" in theirs:
+        theirs = {"fx": theirs["f"], "fy": theirs["f"], **theirs}
+    theirs = {**theirs, "cx": theirs["cx"] - HALF_PIXEL, "cy": theirs["cy"] - HALF_PIXEL}
+    if kind in LAYOUTS:
+        model = LAYOUTS[kind][0]
+        return camera_of(model, size_px, _parameters(model, theirs), name)
+    fx, fy, cx, cy, *rest = (theirs[key] for key in (*CORE, *(k for k in FURTHER[kind] if k not in (*CORE, "f"))))
+    core, terms = numbers([fx, fy, cx, cy], name, "params"), numbers(rest, name, "params")
+    if not (core[:2] > 0.0).all():
+        raise InputError(f"'{name}': focal lengths are positive; correct the line")
+    if kind.endswith("DIVISION"):
+        # x / (1 + k r^2) is the ray (x, y, 1 + k r^2): Scaramuzza's polynomial, in pixels along y.
+        return camera_of("scaramuzza", size_px, np.array([fy, terms[0] / fy, 0.0, cx, cy, fx / fy, 0.0]), name)
+    lens: Lens
+    if kind == "FOV":
+        if not 0.0 < terms[0] < np.pi:
+            raise InputError(f"'{name}': omega = {terms[0]:g} of the FOV model lies between 0 and pi; correct the line")
+        lens = fov_lens(core, float(terms[0]))
+    elif kind == "THIN_PRISM_FISHEYE":
+        lens = thin_prism_fisheye_lens(core, terms)
+    else:
+        lens = fisheye_prism_lens(core, terms[:6], terms[6:])
+    camera, worst = nearest_camera_of(lens, size_px, name, np.pi)
+    _log.info(f"{name}: {kind} was refitted as '{camera.model}', at most {worst:.2g} px away")
+    return camera
+
+
 def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
     names = {
         "pinhole": ("fx", "fy", "cx", "cy"),
@@ -147,9 +194,6 @@ def _parameters(model: str, theirs: dict[str, float]) -> FloatArray:
         names = (*names, "k3", "k4", "k5", "k6")
     elif model == "brown" and "k3" in theirs:
         names = (*names, "k3")
-    if "f" in theirs:
-        theirs = {"fx": theirs["f"], "fy": theirs["f"], **theirs}
-    theirs = {**theirs, "cx": theirs["cx"] - HALF_PIXEL, "cy": theirs["cy"] - HALF_PIXEL}
     return np.array([theirs.get(key, 0.0) for key in names])
 
 

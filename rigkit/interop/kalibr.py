@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -26,9 +27,13 @@ from rigkit.interop.exchange import (
     unified_from_xi,
     unified_with_xi,
 )
+from rigkit.interop.foreign_lenses import fov_lens, unified_brown_lens
+from rigkit.interop.nearest import Lens, nearest_camera_of
 from rigkit.interop.yaml_text import flow, parse_yaml
 
 KALIBR_ACCEPTS = (*PERSPECTIVE[:2], *(Accepted(model) for model in ("kannala_brandt", "ucm", "eucm", "double_sphere")))
+_log = logging.getLogger(__name__)
+
 CAMERA = re.compile(r"cam[0-9]{1,3}")
 
 
@@ -82,8 +87,8 @@ def write_kalibr(
 def read_kalibr(text: str, name: str = "camchain") -> tuple[tuple[Camera, ...], tuple[Rigid3, ...]]:
     """Return the cameras of a camchain and cam_from_rig of each; the rig's frame is that of cam0.
 
-    A camera without T_cn_cnm1 behind cam0 is an error. Raises InputError for models that are not here ("fov",
-    "omni" with distortion) and for damaged files.
+    A camera without T_cn_cnm1 behind cam0 is an error. A pinhole with "fov" and "omni" with "radtan" are refitted: the
+    log says so. Raises InputError for other models that are not here and for damaged files.
     """
     data = parse_yaml(text, name)
     keys = sorted((k for k in data if CAMERA.fullmatch(k)), key=lambda k: int(k[3:]))
@@ -137,10 +142,15 @@ def _camera(block: Any, name: str) -> Camera:
         return camera_of("kannala_brandt", size, np.concatenate([intrinsics, distortion]), name)
     if model == "pinhole" and distortion_model == "radtan" and distortion.any():
         return camera_of("brown", size, np.concatenate([intrinsics, distortion]), name)
+    lens = _foreign_lens(model, distortion_model, intrinsics, distortion)
+    if lens is not None:
+        camera, worst = nearest_camera_of(lens, size, name, np.pi)
+        _log.info(f"{name}: {model}-{distortion_model} was refitted as '{camera.model}', at most {worst:.2g} px away")
+        return camera
     if distortion.any():
         raise InputError(
-            f"'{name}': {model} with distortion_model '{distortion_model}' is not supported; calibrate with radtan or "
-            "equidistant on a pinhole, or without distortion"
+            f"'{name}': {model} with distortion_model '{distortion_model}' is not supported; calibrate with radtan, "
+            "equidistant or fov on a pinhole, radtan on omni, or without distortion"
         )
     if model == "pinhole":
         return camera_of("pinhole", size, intrinsics, name)
@@ -148,3 +158,12 @@ def _camera(block: Any, name: str) -> Camera:
         return unified_from_xi(size, float(intrinsics[0]), intrinsics[1:], name)
     ours = {"eucm": "eucm", "ds": "double_sphere"}[model]
     return camera_of(ours, size, np.concatenate([intrinsics[2:], intrinsics[:2]]), name)
+
+
+def _foreign_lens(model: str, distortion_model: str, intrinsics: FloatArray, distortion: FloatArray) -> Lens | None:
+    """Return the lens of a model that is not here; None for others, and for values that no lens has."""
+    if model == "pinhole" and distortion_model == "fov" and distortion.size == 1 and 0.0 < distortion[0] < np.pi:
+        return fov_lens(intrinsics, float(distortion[0]))
+    if model == "omni" and distortion_model == "radtan" and distortion.size == 4 and distortion.any():
+        return unified_brown_lens(intrinsics[1:], float(intrinsics[0]), distortion) if intrinsics[0] >= 0.0 else None
+    return None

@@ -1,8 +1,8 @@
-"""mrcal's .cameramodel: pinhole, OpenCV models of 4, 5 and 8 terms, and its splined stereographic model.
+"""mrcal's .cameramodel: pinhole, OpenCV models of 4, 5, 8 and 12 terms, stereographic, CAHVOR, and its splines.
 
 Pixels as ours; lengths in metres; the pose is rt_cam_ref, a rotation vector and a translation. The splined model is a
 table of control points of a bicubic B-spline: it is written for fisheye lenses, of which mrcal has no other model that
-fits, and reproduces any smooth lens.
+fits, and reproduces any smooth lens. Splines, CAHVOR and thin prisms are read as the camera of ours that follows best.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.convert import fit_camera
-from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Rays
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.interop.exchange import MM_PER_M, PERSPECTIVE, Written, best_accepted, camera_of, field, image_size, numbers
+from rigkit.interop.foreign_lenses import brown_prism_lens, cahvor_lens
+from rigkit.interop.nearest import nearest_camera_of
 
 SPLINED = re.compile(
     r"^LENSMODEL_SPLINED_STEREOGRAPHIC_(?:spline_)?order=(?P<order>\d)_Nx=(?P<nx>\d{1,4})_Ny=(?P<ny>\d{1,4})_fov_x_deg=(?P<fov>\d{1,3})$"
@@ -37,15 +37,10 @@ SPLINE_GRID = (161, 121)
 """Pixels at which the spline is fitted and read."""
 CHECK_GRID = (233, 187)
 """Pixels at which its error is measured: others."""
-SPLINE_DEGREE = 10
-"""Of the polynomial camera in whose form a spline is read: the highest, there is no noise to follow."""
-SPLINE_MODELS = ("scaramuzza", "kannala_brandt", "double_sphere", "eucm", "ucm", "brown")
-"""Tried in this order for a spline; the last ones have few terms, and are what some other program's lens was."""
-EXACT_PX = 0.01
-"""A spline is off by as much from the lens that it was made of: no other model needs to be tried."""
-MIN_SEEN = 0.99
 CLOSE_ENOUGH_PX = 0.1
 """A parametric model that is off by less is preferred to the spline: other programs can read it."""
+INTRINSICS = {"PINHOLE": 4, "STEREOGRAPHIC": 4, "OPENCV4": 8, "OPENCV5": 9, "OPENCV8": 12, "OPENCV12": 16, "CAHVOR": 9}
+"""Lens models that are read, besides splines, and how many numbers each has."""
 
 
 def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, outline: Pixels | None = None) -> Written:
@@ -70,10 +65,10 @@ def write_cameramodel(camera: Camera, cam_from_ref: Rigid3 | None = None, *, out
 
 
 def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigid3, float]:
-    """Return the camera, cam_from_ref and the largest error, px: 0 unless a spline was refitted, as the model that
+    """Return the camera, cam_from_ref and the largest error, px: 0 unless the lens was refitted, as the model that
     follows it best: a lens that was written as a spline comes back as what it was.
 
-    Raises InputError for damaged files and for lens models that are not here (CAHVOR, panoramas).
+    Raises InputError for damaged files and for lens models that are not here (CAHVORE, panoramas).
     """
     try:
         data = ast.literal_eval(text[text.index("{") :])
@@ -87,20 +82,33 @@ def read_cameramodel(text: str, name: str = "cameramodel") -> tuple[Camera, Rigi
     pose_key = "rt_cam_ref" if "rt_cam_ref" in data else "extrinsics"
     rt = numbers(field(data, pose_key, name), name, pose_key, 6)
     pose = Rigid3(exp_so3(rt[:3]), rt[3:] * MM_PER_M)
-    counts = {"PINHOLE": 4, "OPENCV4": 8, "OPENCV5": 9, "OPENCV8": 12}
-    kind = lens.removeprefix("LENSMODEL_")
-    if kind in counts:
-        if intrinsics.size != counts[kind]:
-            raise InputError(
-                f"'{name}': {lens} has {counts[kind]} intrinsics, found {intrinsics.size}; is the file whole?"
-            )
-        if kind == "PINHOLE":
-            return camera_of("pinhole", size, intrinsics, name), pose, 0.0
-        return camera_of("brown", size, intrinsics, name), pose, 0.0
-    if SPLINED.match(lens) is None:
-        raise InputError(f"'{name}': lens model '{lens}' is not supported; known: {', '.join(counts)}, splined (cubic)")
-    camera, error_px = _from_spline(lens, intrinsics, size, name)
+    camera, error_px = _lens(lens, intrinsics, size, name)
     return camera, pose, error_px
+
+
+def _lens(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], name: str) -> tuple[Camera, float]:
+    """Return the camera of a lens model and its intrinsics, and its largest error, px: 0 for a model that is here."""
+    kind = lens.removeprefix("LENSMODEL_")
+    if SPLINED.match(lens) is not None:
+        return _from_spline(lens, intrinsics, size_px, name)
+    if kind not in INTRINSICS:
+        raise InputError(
+            f"'{name}': lens model '{lens}' is not supported; known: {', '.join(INTRINSICS)}, splined (cubic); bring "
+            "it into one of them with mrcal-convert-lensmodel"
+        )
+    if intrinsics.size != INTRINSICS[kind]:
+        raise InputError(
+            f"'{name}': {lens} has {INTRINSICS[kind]} intrinsics, found {intrinsics.size}; is the file whole?"
+        )
+    if kind == "STEREOGRAPHIC":
+        # 2 f tan(theta / 2) is the unified model with alpha one half.
+        return camera_of("ucm", size_px, np.append(intrinsics, 0.5), name), 0.0
+    core, terms = intrinsics[:4], intrinsics[4:]
+    if kind == "CAHVOR":
+        return nearest_camera_of(cahvor_lens(core, terms[:2], terms[2:]), size_px, name, np.pi / 2.0)
+    if kind == "OPENCV12" and terms[8:].any():
+        return nearest_camera_of(brown_prism_lens(core, terms), size_px, name, np.pi / 2.0)
+    return camera_of("brown" if terms.size else "pinhole", size_px, intrinsics[:12], name), 0.0
 
 
 def _text(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], pose: Rigid3, outline: Pixels | None) -> str:
@@ -213,40 +221,7 @@ def _from_spline(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], na
     assert match is not None
     if intrinsics.size != 4 + 2 * int(match["nx"]) * int(match["ny"]):
         raise InputError(f"'{name}': {lens} needs {int(match['nx'])} x {int(match['ny'])} knots; is the file whole?")
-    rays, pixels = _spline_samples(lens, intrinsics, size_px, SPLINE_GRID[0])
-    if len(rays) < SPLINE_GRID[0]:
-        raise InputError(f"'{name}': the spline shows next to nothing on the image; is the file whole?")
-    centre = _spline_project(np.array([[0.0, 0.0, 1.0]]), lens, intrinsics)[0][0]
-    checked = _spline_samples(lens, intrinsics, size_px, 3 * SPLINE_GRID[0])
-    best: tuple[Camera, float] | None = None
-    for kind in SPLINE_MODELS:
-        try:
-            order = SPLINE_DEGREE if kind == "scaramuzza" else None
-            camera = fit_camera(camera_model(kind), size_px, rays, pixels, centre, order=order)
-        except (InputError, np.linalg.LinAlgError):
-            continue
-        projected, seen = camera.project(checked[0])
-        error = np.linalg.norm((projected - checked[1])[seen], axis=-1)
-        # What the camera cannot see it does not follow.
-        worst = float(error.max()) if seen.mean() > MIN_SEEN else np.inf
-        if best is None or worst < best[1]:
-            best = camera, worst
-        if worst < EXACT_PX:
-            break
-    if best is None or not np.isfinite(best[1]):
-        raise InputError(f"'{name}': no model here follows this spline; export it from mrcal as a parametric model")
-    return best
-
-
-def _spline_samples(lens: str, intrinsics: FloatArray, size_px: tuple[int, int], count: int) -> tuple[Rays, Pixels]:
-    """Return rays on a square grid of `count` a side in u, and their pixels, where they fall on the image."""
-    match = SPLINED.match(lens)
-    assert match is not None
-    reach = 2.0 * np.tan(np.radians(int(match["fov"])) / 4.0)
-    u, v = np.meshgrid(np.linspace(-reach, reach, count), np.linspace(-reach, reach, count))
-    plane = np.stack([u, v], axis=-1).reshape(-1, 2)
-    rho2 = 0.25 * np.sum(plane**2, axis=-1, keepdims=True)
-    rays = np.concatenate([plane, 1.0 - rho2], axis=-1) / (1.0 + rho2)
-    pixels, inside = _spline_project(rays, lens, intrinsics)
-    inside &= ((pixels >= -0.5) & (pixels <= np.array(size_px) - 0.5)).all(axis=-1)
-    return rays[inside], pixels[inside]
+    reach_rad = np.radians(min(2.0 * int(match["fov"]), MAX_FOV_DEG)) / 2.0
+    return nearest_camera_of(
+        lambda rays: _spline_project(rays, lens, intrinsics), size_px, name, float(reach_rad), worst_px=np.inf
+    )

@@ -105,6 +105,14 @@ def read_py_ocamcalib(text: str, size_px: tuple[int, int], name: str = "calibrat
     return camera, turn @ np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
+def camera_of_taylor(
+    size_px: tuple[int, int], polynomial: FloatArray, centre: FloatArray, stretch: FloatArray, name: str
+) -> Scaramuzza:
+    """Return the camera of a polynomial (a0, 0, a2, ...) that looks forward, with `stretch` (2, 2) of (right, down), as
+    py-OCamCalib and MATLAB's toolbox have it, turned about its axis into ours; raises InputError for no lens."""
+    return _from_ocam(size_px, polynomial, centre, stretch, name)[0]
+
+
 def _from_ocam(
     size_px: tuple[int, int], polynomial: FloatArray, centre: FloatArray, affine: FloatArray, name: str
 ) -> tuple[Scaramuzza, Mat3]:

@@ -1,4 +1,4 @@
-"""ROS camera_info YAML, as camera_calibration_parsers reads it: plumb_bob, rational_polynomial, equidistant.
+"""ROS camera_info YAML, as camera_calibration_parsers reads it: plumb_bob, rational_polynomial, equidistant; ost.txt.
 
 Pixels as ours, lengths in metres. For a camera alone the rectification matrix is the identity and the projection
 matrix the camera matrix.
@@ -16,7 +16,16 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
-from rigkit.interop.exchange import PERSPECTIVE, Accepted, Written, best_accepted, field, numbers, written_size
+from rigkit.interop.exchange import (
+    PERSPECTIVE,
+    Accepted,
+    Written,
+    best_accepted,
+    field,
+    image_size,
+    numbers,
+    written_size,
+)
 from rigkit.interop.opencv import camera_from_arrays
 from rigkit.interop.yaml_text import flow, parse_yaml
 
@@ -26,6 +35,8 @@ last column is in pixels times metres."""
 
 COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 """How many numbers each distortion model has."""
+OST = re.compile(r"^\[image\]\s*$", re.MULTILINE)
+"""What tells the ost.txt that camera_calibration puts beside the YAML file."""
 ROS_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"))
 
 
@@ -65,10 +76,13 @@ def write_camera_info(
 
 
 def read_camera_info(text: str, name: str = "camera_info") -> Camera:
-    """Return the camera of a camera_info file, or of a message as `ros2 topic echo` and `rostopic echo` print it.
+    """Return the camera of a camera_info file, of a message as `ros2 topic echo` and `rostopic echo` print it, or of
+    camera_calibration's ost.txt.
 
     Raises InputError for other distortion models and damaged files.
     """
+    if OST.search(text):
+        return _read_ost(text, name)
     data = _as_stored(parse_yaml(_first_message(text), name), name)
     size = written_size(data, name)
     K = numbers(field(field(data, "camera_matrix", name), "data", name), name, "camera_matrix", 9)
@@ -81,6 +95,39 @@ def read_camera_info(text: str, name: str = "camera_info") -> Camera:
         raise InputError(f"'{name}': {model} has {count} coefficients, found {distortion.size}; is the file whole?")
     distortion = np.concatenate([distortion[:count], np.zeros(max(count - distortion.size, 0))])
     return camera_from_arrays(size, K, distortion, fisheye=model == "equidistant", name=name)
+
+
+def _read_ost(text: str, name: str) -> Camera:
+    """Return the camera of an ost.txt: sections in brackets, under each key its numbers. No model is named there, only
+    the number of its terms differs."""
+    section, key = "", ""
+    values: dict[str, dict[str, list[str]]] = {}
+    for line in text.splitlines():
+        words = line.split("#")[0].split()
+        if words and words[0].startswith("["):
+            section, key = " ".join(words).strip("[]"), ""
+        elif words and words[0][0].isalpha():
+            key = " ".join(words)
+        elif words:
+            values.setdefault(section, {}).setdefault(key, []).extend(words)
+    image = values.pop("image", {})
+    if len(values) != 1:
+        raise InputError(f"'{name}' holds {len(values)} cameras; leave [image] and the one that you want in it")
+
+    def read(of: dict[str, list[str]], key: str, count: int | None = None) -> FloatArray:
+        try:
+            return numbers([float(word) for word in field(of, key, name)], name, key, count)
+        except ValueError as error:
+            raise InputError(f"'{name}': '{key}' is not a list of numbers; is the file whole?") from error
+
+    (camera,) = values.values()
+    size = image_size([read(image, key, 1)[0] for key in ("width", "height")], name, "width, height")
+    d = read(camera, "distortion")
+    if d.size not in COEFFICIENTS.values():
+        known = ", ".join(f"{count} ({model})" for model, count in COEFFICIENTS.items())
+        raise InputError(f"'{name}': {d.size} terms of distortion; known are {known}; is the file whole?")
+    fisheye = d.size == COEFFICIENTS["equidistant"]
+    return camera_from_arrays(size, read(camera, "camera matrix", 9), d, fisheye=fisheye, name=name)
 
 
 def _first_message(text: str) -> str:

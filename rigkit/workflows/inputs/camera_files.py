@@ -19,6 +19,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.colmap_cameras import colmap_cameras_text
 from rigkit.interop.kalibr import read_kalibr
+from rigkit.interop.matlab import is_matlab_pair, matlab_text, read_matlab_pair
 from rigkit.interop.opencv_stereo import read_opencv_stereo
 from rigkit.io.calibration_file import load_calibration_or_camera
 from rigkit.io.reading import read_bytes, read_text
@@ -38,7 +39,7 @@ def import_camera(path: str | Path, kind: str | None = None, *, size_px: tuple[i
     """Return the camera of a file, ours or another tool's: the central one, with a warning where its pupil moves.
 
     `kind` is the format; None: the content tells it. `size_px`, the size of the images, is needed for files of
-    py-OCamCalib alone; all others state it.
+    py-OCamCalib and some of MATLAB; all others state it.
 
     Raises InputError for a file that is no camera of that format, holds several, or whose format nobody can tell.
     """
@@ -72,9 +73,10 @@ def _camera_or_calibration(source: Path, kind: str | None, size_px: tuple[int, i
 
 
 def camera_text(path: str | Path) -> str:
-    """Return the text of a camera file, of COLMAP's binary one that of the same cameras; raises as `read_text`."""
+    """Return the text of a camera file, of binary ones (COLMAP's, MATLAB's) that of the same cameras; raises as
+    `read_text`."""
     data = read_bytes(path, "camera file")
-    return colmap_cameras_text(data) or read_text(path, "camera file")
+    return colmap_cameras_text(data) or matlab_text(data, str(path)) or read_text(path, "camera file")
 
 
 def camera_format(text: str) -> str | None:
@@ -137,10 +139,12 @@ def is_rig(path: str | Path) -> bool:
     if is_rig_file(path):
         return True
     try:
-        text = read_text(path, "rig file")
+        text = camera_text(path)
     except InputError:
         return False
     kind = camera_format(text)
+    if kind == "matlab":
+        return is_matlab_pair(text)
     return (kind == "kalibr" and "T_cn_cnm1" in text) or (kind == "opencv" and STEREO.search(text) is not None)
 
 
@@ -150,24 +154,27 @@ def saved_rig(path: str | Path) -> SavedRig:
 
 
 def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
-    """Return camera and cam_from_rig (mm) by name: of our rig's file, Kalibr's camchain, or OpenCV's file of a pair.
+    """Return camera and cam_from_rig (mm) by name: of our rig's file, Kalibr's camchain, OpenCV's or MATLAB's pair.
 
-    Kalibr's cameras are called cam0, cam1 ..., OpenCV's left and right. Raises InputError for any other file, and a
-    damaged one.
+    Kalibr's cameras are called cam0, cam1 ..., those of a pair left and right. Raises InputError for any other file,
+    and a damaged one.
     """
     if is_rig_file(path):
         return load_rig(path)
-    text, name = read_text(path, "rig file"), str(path)
+    text, name = camera_text(path), str(path)
     kind = camera_format(text)
     if kind == "kalibr":
         cameras, poses = read_kalibr(text, name)
         return {f"cam{k}": one for k, one in enumerate(zip(cameras, poses, strict=True))}
-    if kind == "opencv" and STEREO.search(text):
-        (left, right), right_from_left = read_opencv_stereo(text, name)
+    if (kind == "opencv" and STEREO.search(text)) or (kind == "matlab" and is_matlab_pair(text)):
+        read = read_opencv_stereo if kind == "opencv" else read_matlab_pair
+        (left, right), right_from_left = read(text, name)
         return {"left": (left, Rigid3.identity()), "right": (right, right_from_left)}
     if kind == "rigkit":
         return load_rig(path)
-    raise InputError(f"'{name}': no rig of rigkit, Kalibr (camchain) or OpenCV (M1, D1, M2, D2, R, T); check the file")
+    raise InputError(
+        f"'{name}': no rig of rigkit, Kalibr (camchain), OpenCV (M1, D1, M2, D2, R, T) or MATLAB; check the file"
+    )
 
 
 def import_pair(

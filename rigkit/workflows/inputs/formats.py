@@ -13,7 +13,7 @@ FOREIGN_ENDINGS = {
 """Other tools' formats of cameras that are written, and how the names of their files end. Readers and writers are in
 `rigkit.interop.camera_formats`, which takes too long to load for a help text."""
 CAMERA_FORMATS = ("rigkit", *FOREIGN_ENDINGS)
-READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib")
+READ_FORMATS = (*CAMERA_FORMATS, "py-ocamcalib", "matlab")
 CLOUD_FORMATS = ("ply", "npz", "las", "colmap")
 PLY_FORMATS = ("ply", "las")
 """Of a cloud that is there as PLY."""

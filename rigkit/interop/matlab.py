@@ -1,0 +1,231 @@
+"""MATLAB's calibrations: Bouguet's Calib_Results (.mat, .m), and structures that toStruct makes of Computer Vision
+Toolbox's cameraParameters, cameraIntrinsics, fisheyeParameters, fisheyeIntrinsics and stereoParameters.
+
+A .mat file becomes the assignments of a script, which are read as Calib_Results.m is. Bouguet's pixels are ours; the
+toolbox counts them from 1. Lengths in mm. `Calib_Results_stereo` and stereoParameters are pairs.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.interop.exchange import field, image_size, numbers
+from rigkit.interop.ocamcalib import camera_of_taylor
+from rigkit.interop.opencv import camera_from_arrays
+
+SizePx = tuple[int, int]
+Values = Mapping[str, FloatArray]
+
+MAT5, MAT73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+"""How files begin that save -v6 and -v7, and that save -v7.3 writes."""
+MAX_VALUES = 100
+"""Of an array: a camera's are smaller; corners and covariances are left out."""
+MAX_DEPTH = 6
+MAT_SIGN = re.compile(
+    r"^\s*(?:\w+\.)*(?:fc|fc_left|FocalLength|MappingCoefficients|IntrinsicMatrix|K)\s*=\s*\[|^% MATLAB\b", re.MULTILINE
+)
+"""What files of cameras have, and what a .mat file becomes."""
+ASSIGNMENT = re.compile(r"^\s*([A-Za-z][\w.]*)\s*=\s*(\[[^\]]*\]|[-+.\w]+)\s*;?", re.MULTILINE)
+OBJECTS = "% MATLAB objects:"
+
+
+def matlab_text(data: bytes, name: str) -> str | None:
+    """Return the assignments of a .mat file, None for bytes that are none.
+
+    Raises InputError for a damaged file, and for HDF5 (-v7.3).
+    """
+    if data.startswith(MAT73):
+        raise InputError(f"'{name}' was saved with -v7.3; save it in MATLAB with save(..., '-v7')")
+    if not data.startswith(MAT5):
+        return None
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        loaded = loadmat(io.BytesIO(data), struct_as_record=False, squeeze_me=True)
+    except (
+        MatReadError, ValueError, TypeError, LookupError, AttributeError, OSError, ArithmeticError, MemoryError,
+        NotImplementedError, zlib.error,
+    ) as error:  # fmt: skip
+        raise InputError(f"'{name}': not readable as a .mat file ({error}); is the file whole?") from error
+    lines: list[str] = []
+    for key, value in loaded.items():
+        _assignments(key, value, lines)
+    return "\n".join(["% MATLAB", *lines]) + "\n"
+
+
+def read_matlab(text: str, name: str = "camera.mat", size_px: SizePx | None = None) -> Camera:
+    """Return the camera of a .mat file's assignments (`matlab_text`) or of a Calib_Results.m.
+
+    `size_px` is the images' size, where the file does not say it. Raises InputError for skew, files of pairs, objects
+    instead of structures, and damaged files.
+    """
+    values = _values(text, name)
+    found = _cameras(values)
+    if len(found) > 1 or is_matlab_pair(text):
+        raise InputError(f"'{name}' holds several cameras; give it as a rig (--rig), or save the one that you want")
+    if not found:
+        raise _nothing(text, name)
+    return _camera(found[next(iter(found))], name, size_px)
+
+
+def is_matlab_pair(text: str) -> bool:
+    """Say whether a text that `MAT_SIGN` tells is one of two cameras and their pose."""
+    return re.search(r"^\s*(?:\w+\.)*(?:fc_right|CameraParameters2\.\w+)\s*=", text, re.MULTILINE) is not None
+
+
+def read_matlab_pair(
+    text: str, name: str = "stereo.mat", size_px: SizePx | None = None
+) -> tuple[tuple[Camera, Camera], Rigid3]:
+    """Return left and right camera, and right_from_left, mm; raises InputError as `read_matlab`."""
+    values = _values(text, name)
+    if "fc_left" in values:
+        sides = [{k: values[f"{k}_{s}"] for k in BOUGUET if f"{k}_{s}" in values} for s in ("left", "right")]
+        size: dict[str, FloatArray] = {k: values[k] for k in ("nx", "ny") if k in values}
+        left, right = (_camera(side | size, name, size_px) for side in sides)
+        R, t = (numbers(field(dict(values), key, name), name, key, n) for key, n in (("R", 9), ("T", 3)))
+        return (left, right), _pose(R.reshape(3, 3), t, name)
+    found = _cameras(values)
+    first = next((key for key in found if "CameraParameters1" in key), None)
+    second = None if first is None else first.replace("CameraParameters1", "CameraParameters2")
+    if first is None or second not in found:
+        raise _nothing(text, name)
+    left, right = (_camera(found[key], name, size_px) for key in (first, second))
+    of = first.split("CameraParameters1")[0]
+    if f"{of}PoseCamera2.R" in values:
+        # Newer versions: rigidtform3d, which acts on columns.
+        R, t = values[f"{of}PoseCamera2.R"], values.get(f"{of}PoseCamera2.Translation", np.zeros(0))
+    else:
+        keys = (f"{of}RotationOfCamera2", f"{of}TranslationOfCamera2")
+        R, t = (numbers(field(dict(values), key, name), name, key) for key in keys)
+        # Older ones: points are rows, x2 = x1 R + t.
+        R = R.reshape(3, 3).T if R.size == 9 else R
+    return (left, right), _pose(numbers(R, name, "rotation", 9).reshape(3, 3), numbers(t, name, "translation", 3), name)
+
+
+BOUGUET = ("fc", "cc", "kc", "alpha_c")
+
+
+def _assignments(key: str, value: Any, lines: list[str], depth: int = 0) -> None:
+    """Append what a variable holds: one line a small array, of a structure one a field."""
+    from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
+
+    if key.startswith("__") or depth > MAX_DEPTH:
+        return
+    if isinstance(value, mat_struct):
+        for part in value._fieldnames:
+            _assignments(f"{key}.{part}", getattr(value, part), lines, depth + 1)
+        return
+    if isinstance(value, MatlabOpaque | MatlabFunction) or (isinstance(value, np.ndarray) and value.dtype.names):
+        lines.append(f"{OBJECTS} {key}")
+        return
+    array = np.asarray(value)
+    if array.dtype.kind in "iufb" and 0 < array.size <= MAX_VALUES:
+        rows = np.atleast_2d(array.astype(np.float64))
+        lines.append(f"{key} = [ {' ; '.join(' '.join(map(repr, row)) for row in rows.tolist())} ];")
+
+
+def _values(text: str, name: str) -> dict[str, FloatArray]:
+    """Return the numbers by their names, of an array (N,) row by row; the last one counts, as in MATLAB."""
+    found = {}
+    for key, words in ASSIGNMENT.findall(re.sub(r"%[^\n]*", "", text)):
+        plain = re.sub(r"[\[\];,]|\.\.\.", " ", words).split()
+        try:
+            found[key] = numbers([float(word) for word in plain], name, key)
+        except ValueError:
+            continue  # an expression or a word, which no camera needs
+    return found
+
+
+def _cameras(values: Values) -> dict[str, dict[str, FloatArray]]:
+    """Return by the structure's name the numbers of each camera in it."""
+    found: dict[str, dict[str, FloatArray]] = {}
+    for key in values:
+        of, _, last = key.rpartition(".")
+        if last in ("fc", "FocalLength", "MappingCoefficients", "IntrinsicMatrix", "K"):
+            found.setdefault(of, {k.rpartition(".")[2]: v for k, v in values.items() if k.rpartition(".")[0] == of})
+    # A camera's structure may say the same once more in one of its intrinsics (newer cameraParameters).
+    return {of: v for of, v in found.items() if not (of.endswith(".Intrinsics") and of.rpartition(".")[0] in found)}
+
+
+def _camera(of: Values, name: str, size_px: SizePx | None) -> Camera:
+    """Return the camera of Bouguet's or the toolbox's numbers."""
+    data = dict(of)
+    if "ImageSize" in data and data["ImageSize"].size == 2:
+        size = image_size(data["ImageSize"][::-1], name, "ImageSize")
+    elif "nx" in data and "ny" in data:
+        size = image_size([data["nx"][0], data["ny"][0]], name, "nx, ny")
+    elif size_px is not None:
+        size = size_px
+    else:
+        raise InputError(f"'{name}': it does not say the images' size; use `rigkit export --size`")
+    if "MappingCoefficients" in data:
+        a = numbers(data["MappingCoefficients"], name, "MappingCoefficients", 4)
+        centre = numbers(field(data, "DistortionCenter", name), name, "DistortionCenter", 2) - 1.0
+        stretch = numbers(data.get("StretchMatrix", np.eye(2)), name, "StretchMatrix", 4).reshape(2, 2)
+        return camera_of_taylor(size, np.insert(a, 1, 0.0), centre, stretch, name)
+    if "fc" in data:
+        return _bouguet(data, size, name)
+    K = _toolbox_matrix(data, name)
+    radial = numbers(data.get("RadialDistortion", np.zeros(2)), name, "RadialDistortion")
+    tangential = numbers(data.get("TangentialDistortion", np.zeros(2)), name, "TangentialDistortion", 2)
+    if radial.size not in (2, 3):
+        raise InputError(f"'{name}': RadialDistortion has {radial.size} numbers, not 2 or 3; is the file whole?")
+    return camera_from_arrays(size, K, np.array([*radial[:2], *tangential, *radial[2:]]), fisheye=False, name=name)
+
+
+def _bouguet(data: dict[str, FloatArray], size: SizePx, name: str) -> Camera:
+    fc, cc = (numbers(field(data, key, name), name, key, 2) for key in ("fc", "cc"))
+    skew = float(data.get("alpha_c", np.zeros(1))[0])
+    d = numbers(data.get("kc", np.zeros(5)), name, "kc")
+    if d.size != 5:
+        # The toolbox's fisheye (calib_fisheye) has four, and no word that it is one.
+        raise InputError(
+            f"'{name}': kc has {d.size} numbers, not 5; of a perspective lens add zeros; a fisheye's kc is OpenCV's: "
+            "write it into OpenCV's file with fisheye_model: 1"
+        )
+    K = np.array([fc[0], skew * fc[0], cc[0], 0.0, fc[1], cc[1], 0.0, 0.0, 1.0])
+    return camera_from_arrays(size, K, d, fisheye=False, name=name)
+
+
+def _toolbox_matrix(data: dict[str, FloatArray], name: str) -> FloatArray:
+    """Return K (9), its principal point counted from 0."""
+    if "K" in data or "IntrinsicMatrix" in data:
+        key = "K" if "K" in data else "IntrinsicMatrix"
+        K = numbers(data[key], name, key, 9).reshape(3, 3)
+        # Older versions have it for row vectors.
+        K = K.T.copy() if K[0, 2] == 0.0 and K[2, 0] != 0.0 else K.copy()
+    else:
+        focal = numbers(field(data, "FocalLength", name), name, "FocalLength", 2)
+        centre = numbers(field(data, "PrincipalPoint", name), name, "PrincipalPoint", 2)
+        skew = float(data.get("Skew", np.zeros(1))[0])
+        K = np.array([[focal[0], skew, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    K[:2, 2] -= 1.0
+    return K.reshape(9)
+
+
+def _pose(R: FloatArray, t: FloatArray, name: str) -> Rigid3:
+    try:
+        return Rigid3(R, t)
+    except InputError as error:
+        raise InputError(f"'{name}': {error}; is the file whole?") from error
+
+
+def _nothing(text: str, name: str) -> InputError:
+    if OBJECTS in text:
+        which = text.split(OBJECTS)[1].split()[0]
+        return InputError(
+            f"'{name}': '{which}' is an object, which only MATLAB reads; there: s = toStruct({which}); "
+            "save('camera.mat', '-struct', 's', '-v7')"
+        )
+    return InputError(f"'{name}': no camera of MATLAB in it (fc, cc, kc, or what toStruct makes); check the file")
