@@ -81,9 +81,12 @@ def match_affine_features(
             break
     assert found is not None
     if not len(found.pairs):
+        # Where nothing looks alike there is nothing to align.
+        what = (
+            f"none of {found.tried} matches could be aligned" if found.tried else "nothing looks alike in both images"
+        )
         raise DegenerateError(
-            f"affine features: none of {found.tried} matches could be aligned; check that the images show one textured "
-            "scene"
+            f"affine features: {what}; check that they show one textured scene, from places not too far apart"
         )
     return found.pairs
 

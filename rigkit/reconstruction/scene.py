@@ -182,6 +182,11 @@ def _matches(
     """Return the matches and which of the correspondences have one. Raises InputError where these cannot be used."""
     _check(correspondences, baseline_mm, pair_id)
     matches, seen = correspondences.matches(camera1, camera2)
+    if len(seen) < MIN_MATCHES:
+        raise InputError(
+            f"'{pair_id}': only {len(seen)} correspondences, at least {MIN_MATCHES} are needed; give images that show "
+            "more of one textured scene, from places nearer to each other"
+        )
     if seen.sum() < MIN_MATCHES:
         raise InputError(
             f"'{pair_id}': {int(seen.sum())} of {len(seen)} correspondences lie in both cameras' fields of view; at "

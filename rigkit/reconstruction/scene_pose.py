@@ -131,7 +131,7 @@ def _refuse_contradiction(matches: Matches, pose: Rigid3, near: BoolArray) -> No
         raise DegenerateError(
             f"{int(near.sum())} of {len(matches)} correspondences agree with the measured pose and {int(better.sum())} "
             f"with another, turned by {turn:.2f} deg from it; check which camera took which image, that the pose is "
-            "cam2_from_cam1, and that the cameras have not moved since"
+            "cam2_from_cam1, that both images are of one moment, and that the cameras have not moved since"
         )
 
 
@@ -145,7 +145,34 @@ def fit_scene_pose(
     """Return the pose that most matches agree with, refined on those by points and affinities.
 
     From `start`, where one is known that most of the matches were found with, nothing is searched for.
+    Raises DegenerateError: no pose, or none of the type `declared`, though there is another.
     """
+    try:
+        return _fitted(matches, declared, level_sigma_rad, rng, start)
+    except DegenerateError as error:
+        if declared in (PoseType.AUTO, PoseType.GENERAL) or start is not None:
+            raise
+        try:
+            other = _fitted(matches, PoseType.GENERAL, None, rng, None)
+        except RigkitError:
+            raise error from None
+        pose = other.refined.cam2_from_cam1
+        turn = np.degrees(rotation_angle(pose.rotation))
+        along = ", ".join(f"{x:.2f}" for x in pose.rotation.T @ -pose.translation_mm)
+        raise DegenerateError(
+            f"declared '{declared.value}', but {int(other.inliers.sum())} of {len(matches)} correspondences agree with "
+            f"a pose that is not: turned by {turn:.2f} deg, moved along ({along}); declare 'general', and how well a "
+            "declared type holds with --level-sigma-deg"
+        ) from error
+
+
+def _fitted(
+    matches: Matches,
+    declared: PoseType,
+    level_sigma_rad: float | None,
+    rng: np.random.Generator,
+    start: Rigid3 | None,
+) -> ScenePose:
     pose, pose_type = start, declared
     if pose is None:
         found = _search(matches, PoseType.GENERAL if declared is PoseType.AUTO else declared, rng)

@@ -46,6 +46,33 @@ def contaminated(rng, kind="general", count=150, outliers=0.6, camera=REGULAR):
     return Correspondences(m.pixels1, q2, A21, None, *stated), m, pose, X, bad
 
 
+@pytest.mark.parametrize("declared", ["standard", "forward"])
+def test_a_pose_type_that_is_not_there_is_named(rng, declared):
+    """Not "no baseline", and not "other scenes": the matches agree with a pose of another type."""
+    found, _, _, _, bad = contaminated(rng, outliers=0.3)
+    with pytest.raises(
+        DegenerateError, match=rf"declared '{declared}', but .* correspondences agree with a pose"
+    ) as caught:
+        reconstruct_scene(found, REGULAR, REGULAR, pose_type=declared, baseline_mm=300.0)
+    agree = int(str(caught.value).split(" of 150")[0].split()[-1])
+    assert 0.9 * (~bad).sum() < agree < 1.1 * (~bad).sum()
+
+
+def test_matches_that_agree_with_nothing_are_not_called_a_wrong_pose_type(rng):
+    found, _, _, _, _ = contaminated(rng, outliers=1.0)
+    with pytest.raises(DegenerateError) as caught:
+        reconstruct_scene(found, REGULAR, REGULAR, pose_type="standard", baseline_mm=300.0)
+    assert "declared" not in str(caught.value)
+
+
+def test_images_without_texture_have_nothing_to_align(rng):
+    flat = [np.clip(120.0 + rng.normal(0.0, 2.0, (200, 300)), 0, 255).astype(np.uint8) for _ in range(2)]
+    with pytest.raises(DegenerateError, match="nothing looks alike in both images|none of [1-9]"):
+        match_affine_features(*flat)
+    with pytest.raises(DegenerateError, match="nothing looks alike in both images"):
+        match_affine_features(*(np.full((200, 300), 120, np.uint8) for _ in range(2)))
+
+
 @pytest.mark.parametrize(
     ("kind", "camera"),
     [("general", REGULAR), ("general", FISHEYE), ("planar", REGULAR), ("standard", REGULAR)],
