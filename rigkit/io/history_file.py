@@ -80,7 +80,8 @@ class HistoryEntry:
         amounts: dict[str, tuple[float, float]] = {}
         for change in check.tried:
             cause = change.cause
-            if cause.kind in ("lens", "moved"):
+            # Of flipped pictures nothing moved.
+            if cause.kind in ("lens", "moved") or check.flipped:
                 continue
             several = len(change.amounts) > 1
             for k, (amount, sigma, unit) in enumerate(zip(change.amounts, change.sigmas, cause.units, strict=True)):
@@ -95,12 +96,20 @@ class HistoryEntry:
             digest=digest,
             holds=check.holds,
             chance=check.chance,
-            verdict="holds" if check.holds else str(check.change or "nothing that moved explains it"),
+            verdict=_verdict(check),
             frames=check.frames,
             rms_px=check.rms_px,
             temperature_c=temperature_c,
             amounts=amounts,
         )
+
+
+def _verdict(check: SentinelCheck) -> str:
+    if check.holds:
+        return "holds"
+    if check.flipped:
+        return f"the pictures seem {check.flipped}: put back, they fit"
+    return "nothing that moved explains it" if check.unexplained else str(check.change)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

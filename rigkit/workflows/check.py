@@ -16,9 +16,8 @@ from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection, BoardView, grid_turned
+from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
@@ -43,7 +42,7 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
-from rigkit.validation.sentinel.flipped import flipped_pictures
+from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.detect import images_in
@@ -131,8 +130,8 @@ def check_pictures(
                 raise InputError(f"check: {_nothing_to_check(left_out, unreadable, boards)}")
             check = check_views(watched, views, cost)
             if not check.holds:
-                _require_right_order(check, views)
                 check = replace(check, flipped=flipped_pictures(watched, views))
+                _require_right_order(check, views)
     files = _files(source, check, options)
     write_together(files, force=options.force)
     if options.history is not None:
@@ -267,7 +266,7 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [FreshView(name, c, _counted_alike(watched, c, watched.from_afar(v), name, out)) for v in views]
+            out += [counted_alike(watched, FreshView(name, c, watched.from_afar(view)), out) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out
@@ -296,30 +295,12 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
         except (DegenerateError, InputError):
             continue
         if exchanged.holds or (check.unexplained and not exchanged.unexplained):
+            # Two cameras of one lens that were both turned look as if they had been exchanged.
+            how = f"exchanged, or {check.flipped}" if check.flipped else "exchanged"
             raise InputError(
-                f"check: the images of '{names[i]}' and '{names[j]}' are exchanged: put right, they fit; give them in "
-                f"the rig's order, {', '.join(names)}"
+                f"check: the images of '{names[i]}' and '{names[j]}' are {how}: put right, they fit; give them in the "
+                f"rig's order, {', '.join(names)}"
             )
-
-
-def _counted_alike(watched: Watched, c: int, view: BoardView, frame: str, before: Sequence[FreshView]) -> BoardView:
-    """Return a view of a board that looks the same turned, numbered from the end from which another camera did."""
-    same = [v for v in before if v.frame == frame and v.view.board.board_id == view.board.board_id and v.camera != c]
-    if not same or not view.board.looks_same_turned:
-        return view
-    first = same[0]
-    try:
-        pose = cam_from_seen_board(watched.cameras[first.camera], first.view.pixels, first.view.points())
-    except (InputError, DegenerateError):
-        return view
-    here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose
-    turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
-
-    def apart(one: BoardView) -> float:
-        pixels, seen = watched.cameras[c].project(here.apply(one.points()))
-        return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
-
-    return turned if apart(turned) < apart(view) else view
 
 
 def length_costs(watched: Watched, task: Task) -> list[Goal]:

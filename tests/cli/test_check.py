@@ -106,25 +106,14 @@ def test_a_board_that_looks_the_same_turned_is_counted_alike_by_two_cameras(
     def no_pose(*_: object) -> None:
         raise DegenerateError("no pose")
 
-    monkeypatch.setattr("rigkit.workflows.check.cam_from_seen_board", no_pose)
+    monkeypatch.setattr("rigkit.validation.sentinel.flipped.cam_from_seen_board", no_pose)
     turned = check_pictures(tmp_path / "rig.json", pictures, CheckOptions(boards=(board,))).check
     assert turned.unexplained and turned.rms_px > 10.0
 
 
 def test_images_of_a_rig_that_are_exchanged_are_no_change_of_it(tmp_path: Path) -> None:
-    poses = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-60.0, 0.0, 0.0]))
-    camera, optics = Pinhole((320, 240), np.array([260.0, 260.0, 160.3, 119.1])), Optics(0.6, supersample=2)
-    places = [Rigid3(exp_so3(np.array([0.2, tilt, 0.0])), [-70.0, -60.0, 400.0]) for tilt in (0.3, -0.3)]
-    pictures = [tmp_path / f"{name}{k}.png" for k in range(2) for name in ("left", "right")]
-    for path, (place, pose) in zip(pictures, [(a, b) for a in places for b in poses], strict=True):
-        cv2.imwrite(str(path), render([PlacedBoard(BOARD, place)], camera, pose, optics=optics))
-    cameras = [
-        {"name": name, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
-        for name, pose in zip(("left", "right"), poses, strict=True)
-    ]
-    sure = (np.diag([0.1, 0.1, 0.1, 0.1] * 2 + [1e-4] * 3 + [0.05] * 3) ** 2).tolist()
-    rig, options = tmp_path / "rig.json", CheckOptions(boards=(BOARD,))
-    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "sigma_px": 0.05, "cameras": cameras, "covariance": sure}))
+    rig, pictures = _rig_of_two(tmp_path, BOARD)
+    options = CheckOptions(boards=(BOARD,))
     assert check_pictures(rig, pictures, options).check.holds
     with pytest.raises(InputError, match=r"the images of 'left' and 'right' are exchanged: .*rig's order, left, right"):
         check_pictures(rig, [pictures[k] for k in (1, 0, 3, 2)], options)
@@ -138,7 +127,7 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
 
     def found(*, holds: bool, unexplained: bool) -> SentinelCheck:
         names = SimpleNamespace(names=("left", "right"))
-        return cast(SentinelCheck, SimpleNamespace(watched=names, holds=holds, unexplained=unexplained))
+        return cast(SentinelCheck, SimpleNamespace(watched=names, holds=holds, unexplained=unexplained, flipped=""))
 
     odd, moved, holding = (found(holds=h, unexplained=u) for h, u in ((False, True), (False, False), (True, False)))
     for given, other, wrong in ((odd, odd, False), (moved, moved, False), (odd, moved, True), (moved, holding, True)):
@@ -147,6 +136,56 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
             _require_right_order(given, [])
     monkeypatch.setattr("rigkit.workflows.check.check_views", refused)
     _require_right_order(odd, [])
+
+
+@pytest.mark.parametrize(
+    ("whose", "flip", "words"),
+    [
+        (("right",), -1, "those of 'right' turned by half a turn"),
+        (("left",), 1, "those of 'left' mirrored left to right"),
+        (("right",), 0, "those of 'left' mirrored top to bottom or those of 'right' mirrored top to bottom"),
+        (("left", "right"), -1, "turned by half a turn or mirrored left to right"),
+    ],
+)
+@pytest.mark.parametrize("board", [BOARD, Board("even", 6, 4, 20.0, 20.0)], ids=["9x6", "6x4"])
+def test_flipped_pictures_of_a_rig_are_named(
+    board: Board, whose: tuple[str, ...], flip: int, words: str, tmp_path: Path
+) -> None:
+    """Also of a board that looks the same turned. The register has no moved principal point of them."""
+    rig, pictures = _rig_of_two(tmp_path, board)
+    register = tmp_path / "rig.jsonl"
+    options = CheckOptions(boards=(board,), history=register)
+    assert check_pictures(rig, pictures, options).check.holds
+    for path in pictures:
+        if path.stem[:-1] in whose:
+            cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), flip))
+    if board.looks_same_turned and len(whose) == 2:
+        with pytest.raises(InputError, match=f"'left' and 'right' are exchanged, or {words}: put right"):
+            check_pictures(rig, pictures, options)
+        return
+    done = check_pictures(rig, pictures, options)
+    assert done.check.flipped == words
+    entry = json.loads(register.read_text().splitlines()[-1])
+    assert entry["verdict"] == f"the pictures seem {words}: put back, they fit"
+    assert entry["amounts"] == {} and not entry["holds"]
+
+
+def _rig_of_two(folder: Path, board: Board) -> tuple[Path, list[Path]]:
+    """Return the file of a rig and four pictures of a board, left and right in turns."""
+    poses = (Rigid3.identity(), Rigid3(exp_so3(np.array([0.0, 0.1, 0.0])), [-60.0, 0.0, 0.0]))
+    camera, optics = Pinhole((320, 240), np.array([260.0, 260.0, 160.3, 119.1])), Optics(0.6, supersample=2)
+    places = [Rigid3(exp_so3(np.array([0.2, tilt, 0.0])), [-70.0, -60.0, 400.0]) for tilt in (0.3, -0.3)]
+    pictures = [folder / f"{name}{k}.png" for k in range(2) for name in ("left", "right")]
+    for path, (place, pose) in zip(pictures, [(a, b) for a in places for b in poses], strict=True):
+        cv2.imwrite(str(path), render([PlacedBoard(board, place)], camera, pose, optics=optics))
+    cameras = [
+        {"name": name, "camera": camera_to_json(camera), "cam_from_rig": pose.matrix()[:3].tolist(), "rms_px": 0.1}
+        for name, pose in zip(("left", "right"), poses, strict=True)
+    ]
+    sure = (np.diag([0.1, 0.1, 0.1, 0.1] * 2 + [1e-4] * 3 + [0.05] * 3) ** 2).tolist()
+    rig = folder / "rig.json"
+    rig.write_text(json.dumps({"schema": "rigkit.rig/1", "sigma_px": 0.05, "cameras": cameras, "covariance": sure}))
+    return rig, pictures
 
 
 @pytest.mark.parametrize(("flip", "words"), [(-1, "turned by half a turn"), (0, "mirrored top to bottom")])

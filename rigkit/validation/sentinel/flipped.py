@@ -1,6 +1,7 @@
 """Fresh pictures that a program turned or mirrored: the calibration holds for them once they are put back.
 
-Else they say that the principal point moved to the other side of the image's middle, which no glass does.
+Else they say that the principal point moved to the other side of the image's middle, which no glass does, or of a rig
+that nothing explains them.
 """
 
 from __future__ import annotations
@@ -10,6 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.judge import check_views
@@ -26,22 +30,79 @@ lenses lie off the middle by 0.1 to 3.5 % (camodocal-fisheye, bouguet-stereo), a
 
 
 def flipped_pictures(watched: Watched, views: Sequence[FreshView]) -> str:
-    """Return how pictures of one camera must have been flipped, where they fit once they are put back: several ways in
-    words where they look the same. "" where none does, where the flip is too small to tell, and for rigs."""
-    if len(watched.cameras) != 1:
-        return ""
-    camera = watched.cameras[0]
-    off = np.array(camera.size_px) - 1.0 - 2.0 * camera.axis_px
+    """Return how pictures must have been flipped, of a rig those of which camera or of all, where they fit once they
+    are put back: several ways in words where they look the same. "" where none does, and where the flip is too small to
+    tell."""
+    count = len(watched.cameras)
+    if count > 1:
+        # To a board one camera in a mirror is the other one in a mirror, where the rig looks the same in it.
+        one = [
+            f"those of '{name}' {way}" for c, name in enumerate(watched.names) for way in _ways(watched, views, (c,))
+        ]
+        if one:
+            return " or ".join(one)
+    return " or ".join(_ways(watched, views, tuple(range(count))))
+
+
+def _ways(watched: Watched, views: Sequence[FreshView], which: tuple[int, ...]) -> list[str]:
+    """Return in how many ways the pictures of some cameras fit once they are put back, in words."""
+    cameras = [watched.cameras[c] for c in which]
+    # A board that another camera sees, too, stands elsewhere in a flipped picture: that is no knock.
+    whose = {frame: {v.camera for v in views if v.frame == frame} for frame in {v.frame for v in views}}
+    together = any(len(seen) > 1 and not seen.isdisjoint(which) for seen in whose.values())
     fit = []
     for words, signs in WAYS_TO_FLIP.items():
-        moved = np.where(np.array(signs) < 0.0, off, 0.0)
-        if np.linalg.norm(moved) < MIN_SHARE_FLIPPED * max(camera.size_px):
+        if not together and max(_moved(camera, signs) for camera in cameras) < MIN_SHARE_FLIPPED:
             continue
         # In a mirror a board's columns or its rows are counted backwards, as the colours of its ends have it.
         ways = (0, 1) if np.prod(signs) < 0.0 else (None,)
-        if any(_fits(watched, [_put_back(view, signs, camera.size_px, way) for view in views]) for way in ways):
+        if any(_fits(watched, _all_put_back(watched, views, which, signs, way)) for way in ways):
             fit.append(words)
-    return " or ".join(fit)
+    return fit
+
+
+def _moved(camera: Camera, signs: tuple[float, float]) -> float:
+    """Return how far a flip moves the principal point, as a share of the longer side."""
+    off = np.array(camera.size_px) - 1.0 - 2.0 * camera.axis_px
+    return float(np.linalg.norm(np.where(np.array(signs) < 0.0, off, 0.0))) / max(camera.size_px)
+
+
+def _all_put_back(
+    watched: Watched,
+    views: Sequence[FreshView],
+    which: tuple[int, ...],
+    signs: tuple[float, float],
+    backwards: int | None,
+) -> list[FreshView]:
+    """Return all views, those of some cameras put back; these count boards that look alike turned as the others do."""
+    out = [view for view in views if view.camera not in which]
+    for view in views:
+        if view.camera in which:
+            put = _put_back(view, signs, watched.cameras[view.camera].size_px, backwards)
+            out.append(counted_alike(watched, put, out))
+    return out
+
+
+def counted_alike(watched: Watched, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
+    """Return a view of a board that looks the same turned, numbered from the end from which another camera did."""
+    view, c = fresh.view, fresh.camera
+    name = view.board.board_id
+    same = [v for v in before if v.frame == fresh.frame and v.view.board.board_id == name and v.camera != c]
+    if not same or not view.board.looks_same_turned:
+        return fresh
+    first = same[0]
+    try:
+        pose = cam_from_seen_board(watched.cameras[first.camera], first.view.pixels, first.view.points())
+    except (InputError, DegenerateError):
+        return fresh
+    here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose
+    turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
+
+    def apart(one: BoardView) -> float:
+        pixels, seen = watched.cameras[c].project(here.apply(one.points()))
+        return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
+
+    return replace(fresh, view=turned) if apart(turned) < apart(view) else fresh
 
 
 def _fits(watched: Watched, views: Sequence[FreshView]) -> bool:
