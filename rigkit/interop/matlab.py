@@ -30,12 +30,15 @@ MAT5, MAT73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 """How files begin that save -v6 and -v7, and that save -v7.3 writes."""
 MAX_VALUES = 100
 """Of an array: a camera's are smaller; corners and covariances are left out."""
-MAX_DEPTH = 6
+MAX_STRUCTURES = 6
+"""In each other; the toolbox's cameras have three."""
 MAT_SIGN = re.compile(
     r"^\s*(?:\w+\.)*(?:fc|fc_left|FocalLength|MappingCoefficients|IntrinsicMatrix|K)\s*=\s*\[|^% MATLAB\b", re.MULTILINE
 )
 """What files of cameras have, and what a .mat file becomes."""
 ASSIGNMENT = re.compile(r"^\s*([A-Za-z][\w.]*)\s*=\s*(\[[^\]]*\]|[-+.\w]+)\s*;?", re.MULTILINE)
+BOUGUET = ("fc", "cc", "kc", "alpha_c")
+"""What a pair has of each side, with _left and _right behind."""
 OBJECTS = "% MATLAB objects:"
 
 
@@ -113,14 +116,11 @@ def read_matlab_pair(
     return (left, right), _pose(numbers(R, name, "rotation", 9).reshape(3, 3), numbers(t, name, "translation", 3), name)
 
 
-BOUGUET = ("fc", "cc", "kc", "alpha_c")
-
-
 def _assignments(key: str, value: Any, lines: list[str], depth: int = 0) -> None:
     """Append what a variable holds: one line a small array, of a structure one a field."""
     from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
 
-    if key.startswith("__") or depth > MAX_DEPTH:
+    if key.startswith("__") or depth > MAX_STRUCTURES:
         return
     if isinstance(value, mat_struct):
         for part in value._fieldnames:

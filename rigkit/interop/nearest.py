@@ -15,7 +15,7 @@ from rigkit.core.errors import InputError
 Lens = Callable[[Rays], tuple[Pixels, BoolArray]]
 """Pixels (N, 2) of unit rays (N, 3), and which of them the lens sees."""
 
-MODELS = (
+NEAREST = (
     ("scaramuzza", 10),
     ("kannala_brandt", None),
     ("double_sphere", None),
@@ -55,7 +55,7 @@ def nearest_camera_of(
     checked_rays, checked = rays_of_image(lens, size_px, reach_rad, CHECKED)
     centre = lens(np.array([[0.0, 0.0, 1.0]]))[0][0]
     best: tuple[Camera, float] | None = None
-    for kind, order in MODELS:
+    for kind, order in NEAREST:
         try:
             camera = fit_camera(camera_model(kind), size_px, rays, pixels, centre, order=order)
         except (InputError, np.linalg.LinAlgError):

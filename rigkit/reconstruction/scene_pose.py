@@ -154,7 +154,7 @@ def fit_scene_pose(
             raise
         try:
             other = _fitted(matches, PoseType.GENERAL, None, rng, None)
-        except RigkitError:
+        except (InputError, DegenerateError):
             raise error from None
         pose = other.refined.cam2_from_cam1
         turn = np.degrees(rotation_angle(pose.rotation))

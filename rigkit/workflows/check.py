@@ -207,8 +207,8 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     images = list(images_in(sources))
     if len(images) % count:
         raise InputError(
-            f"check: {len(images)} images are not moments of {count} cameras each ({watched.names}); "
-            "give as many of each camera"
+            f"check: {len(images)} different images, which are not moments of {count} cameras each "
+            f"({', '.join(watched.names)}); give as many of each camera"
         )
     return [images[k : k + count] for k in range(0, len(images), count)]
 

@@ -217,6 +217,9 @@ def test_refusals(rng: np.random.Generator) -> None:
         certify(alone, Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=1000.0))
     with pytest.raises(InputError, match="size must be positive"):
         Task(quantity=Quantity.LENGTH, size_mm=0.0, distance_mm=1000.0)
+    one_place = replace(known_rig("brown", rig_covariance(camera, rng)), cam_from_rig=(Rigid3.identity(),) * 2)
+    with pytest.raises(DegenerateError, match="look from one place"):
+        certify(Instrument.of(one_place), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=1000.0))
     with pytest.raises(InputError, match="two different cameras of left, right"):
         Instrument.of(known_rig("brown", rig_covariance(camera, rng)), ("left", "left"))
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rotation import skew
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 
@@ -98,7 +99,13 @@ def gradients(
         normal = np.swapaxes(J, -1, -2) @ J
         # Out of view anything that can be inverted will do.
         normal[~seen] = np.eye(3)
-        by_pixel = np.linalg.solve(normal, np.swapaxes(J, -1, -2))
+        try:
+            by_pixel = np.linalg.solve(normal, np.swapaxes(J, -1, -2))
+        except np.linalg.LinAlgError as error:
+            raise DegenerateError(
+                "certificate: the cameras look from one place, so that nothing they see has a distance; give two that "
+                "are apart"
+            ) from error
     else:
         # The pseudo-inverse of a 2x3 Jacobian moves a point across its ray alone.
         by_pixel = np.linalg.pinv(J)
