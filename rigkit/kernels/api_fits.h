@@ -228,7 +228,7 @@ enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
 /* The constants of detection.tags.whole, under their names there. */
 typedef struct {
     double tail_sigmas, pixel_kurtosis, sharp_blur, least_blur, most_blur, most_move_px, most_blur_change, light_sigma;
-    double least_variance, converged_px;
+    double least_variance, converged_px, most_taken;
     int64_t iterations;
 } tag_rules_t;
 

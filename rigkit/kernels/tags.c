@@ -374,16 +374,22 @@ void fit_tags(
         for (int64_t k = 0; k < squares; k++)
             for (int i = 0; i < BLOCK; i++)
                 tag.a += (double)blocks[k].counts[i] * ((double)blocks[k].value[i] - 0.5 * tag.b) / (double)seen;
-        double N[PARAMETERS * PARAMETERS], step[PARAMETERS], variance = 0.0;
+        double N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS], variance = 0.0;
         int settled = 0;
         for (int64_t k = 0; k < rules->iterations && !settled; k++) {
-            variance = tag_equations(&tag, blocks, squares, rules, N, step) / (double)(seen - PARAMETERS);
+            const double left = tag_equations(&tag, blocks, squares, rules, N, right);
+            variance = left / (double)(seen - PARAMETERS);
             variance = variance > rules->least_variance ? variance : rules->least_variance;
+            memcpy(step, right, sizeof step);
             add_prior(&tag, bend_sigma[n], variance, rules, N, step);
             if (!cholesky(N, PARAMETERS))
                 break;
             cholesky_solve(N, PARAMETERS, step);
-            settled = take_step(&tag, step, rules) <= rules->converged_px;
+            /* Corners may be right before the light is: what is left then is no noise, and says nothing of sigmas. */
+            double taken = 0.0;
+            for (int i = 0; i < PARAMETERS; i++)
+                taken += step[i] * right[i];
+            settled = take_step(&tag, step, rules) <= rules->converged_px && taken <= rules->most_taken * left;
         }
         if (settled)
             write_tag(&tag, N, variance, result);

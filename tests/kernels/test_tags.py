@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels.reference.tags import picture
 
-from rigkit.detection.tags.whole import WHOLE_RULES
+from rigkit.detection.tags.whole import WHOLE_ROUNDS, WHOLE_RULES
 from rigkit.kernels.tags import fit_tags
 
 SERIES_PX = 8e-3
@@ -60,6 +60,19 @@ def test_sigmas_are_those_of_the_errors(rng: np.random.Generator) -> None:
         off.append((found[:8].reshape(4, 2) - MOVES) / found[8:12, None])
     # 800 numbers: 5 per cent are two standard deviations.
     assert 0.95 < np.sqrt(np.mean(np.square(off))) < 1.08
+
+
+def test_what_is_left_is_noise_where_corners_were_right_from_the_start(rng: np.random.Generator) -> None:
+    """Then the first step moves nothing, and the light is not fitted yet."""
+    maps, ink = told("straight")
+    image = picture((42, 40), maps, CENTRE, SCALE, np.zeros((4, 2)), ink, BREAKS, 0.76, 190.0, 160.0)
+    image = (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
+    found = fit_tags(
+        *(image, maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
+        *(np.array([0.76]), np.array([160.0]), np.array([1e-3]), WHOLE_ROUNDS[0]),
+    )[0]
+    # 250 pixels: their rms is known to a twentieth.
+    assert found[14] == pytest.approx(2.0, rel=0.15)
 
 
 def test_a_tag_outside_the_image_is_not_valid() -> None:
