@@ -10,6 +10,7 @@ import pytest
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import BenchScene, bench_camera, one_board
 from detection_bench.tag_bound import tag_information
+from detectors.degradations import degraded
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
@@ -197,3 +198,22 @@ def test_white_tags_are_found_where_black_ones_are_in_the_negative(squares: bool
     np.testing.assert_array_equal(found.pixels, negative.pixels)
     assert np.sqrt((errors(found, scene.truth()[0]) ** 2).sum(axis=1).mean()) < 0.05
     assert detect_boards(image, [black]) == ()
+
+
+def test_tags_that_light_parts_from_the_squares_between_them_are_sought_alone() -> None:
+    """Of the saddles a few are left, which say that it is this board."""
+    board, rng = Board("grid", 8, 8, 60.0, 60.0, pattern=AprilGrid(0.3)), np.random.default_rng(0)
+    scene = one_board(rng, board=board, size_px=(1280, 960))
+    clear = scene.render(blur_px=0.6, noise_levels=2.0, rng=rng)
+    image, _ = degraded("run over", 2.0, clear, rng)
+    (found,) = detect_boards(image, [board])
+    assert len(found.grid) == 64
+    off = found.pixels - scene.truth()[0].lattice()[found.grid[:, 1], found.grid[:, 0]]
+    assert np.sqrt(np.mean(off**2)) < 0.15
+
+
+def test_tags_without_squares_between_them_are_no_board_with_squares(rng: np.random.Generator) -> None:
+    board = Board("grid", 8, 8, 60.0, 60.0, pattern=AprilGrid(0.3, corner_squares=False))
+    image = one_board(rng, board=board).render(noise_levels=2.0, rng=rng)
+    assert detect_boards(image, [board])
+    assert not detect_boards(image, [replace(board, pattern=AprilGrid(0.3))])

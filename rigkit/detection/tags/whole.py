@@ -50,8 +50,8 @@ ROUGH_STEP_PX = 0.1
 """A step that ends a round after which tags are fitted again: what is left after it is a tenth of it."""
 
 MOST_TAKEN = 0.02
-"""The last step takes no more than this part of the squares that are left: sigmas are right to a hundredth. The light is
-not known beforehand, and one fitted a step later than the corners made sigmas up to four times too large."""
+"""The last step takes no more than this part of the squares that are left: sigmas are right to a hundredth. The light
+is not known beforehand, and one fitted a step later than the corners made sigmas up to four times too large."""
 
 
 def _rules(converged_px: float) -> TagRules:

@@ -68,7 +68,7 @@ class AprilGridFinder(Finder):
                 if len(alone) < MIN_SEEN_AT_FIRST or any(np.isfinite(pixels).any() for _, pixels in placed):
                     break
                 placed = list(_placed_by(alone, level, grey, joined))
-        yield from placed
+        yield from ((item, _or_lone_tags(grey, item, pixels)) for item, pixels in placed)
 
 
 def _placed_by(
@@ -81,6 +81,19 @@ def _placed_by(
         pixels, used = placed_lattices(image, lattices, item)
         lattices = [lattice for n, lattice in enumerate(lattices) if n not in used]
         yield item, pixels
+
+
+def _or_lone_tags(image: GreyImage, tags: TagBoard, pixels: FloatArray) -> FloatArray:
+    """Return the rough corners `pixels` (R, C, 2) of a board, or those of its tags as they are found alone, if more.
+
+    Light that runs over by pixels parts tags from the squares between them, and leaves few saddles. Without any it is
+    no board with such squares, and most pictures without boards need not be searched for tags.
+    """
+    known = int(np.count_nonzero(np.isfinite(pixels[..., 0])))
+    if not 0 < known < MIN_SEEN_AT_FIRST:
+        return pixels
+    alone = placed_tags(image, tags)
+    return alone if np.count_nonzero(np.isfinite(alone[..., 0])) > known else pixels
 
 
 def _confirmed(image: GreyImage, tags: TagBoard, seen: BoardDetection) -> bool:
