@@ -89,7 +89,9 @@ def board_sheet(board: Board, paper: str) -> PrintedSheet:
     lines += [(right, y0 + t, right - _tick(t), y0 + t) for t in np.arange(0.0, ruler_y + 1.0, RULER_STEP_MM)]
     name = board.describe()
     texts = (
-        (x0, bottom + 4.5, 0.0, f"rigkit: {name}. Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
+        (x0, bottom + 3.5, 0.0, f"Print at 100 %. This ruler should be {ruler_x:g} mm; measure it."),
+        # Of its own, from the left edge on: names may be nearly as long as a page is wide.
+        (UNPRINTABLE_MM, bottom + 6.9, 0.0, f"rigkit: {name}"),
         (right + 2.0, y0, 90.0, f"This ruler should be {ruler_y:g} mm."),
     )
     return PrintedSheet(

@@ -94,3 +94,13 @@ def test_tags_that_are_too_large_are_called_tags(tmp_path: Path) -> None:
     assert "12x12" not in str(caught.value)
     smaller = Board("b", 12, 12, 0.94 * 24.0, 0.94 * 24.0, pattern=AprilGrid(0.3))
     assert print_board(smaller, PrintOptions(output=tmp_path / "b", paper="A4"))
+
+
+@pytest.mark.parametrize("rows", [6, 12])
+def test_what_is_written_below_a_board_ends_before_the_page_does(rows: int) -> None:
+    pattern = AprilGrid(0.3, corner_squares=False)
+    sheet = board_sheet(Board("grid", 8, rows, 20.0, 20.0, pattern=pattern), "a4")
+    level = [(x, text) for x, _, turned, text in sheet.texts if turned == 0.0]
+    assert any("measure it" in text for _, text in level)
+    # Letters of 3 mm are half of that wide on average.
+    assert all(x + 1.6 * len(text) <= sheet.width_mm for x, text in level)
