@@ -109,9 +109,15 @@ def _common_size(session: Session, found: Mapping[str, FoundCorners]) -> tuple[i
     if len(counts) > 1 and ODD_SIZES * counts[1][1] >= len(counted_ones):
         first = {item.size_px: name for name, item in reversed(list(found.items()))}
         sizes = " and ".join(f"{w}x{h} px ({n}, such as '{first[w, h]}')" for (w, h), n in counts[:2])
+        turned = counts[0][0] == counts[1][0][::-1]
+        remedy = (
+            "some program turned part of them by a quarter: turn their pixels back to how the camera wrote them, or "
+            if turned
+            else "a camera at one setting has one size: "
+        )
         raise InputError(
-            f"{session.path}: images of {sizes}; a camera at one setting has one size: list only the images of one "
-            "size in 'images'"
+            f"{session.path}: images of {sizes}; {remedy}take the images of one size alone, in a folder of their own "
+            "or listed in 'images' of a session"
         )
     return counts[0][0]
 
