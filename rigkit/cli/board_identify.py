@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 from rigkit.core.errors import ExitCode, InputError
@@ -27,7 +28,7 @@ def identify(args: argparse.Namespace) -> int:
     ensure_writable(path, force=args.force, inputs=images)
     found = identify_board(images, progress=progress_on_stderr())
     board = found.board
-    print(f"{board.pattern.type}: {board.describe()}".replace("s 1 x 1 mm", "s of unknown size"))
+    print(f"{board.pattern.type}: {without_scale(board.describe())}")
     print(f"seen in {len(found.seen)} of {len(found.looked_at)} images")
     print(f"--board {found.words}   (MM: {board.pattern.size_meaning}, measured with a rule)")
     if found.beside:
@@ -51,3 +52,8 @@ def identify(args: argparse.Namespace) -> int:
     for error in found.unreadable:
         note(f"left out: {error}")
     return ExitCode.BAD_INPUT if found.unreadable else ExitCode.WELL
+
+
+def without_scale(words: str) -> str:
+    """Return the description of a board whose squares, tags or distances are of 1 mm, which stands for any size."""
+    return re.sub(r"([\d.]+) mm\b", r"\1 of that", words.replace(" 1 x 1 mm", " of unknown size"))

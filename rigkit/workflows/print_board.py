@@ -17,6 +17,8 @@ MAX_UNEVEN = 1.05
 """Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
 MAX_STRETCH = 2.0
 """Of a ruler: nobody prints so far from the true scale and wants it kept."""
+ENDINGS = (".pdf", ".svg", ".toml")
+"""Of what is written; a name that is given with one of them is meant without it, "board-25.4" is one as it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +26,7 @@ class PrintOptions:
     """Where a board to print goes."""
 
     output: Path
-    """Name of the files, which get the endings .pdf, .svg and, of a new board, .toml."""
+    """Name of the files, which get the endings .pdf, .svg and, of a new board, .toml, once."""
     paper: str = "a4"
     """a4, a3, a2, a1, a0, letter or tabloid."""
     force: bool = False
@@ -57,12 +59,10 @@ def print_board(board: Board | str | Path, options: PrintOptions) -> tuple[Path,
     layout = board if isinstance(board, Board) else load_layout(board)
     with about(layout.describe().split(", ")[0] if isinstance(board, Board) else board):
         sheet = board_sheet(layout, options.paper)
-    files: dict[Path, str | bytes] = {
-        Path(f"{options.output}.pdf"): pdf_bytes(sheet),
-        Path(f"{options.output}.svg"): svg_text(sheet),
-    }
+    name = options.output.with_suffix("") if options.output.suffix in ENDINGS else options.output
+    files: dict[Path, str | bytes] = {Path(f"{name}.pdf"): pdf_bytes(sheet), Path(f"{name}.svg"): svg_text(sheet)}
     if isinstance(board, Board):
-        own = Path(f"{options.output}.toml")
+        own = Path(f"{name}.toml")
         words = "nominal: print, measure both rulers, run rigkit board again"
         files[own] = board_text(replace(layout, board_id=own.stem), words, own)
     write_together(files, force=options.force)

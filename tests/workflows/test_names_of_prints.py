@@ -1,0 +1,38 @@
+"""`rigkit board`: names of what is written, and what is said of a board whose scale no image shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rigkit.cli.board_identify import without_scale
+from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
+from rigkit.core.patterns.circles import Circles
+from rigkit.workflows.print_board import PrintOptions, print_board
+
+
+@pytest.mark.parametrize(
+    ("given", "stem"), [("a.pdf", "a"), ("a.svg", "a"), ("a.toml", "a"), ("a-25.4", "a-25.4"), ("a", "a")]
+)
+def test_a_name_with_its_ending_has_it_once(given: str, stem: str, tmp_path: Path) -> None:
+    written = print_board(Board("x", 4, 3, 20.0, 20.0), PrintOptions(output=tmp_path / given))
+    assert [path.name for path in written] == [f"{stem}.pdf", f"{stem}.svg", f"{stem}.toml"]
+
+
+@pytest.mark.parametrize(
+    ("board", "said"),
+    [
+        (
+            Board("c", 7, 6, 1.0, 1.0, pattern=Circles(diameter_mm=0.6)),
+            "distance of unknown size, diameter 0.6 of that",
+        ),
+        (Board("m", 7, 5, 1.0, 1.0, pattern=Charuco("DICT_5X5_100", 0.74)), "markers 0.74 of that"),
+        (Board("b", 9, 6, 1.0, 1.0), "squares of unknown size"),
+    ],
+    ids=["circles", "charuco", "chessboard"],
+)
+def test_no_millimetres_without_a_scale(board: Board, said: str) -> None:
+    words = without_scale(board.describe())
+    assert said in words and "mm" not in words
