@@ -58,6 +58,11 @@ def keep_corners(path: Path, views: Views, *, named: bool = True) -> None:
         cache.save()
 
 
+def test_a_rig_has_no_moving_pupil(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(session), "--pupil", "moving"]) == 2
+    assert "those of a rig look from one point each" in capsys.readouterr().err
+
+
 def test_rig_from_kept_corners(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(session), "--json", "--report"]) == 0
     told = json.loads(capsys.readouterr().out)
