@@ -7,11 +7,8 @@ toolbox counts them from 1. Lengths in mm. `Calib_Results_stereo` and stereoPara
 
 from __future__ import annotations
 
-import io
 import re
-import zlib
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +17,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.interop.exchange import field, image_size, numbers
+from rigkit.interop.mat5 import OBJECTS, assignments_of
 from rigkit.interop.ocamcalib import camera_of_taylor
 from rigkit.interop.opencv import camera_from_arrays
 
@@ -28,10 +26,6 @@ Values = Mapping[str, FloatArray]
 
 MAT5, MAT73 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 """How files begin that save -v6 and -v7, and that save -v7.3 writes."""
-MAX_VALUES = 100
-"""Of an array: a camera's are smaller; corners and covariances are left out."""
-MAX_STRUCTURES = 6
-"""In each other; the toolbox's cameras have three."""
 MAT_SIGN = re.compile(
     r"^\s*(?:\w+\.)*(?:fc|fc_left|FocalLength|MappingCoefficients|IntrinsicMatrix|K)\s*=\s*\[|^% MATLAB\b", re.MULTILINE
 )
@@ -39,7 +33,6 @@ MAT_SIGN = re.compile(
 ASSIGNMENT = re.compile(r"^\s*([A-Za-z][\w.]*)\s*=\s*(\[[^\]]*\]|[-+.\w]+)\s*;?", re.MULTILINE)
 BOUGUET = ("fc", "cc", "kc", "alpha_c")
 """What a pair has of each side, with _left and _right behind."""
-OBJECTS = "% MATLAB objects:"
 
 
 def matlab_text(data: bytes, name: str) -> str | None:
@@ -51,20 +44,7 @@ def matlab_text(data: bytes, name: str) -> str | None:
         raise InputError(f"'{name}' was saved with -v7.3; save it in MATLAB with save(..., '-v7')")
     if not data.startswith(MAT5):
         return None
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        loaded = loadmat(io.BytesIO(data), struct_as_record=False, squeeze_me=True)
-    except (
-        MatReadError, ValueError, TypeError, LookupError, AttributeError, OSError, ArithmeticError, MemoryError,
-        NotImplementedError, zlib.error,
-    ) as error:  # fmt: skip
-        raise InputError(f"'{name}': not readable as a .mat file ({error}); is the file whole?") from error
-    lines: list[str] = []
-    for key, value in loaded.items():
-        _assignments(key, value, lines)
-    return "\n".join(["% MATLAB", *lines]) + "\n"
+    return assignments_of(data, name)
 
 
 def read_matlab(text: str, name: str = "camera.mat", size_px: SizePx | None = None) -> Camera:
@@ -114,25 +94,6 @@ def read_matlab_pair(
         # Older ones: points are rows, x2 = x1 R + t.
         R = R.reshape(3, 3).T if R.size == 9 else R
     return (left, right), _pose(numbers(R, name, "rotation", 9).reshape(3, 3), numbers(t, name, "translation", 3), name)
-
-
-def _assignments(key: str, value: Any, lines: list[str], depth: int = 0) -> None:
-    """Append what a variable holds: one line a small array, of a structure one a field."""
-    from scipy.io.matlab import MatlabFunction, MatlabOpaque, mat_struct
-
-    if key.startswith("__") or depth > MAX_STRUCTURES:
-        return
-    if isinstance(value, mat_struct):
-        for part in value._fieldnames:
-            _assignments(f"{key}.{part}", getattr(value, part), lines, depth + 1)
-        return
-    if isinstance(value, MatlabOpaque | MatlabFunction) or (isinstance(value, np.ndarray) and value.dtype.names):
-        lines.append(f"{OBJECTS} {key}")
-        return
-    array = np.asarray(value)
-    if array.dtype.kind in "iufb" and 0 < array.size <= MAX_VALUES:
-        rows = np.atleast_2d(array.astype(np.float64))
-        lines.append(f"{key} = [ {' ; '.join(' '.join(map(repr, row)) for row in rows.tolist())} ];")
 
 
 def _values(text: str, name: str) -> dict[str, FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -177,3 +178,40 @@ def test_cut_files_are_refused(tmp_path: Path) -> None:
         except InputError as error:
             refused += len(str(error).splitlines()) == 1
     assert refused > 0.5 * len(range(0, len(whole) - 1, 53))
+
+
+def _element(kind: int, data: bytes) -> bytes:
+    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+
+def test_objects_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    """As MATLAB writes them: the object, and behind it an array of bytes without a name."""
+    flags = [_element(6, struct.pack("<II", kind, 0)) for kind in (17, 9)]
+    opaque = b"".join([flags[0], _element(1, b"cameraParams"), _element(1, b"MCOS"), _element(1, b"cameraParameters")])
+    rest = b"".join([flags[1], _element(5, struct.pack("<ii", 1, 4)), _element(1, b""), _element(2, bytes(4))])
+    path = tmp_path / "camera.mat"
+    path.write_bytes(
+        b"MATLAB 5.0 MAT-file".ljust(124)
+        + struct.pack("<H", 0x0100)
+        + b"IM"
+        + _element(14, opaque)
+        + _element(14, rest)
+    )
+    with pytest.raises(InputError, match=r"'cameraParams' is an object.*toStruct\(cameraParams\)"):
+        import_camera(path)
+
+
+def test_damaged_bytes_are_refused_in_one_line(tmp_path: Path, rng: np.random.Generator) -> None:
+    """SciPy's reader ends the process on some of these."""
+    whole = [_saved(tmp_path / f"{k}.mat", c).read_bytes() for k, c in enumerate((INTRINSICS, BOUGUET))]
+    path, refused = tmp_path / "damaged.mat", 0
+    for k in range(300):
+        damaged = bytearray(whole[k % 2])
+        for place in rng.integers(128, len(damaged), 3):
+            damaged[place] = rng.integers(256)
+        path.write_bytes(damaged)
+        try:
+            import_camera(path)
+        except InputError as error:
+            refused += len(str(error).splitlines()) == 1
+    assert refused > 30
