@@ -85,8 +85,8 @@ def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:
         return []
     stored, raw = next(parts)
     values = np.frombuffer(raw, f"{order}{NUMBERS[stored]}").astype(np.float64).reshape(shape[::-1]).T
-    rows: list[list[float]] = values.tolist()
-    return [f"{key} = [ {' ; '.join(' '.join(map(repr, row)) for row in rows)} ];"]
+    rows = " ; ".join(" ".join(repr(float(value)) for value in row) for row in values)
+    return [f"{key} = [ {rows} ];"]
 
 
 def _word(raw: bytes) -> str:
