@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 
 HEADER_BYTES = 128
@@ -84,7 +85,8 @@ def _matrix(body: bytes, order: str, of: str, depth: int) -> list[str]:
     if flags not in NUMERIC or not 0 < count <= MAX_NUMBERS or shape.size != 2:
         return []
     stored, raw = next(parts)
-    values = np.frombuffer(raw, f"{order}{NUMBERS[stored]}").astype(np.float64).reshape(shape[::-1]).T
+    flat: FloatArray = np.frombuffer(raw, f"{order}{NUMBERS[stored]}").astype(np.float64)
+    values = flat.reshape(tuple(shape[::-1].tolist())).T
     rows = " ; ".join(" ".join(repr(float(value)) for value in row) for row in values)
     return [f"{key} = [ {rows} ];"]
 
