@@ -215,7 +215,7 @@ def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
     if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
         return False  # Nothing can be compared.
     if len(pairs) == 1:
-        return choose(again[0].observations, pairs[0], SURELY).name == "again"
+        return choose(pairs[0], SURELY).name == "again"
     return HeldOut.of(pairs).chosen() == "again"
 
 
@@ -290,7 +290,7 @@ def _others(tried: Lenses, model: str) -> list[Candidate]:
     own = [option for option in tried.options if option.fit.state.camera.model == model]
     if not own:
         return []
-    against = choose(tried.observations, own, SURELY)
+    against = choose(own, SURELY)
     return described([*(o for o in tried.options if o not in own), against], against)[:-1]
 
 

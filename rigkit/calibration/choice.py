@@ -10,7 +10,6 @@ import numpy as np
 from rigkit.calibration.departures import SMALLEST_PX
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.fit import Fit
-from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02
@@ -51,7 +50,7 @@ def settled(options: Sequence[Option]) -> Sequence[Option]:
     return [option for option in options if option.fit.convergence.converged] or options
 
 
-def choose(observations: Observations, options: Sequence[Option], surely: float | None = None) -> Option:
+def choose(options: Sequence[Option], surely: float | None = None) -> Option:
     """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
     (if given) `surely` standard errors of the difference; with too few images for that, the one with the smallest BIC.
     One whose solver was stopped is taken only where all were; two images leave too much open to say that of it.
@@ -63,7 +62,7 @@ def choose(observations: Observations, options: Sequence[Option], surely: float 
         return options[0]
     judged = [o for o in settled(options) if o.heldout is not None]
     if not judged:
-        return min(options, key=lambda o: _bic(observations, o))
+        return min(options, key=_bic)
     good = _as_good(np.array([o.heldout for o in judged]), surely)
     return min((o for o, fine in zip(judged, good, strict=True) if fine), key=lambda o: o.count)
 
@@ -143,7 +142,7 @@ class HeldOut:
         return dict(zip(self.names, share.tolist(), strict=True))
 
 
-def _bic(observations: Observations, option: Option) -> float:
+def _bic(option: Option) -> float:
     """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
     n = 2 * int(option.fit.kept.sum())
     error = option.fit.rms_px

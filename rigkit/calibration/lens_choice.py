@@ -40,7 +40,7 @@ class Lenses:
     @property
     def alone(self) -> Option:
         """The option that this camera alone would choose."""
-        return choose(self.observations, self.options, SURELY)
+        return choose(self.options, SURELY)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,7 +69,7 @@ def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
         if evidence.names:
             sizes.append(evidence.chosen())
         else:
-            sizes += {choose(c.observations, o, SURELY).name for c, o in zip(cameras, own, strict=True) if o}
+            sizes += {choose(options, SURELY).name for options in own if options}
     return sizes
 
 

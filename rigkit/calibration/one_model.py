@@ -49,12 +49,12 @@ def solved(
         options, failed = fit_all(observations, size_px, wanted, progress)
     observations = reweighted(observations, options)
     options = compared(observations, options, folds, progress)
-    chosen = choose(observations, options, SURELY)
+    chosen = choose(options, SURELY)
     beyond = [] if how.degree is not None else larger_sizes(chosen)
     if beyond:
         options, unfit = fit_all(observations, size_px, beyond, progress, options)
         options = compared(observations, options, folds, progress)
-        chosen, failed = choose(observations, options, SURELY), [*failed, *unfit]
+        chosen, failed = choose(options, SURELY), [*failed, *unfit]
     candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
     return Solved(
@@ -78,7 +78,7 @@ def with_board_shape(
         return observations, flat, [flat], []
     observations, flat, fits = _fit_shapes(observations, flat, board)
     shapes, spared = _shapes(observations, flat, fits, board, folds, progress)
-    chosen = choose(observations, shapes)
+    chosen = choose(shapes)
     candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
     # Corners that only another shape follows were taken in to compare the two, not to be believed.
     return observations, flat if chosen.name == flat.name else chosen, shapes, candidates

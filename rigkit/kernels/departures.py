@@ -9,8 +9,6 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-RADIAL_POWERS = header().constants["RADIAL_POWERS"]
-"""Powers of the radius (2, 4, ...) by which the image is stretched: no model has more terms that tell."""
 DISPLACEMENTS = header().constants["DISPLACEMENTS"]
 POSE = header().constants["POSE"]
 

@@ -23,7 +23,7 @@ def rig_tables(rig: RigCalibration, checks: Sequence[Check]) -> tuple[Table, ...
     if len(rig.cameras) > 1:
         tables += [_baselines(rig, checks), _mounts(rig)]
     tables.append(_intrinsics(rig))
-    tables += [_angles(rig, target, checks) for target in rig.board_rigs]
+    tables += [_angles(target, checks) for target in rig.board_rigs]
     if rig.left_out:
         heads, rows = columns("frame | board | why"), tuple(cells(*entry) for entry in rig.left_out)
         note = "Each camera's own calibration uses these views; the mounts do not rest on them."
@@ -127,7 +127,7 @@ def _baselines(rig: RigCalibration, checks: Sequence[Check]) -> Table:
     return Table("baselines", "Distances between the cameras", heads, tuple(rows), note)
 
 
-def _angles(rig: RigCalibration, target: BoardRig, checks: Sequence[Check]) -> Table:
+def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
     heads = columns(
         "boards | angle [deg] | measured [deg] | how | verdict | between first corners [mm] | between centres [mm]"
     )

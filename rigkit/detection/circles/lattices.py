@@ -134,7 +134,7 @@ def _labelled(blobs: Blobs, links: _Neighbours) -> LabelledBlobs | None:
         reached, first = np.unique(target[ahead], return_index=True)
         label[reached] = label[source[ahead[first]]] + step[first]
         basis[reached] = basis[source[ahead[first]]]
-        _refine(basis, reached, source, target, links.vector, hexagonal)
+        _refine(basis, reached, source, links.vector, hexagonal)
         known[reached] = True
     agreed = _agreed(label, known, basis, source, target, links.vector, hexagonal)
     if agreed.sum() < MIN_LABELLED:
@@ -185,9 +185,7 @@ def _steps(basis: FloatArray, vector: FloatArray, hexagonal: bool) -> tuple[IntA
     return step.astype(np.int64), fine & near & neighbour
 
 
-def _refine(
-    basis: FloatArray, which: IntArray, source: IntArray, target: IntArray, vector: FloatArray, hexagonal: bool
-) -> None:
+def _refine(basis: FloatArray, which: IntArray, source: IntArray, vector: FloatArray, hexagonal: bool) -> None:
     """Fit the bases of the blobs `which` to their own links, in place."""
     mine = np.isin(source, which)
     at = source[mine]
