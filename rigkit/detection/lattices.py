@@ -36,7 +36,7 @@ from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_co
 from rigkit.detection.subpixel.evened import LOOKED_AT_PX, evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
-from rigkit.detection.subpixel.subpixel import refine
+from rigkit.detection.subpixel.subpixel import Promise, refine
 from rigkit.detection.subpixel.whole_board import placed_together
 
 Promising = Callable[[GreyImage, Level, Lattice], bool]
@@ -52,10 +52,6 @@ SMEARED_CORNERS = 12
 
 SAME_PX = 4.0
 """Corners of one board placed in two ways lie nearer than this, px: strong blur moves them so much at most."""
-
-MORE_EVIDENCE = 0.5
-"""The second fit of small squares adds no more to the score of the evidence: on 21 boards, blurred by up to 4 px, from
--2.7 to 0.1, on 38 other lattices in real images 0.3 at most."""
 
 
 def find_lattices(
@@ -186,7 +182,7 @@ def fitted(
 
     Those whose blur is uneven are fitted where it is made even (`RefinedLattice.picture`).
     """
-    refined = refine(grey, boards, _may_be(sizes))
+    refined = refine(grey, boards, _promise(sizes, min_corners))
     found = _fitted(grey, boards, refined, min_corners, sizes)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
         # What is blurred beside a board that is sharp lies in the background.
@@ -197,16 +193,26 @@ def fitted(
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
         room = sizes if len(found) < len(sizes) else ()
-        again = refine(picture.grey, there, _may_be(room), radius_px=picture.radius_px)
+        again = refine(picture.grey, there, _promise(room, min_corners), radius_px=picture.radius_px)
         found = _with_better(
             found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, min_corners, room)]
         )
     return found
 
 
-def _may_be(sizes: Sequence[tuple[int, int]]) -> Callable[[RefinedLattice], bool]:
-    least_score = -MORE_EVIDENCE - (OF_EXPECTED_SIZE if sizes else 0.0)
-    return lambda item: Evidence.of(item).score > least_score
+def _promise(sizes: Sequence[tuple[int, int]], min_corners: int) -> Promise:
+    """Return the score that the evidence for a lattice is judged by, beside those that are placed (`_confirmed`)."""
+    every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
+
+    def score(item: RefinedLattice, placed: Sequence[tuple[Lattice, RefinedLattice]]) -> float:
+        own, (columns, rows) = Evidence.of(item).score, item.lattice.size
+        # Rows and columns may be too many for a board (`known_part`), but no more are found.
+        if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
+            return own
+        sure = sum(trustworthy(after, before.count, min_corners) for before, after in placed)
+        return own + OF_EXPECTED_SIZE if sure < len(sizes) else own
+
+    return score
 
 
 def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) -> list[RefinedLattice]:
@@ -247,7 +253,7 @@ def _fitted(
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
         own_parts = [part for part in alone if large(part, min_corners)]
-        out += _fitted(grey, own_parts, refine(grey, own_parts, _may_be(sizes)), min_corners, sizes)
+        out += _fitted(grey, own_parts, refine(grey, own_parts, _promise(sizes, min_corners)), min_corners, sizes)
     return out
 
 
@@ -301,7 +307,7 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], _may_be(()))
+    (refined,) = refine(grey, [sample], _promise((), 0))
     if trustworthy(refined, sample.count, 0):
         return True
     # Clutter leaves few corners.
@@ -309,5 +315,5 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
-    (again,) = refine(picture.grey, there, _may_be(()), radius_px=picture.radius_px)
+    (again,) = refine(picture.grey, there, _promise((), 0), radius_px=picture.radius_px)
     return trustworthy(again, sample.count, 0)

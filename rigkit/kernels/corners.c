@@ -42,6 +42,15 @@ INLINE int may_be_corner(
            response < (float)rules->quick_sharp * variance;
 }
 
+/* Ask for what the ring around pixel (u, v) is read from: peaks lie all over an image that no near cache holds. */
+INLINE void fetch_ring(const image_t image, int64_t u, int64_t v, int64_t reach)
+{
+    const int64_t left = u > reach ? u - reach : 0, top = v > reach ? v - reach : 0;
+    const int64_t bottom = v + reach < image.height ? v + reach : image.height - 1;
+    for (int64_t row = top; row <= bottom; row++)
+        __builtin_prefetch(image.brightness + row * image.width + left);
+}
+
 /* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
  * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
  * than `most_sharp`; `smeared` says which of these only motion explains. Returns the number of saddles and, in `found`, of corners. */
@@ -50,8 +59,12 @@ FOR_EACH_PROCESSOR int64_t find_corners(
     const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
     uint8_t *smeared, int64_t *found)
 {
+    enum { AHEAD = 6 };
+    const int64_t reach = (int64_t)radius + 1;
     int64_t near = 0, corners = 0;
     for (int64_t k = 0; k < count; k++) {
+        if (k + AHEAD < count)
+            fetch_ring(image, peaks[2 * (k + AHEAD)], peaks[2 * (k + AHEAD) + 1], reach);
         double *pixel = saddles + 2 * near;
         if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
             continue;

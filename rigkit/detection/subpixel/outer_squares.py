@@ -64,9 +64,12 @@ def fitted_beside_paper(
     fitted: Callable[[BoolArray, Geometry], EdgeFit],
     signs: FloatArray,
     owner: IntArray,
+    wanted: BoolArray | None = None,
 ) -> EdgeFit:
-    """Return the `fit` of N corners with those `fitted` again that see what lies beyond their board, `owner` (N,)."""
+    """Return the `fit` of N corners with those (of the `wanted`, (N,), where not all are) `fitted` again that see what
+    lies beyond their board, `owner` (N,); the same `fit` where none do."""
     again = beside_paper(geometry, fit, owner)
+    again = again if wanted is None else again & wanted
     moving = again
     for _ in range(PAPER_ROUNDS if again.any() else 0):
         beside = with_paper(image, geometry.of(again), fit.of(again), signs[again], owner[again])

@@ -31,10 +31,11 @@ from rigkit.detection.guided.guided import (
     SCATTER_FLOOR_PX,
 )
 from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.subpixel.consistent import DISPLACED_CELLS
 from rigkit.detection.subpixel.correlation import factor_rules
 from rigkit.detection.subpixel.edge_fit import edge_rules
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
-from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
+from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_FORETOLD_LIKENESS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import MAX_LEVERAGE, NEAREST_DEPTH, POINTS_A_TERM, SmoothMap, seen_surface

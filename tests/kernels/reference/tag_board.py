@@ -23,11 +23,12 @@ from rigkit.detection.guided.guided import (
 )
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import GreyImage, sample
+from rigkit.detection.subpixel.consistent import DISPLACED_CELLS
 from rigkit.detection.subpixel.correlation import sigma_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
-from rigkit.detection.subpixel.subpixel import DISPLACED_CELLS, FIRST_BLUR, FIRST_PASS, LAST_PASS
+from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
 from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
 from rigkit.detection.tags.corners import (
     BENT_SIGMAS,
