@@ -12,7 +12,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection import lattices as lattices_of_images
 from rigkit.detection.checks.evidence import OF_EXPECTED_SIZE, Evidence
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.subpixel import subpixel
+from rigkit.detection.subpixel import edge_fit, subpixel
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, refine
@@ -45,7 +45,7 @@ def scene() -> tuple[np.ndarray, Lattice, Lattice]:
 def fits(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that gets the number of corners of each fit from now on."""
     counts: list[int] = []
-    fit = subpixel.fit_edges
+    fit = edge_fit.fit_edges
 
     def counted(image: np.ndarray, pixels: FloatArray, *rest: object, **named: object) -> EdgeFit:
         counts.append(len(pixels))
