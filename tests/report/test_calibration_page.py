@@ -226,3 +226,18 @@ def test_what_a_bad_calibration_says_of_the_rest_of_the_image_is_no_advice(
     said = [_reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))]
     assert "px at worst outside" in said[1] and said[0].startswith(said[1].rstrip("."))
     assert advice in said[0] and advice not in said[1]
+
+
+@pytest.mark.parametrize("range_mm", [500.0, np.inf])
+def test_uncertainties_near_and_far_are_widened_where_few_images_tell_them(
+    calibration: Calibration, range_mm: float
+) -> None:
+    """What the images leave open grows by the square of the widening; what models leave out stays."""
+    pixels = np.array([[100.0, 80.0], [300.0, 200.0]])
+    known = [replace(calibration, freedom=freedom) for freedom in (2.0, 5.0, 500.0)]
+    a, b, many = (projection_uncertainty(c, pixels, range_mm=range_mm).covariance for c in known)
+    of_a, of_b, of_many = (c.widening**2 for c in known)
+    assert of_a > of_b > of_many
+    by_a, by_b = (a - many) / (of_a - of_many), (b - many) / (of_b - of_many)
+    np.testing.assert_allclose(by_a, by_b, rtol=1e-6)
+    assert (np.linalg.eigvalsh(by_a) > 0.0).all()
