@@ -46,7 +46,7 @@ def solved_with_pupil(found: Solved, how: How) -> Solved | None:
     if not options:
         return None
     options = compared(observations, options, how.folds, how.progress)
-    chosen = choose(observations, options, SURELY)
+    chosen = choose(options, SURELY)
     candidates = described(options, chosen)
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, how.board, how.folds, how.progress)
     return replace(
@@ -66,7 +66,7 @@ def against_central(central: Solved, moving: Solved, how: How) -> tuple[bool, li
     options = [replace(central.chosen, name=CENTRAL), replace(moving.chosen, name=MOVING)]
     if moving.observations is central.observations:
         options = compared(central.observations, options, how.folds, how.progress)
-    chosen = choose(central.observations, options, SURELY)
+    chosen = choose(options, SURELY)
     return chosen.name == MOVING, described(options, chosen)
 
 
