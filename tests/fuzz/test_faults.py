@@ -148,8 +148,9 @@ def test_a_full_disk(words: str, place: Path) -> None:
 def test_a_log_that_cannot_grow_does_not_end_the_work(place: Path) -> None:
     words = "board 5x4 --square-mm 20 -o q --log-file run.log"
     (place / "run.log").write_text("2026-01-01 00:00:00,000 DEBUG rigkit.cli.main: " + 552 * "x" + "\n")
-    program = rigkit(*words.split(), preexec_fn=_small_files)
-    _, said = program.communicate(timeout=PATIENCE_S)
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as text, small_files():
+        main(words.split())
+    said = text.getvalue()
     assert "Traceback" not in said and "Logging error" not in said and said.count("the log ends here") == 1
 
 
