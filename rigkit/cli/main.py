@@ -76,7 +76,7 @@ class _VerbParser(argparse.ArgumentParser):
 
 
 def build_parser(verb: str | None) -> argparse.ArgumentParser:
-    """Return the parser; only the module of `verb` is imported."""
+    """Return the parser; only the module of `verb` is imported, and only a word that is no verb needs all of them."""
     listed = "\n".join(f"  {name:<12} {summary}" for name, summary in VERBS.items())
     parser = argparse.ArgumentParser(
         prog="rigkit",
@@ -89,15 +89,17 @@ def build_parser(verb: str | None) -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(
         dest="verb", metavar="VERB", prog="rigkit", required=True, parser_class=_VerbParser, help=argparse.SUPPRESS
     )
-    for name, summary in VERBS.items():
-        sub = verbs.add_parser(name)
-        if name == verb:
-            module = importlib.import_module(f"rigkit.cli.{name}")
-            sub.description = (module.__doc__ or summary).partition(": ")[2]
-            sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[name]}"
-            module.add_arguments(sub)
-            add_log_arguments(sub)
-            sub.set_defaults(run=module.run)
+    if verb not in VERBS:
+        for name in VERBS:
+            verbs.add_parser(name)
+        return parser
+    sub = verbs.add_parser(verb)
+    module = importlib.import_module(f"rigkit.cli.{verb}")
+    sub.description = (module.__doc__ or VERBS[verb]).partition(": ")[2]
+    sub.formatter_class, sub.epilog = argparse.RawDescriptionHelpFormatter, f"examples:\n{EXAMPLES[verb]}"
+    module.add_arguments(sub)
+    add_log_arguments(sub)
+    sub.set_defaults(run=module.run)
     return parser
 
 
