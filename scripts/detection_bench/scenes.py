@@ -113,10 +113,11 @@ class BenchScene:
         rng: np.random.Generator | None = None,
         photometry: Photometry | None = None,
         optics: Optics | None = None,
+        supersample: int = 4,
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Return the image; `optics` and `photometry` win over `blur_px` and `noise_levels`."""
+        """Return the image; `optics` wins over `blur_px` and `supersample`, `photometry` over `noise_levels`."""
         photometry = photometry or replace(BENCH_PHOTOMETRY, noise_levels=noise_levels)
-        return develop(self.radiance(optics or Optics(blur_px)), photometry, rng)
+        return develop(self.radiance(optics or Optics(blur_px, supersample=supersample)), photometry, rng)
 
 
 def bench_camera(lens: str, size_px: tuple[int, int] = (640, 480)) -> Camera:

@@ -106,7 +106,7 @@ def test_from_images_to_a_calibration(tmp_path: Path, capsys: pytest.CaptureFixt
     for seed in range(6):
         rng = np.random.default_rng(seed)
         scene = one_board(rng, board=board, square_px=34.0, max_tilt_deg=40.0)
-        image = scene.render(noise_levels=2.0, rng=rng)
+        image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
         if seed % 2:
             image[:, : 40 * seed] = 90
         cv2.imwrite(str(folder / f"{seed}.png"), image)

@@ -31,7 +31,7 @@ def test_salt_and_pepper(share: float) -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
         scene = one_board(rng)
-        image = with_salt(scene.render(noise_levels=2.0, rng=rng), share, rng)
+        image = with_salt(scene.render(supersample=2, noise_levels=2.0, rng=rng), share, rng)
         scores.append(score(scene, [FoundBoard.of(item) for item in detect_boards(image)]))
     total = Score.sum(scores)
     assert (total.false_boards, total.wrong_indices) == (0, 0)
@@ -42,13 +42,13 @@ def test_salt_and_pepper(share: float) -> None:
 
 def test_a_line_that_loses_one_pixel_in_seventeen(rng: np.random.Generator) -> None:
     scene = one_board(rng)
-    (found,) = detect_boards(with_salt(scene.render(noise_levels=2.0, rng=rng), 0.06, rng))
+    (found,) = detect_boards(with_salt(scene.render(supersample=2, noise_levels=2.0, rng=rng), 0.06, rng))
     assert score(scene, [FoundBoard.of(found)]).recall > 0.95
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_bad_pixels_and_no_others_are_replaced(dtype: type, rng: np.random.Generator) -> None:
-    clean = three_boards(rng).render(noise_levels=2.0, rng=rng)
+    clean = three_boards(rng).render(supersample=2, noise_levels=2.0, rng=rng)
     spoiled = with_salt(clean, 0.01, rng)
     repaired = without_bad_pixels(spoiled.astype(dtype))
     assert repaired.dtype == dtype

@@ -72,7 +72,7 @@ def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) ->
     for seed in range(3):
         rng = np.random.default_rng(seed)
         scene = one_board(rng, lens=lens, board=BOARD)
-        image = scene.render(noise_levels=2.0, rng=rng)
+        image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
         truth = scene.truth()[0]
         (found,) = detect_boards(image, [BOARD])
         assert found.board_id == "c"
@@ -94,7 +94,7 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     placed = scene.boards[0]
     cover = Panel(placed.world_from_board @ Rigid3(np.eye(3), np.array([120.0, 60.0, -2.0])), 70.0, 300.0, 0.4)
     scene = replace(scene, occluders=(cover,))
-    found = detect_boards(scene.render(noise_levels=2.0, rng=rng), [BOARD])
+    found = detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), [BOARD])
     assert found[0].board_id == "c"
     assert not found[0].complete
     off = np.linalg.norm(errors(found[0], scene.truth()[0]), axis=1)
@@ -120,7 +120,7 @@ def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng:
     truth = scene.truth()[0].lattice()
     part = truth.copy()
     part[:, 4:] = np.nan
-    grown = beside_markers(grey_image(scene.render(noise_levels=2.0, rng=rng)), part, BOARD)
+    grown = beside_markers(grey_image(scene.render(supersample=2, noise_levels=2.0, rng=rng)), part, BOARD)
     added = np.isfinite(grown[..., 0])
     # At its corners hardly more than the tip of a marker is covered.
     assert not added[1:4, 6].any() and not added[2, 5:8].any()
@@ -131,7 +131,7 @@ def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng:
 @pytest.mark.parametrize("declared", [Charuco("DICT_5X5_100", 21.0, legacy=True), Charuco("DICT_6X6_100", 21.0)])
 def test_squares_of_another_board_name_none(declared: Charuco, rng: np.random.Generator) -> None:
     board = replace(BOARD, rows=5)
-    image = one_board(rng, board=board, max_tilt_deg=20.0).render(noise_levels=2.0, rng=rng)
+    image = one_board(rng, board=board, max_tilt_deg=20.0).render(supersample=2, noise_levels=2.0, rng=rng)
     assert not any(item.board_id for item in detect_boards(image, [replace(board, pattern=declared)]))
 
 
@@ -160,7 +160,7 @@ def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.G
     left = PlacedBoard(boards[0], Rigid3(turn, np.array([-20.0, 60.0, 500.0])))
     right = PlacedBoard(boards[1], Rigid3(np.eye(3), np.array([50.0, -60.0, 500.0])))
     scene = BenchScene("two", (left, right), (), camera)
-    found = {d.board_id: d for d in detect_boards(scene.render(noise_levels=2.0, rng=rng), boards[::-1])}
+    found = {d.board_id: d for d in detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), boards[::-1])}
     assert set(found) == set(names)
     for truth in scene.truth():
         assert np.abs(errors(found[truth.board_id], truth)).max() < 0.2
@@ -168,7 +168,7 @@ def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.G
 
 def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) -> None:
     scene = one_board(rng, board=BOARD)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     (found,) = detect_boards(image, [Board("plain", 9, 6, 30.0, 30.0)])
     assert (found.board_id, found.complete) == ("plain", True)
     truth = scene.truth()[0]
@@ -178,7 +178,7 @@ def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) ->
 
 def test_a_chessboard_is_no_charuco_board(rng: np.random.Generator) -> None:
     scene = one_board(rng, board=Board("plain", 9, 6, 30.0, 30.0))
-    (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [BOARD])
+    (found,) = detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), [BOARD])
     assert found.board_id is None
 
 

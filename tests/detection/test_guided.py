@@ -78,7 +78,7 @@ def test_a_ruler_across_a_board_hides_only_what_it_covers(lens: str) -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)
         scene = ruler_scene(rng, lens)
-        image = scene.render(noise_levels=2.0, rng=rng)
+        image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
         for name, found in (
             ("plain", detect_boards(image)),
             ("board", detect_boards(image, [BOARD])),
@@ -103,7 +103,7 @@ def missing(found: BoardDetection, drop: np.ndarray) -> BoardDetection:
 @pytest.mark.parametrize("camera_known", [True, False])
 def test_corners_forgotten_are_found_again(camera_known: bool, rng: np.random.Generator) -> None:
     scene = one_board(rng, lens="fisheye", board=BOARD)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     found = whole(detect_boards(image, [BOARD]))
     assert found is not None
     assert found.complete
@@ -117,7 +117,7 @@ def test_corners_forgotten_are_found_again(camera_known: bool, rng: np.random.Ge
 def test_a_wrong_camera_is_left_aside(rng: np.random.Generator) -> None:
     scene = one_board(rng, lens="fisheye", board=BOARD, square_px=28.0)
     other: Camera = one_board(rng, lens="regular", board=BOARD).camera
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     plain, with_other = detect_boards(image, [BOARD]), detect_boards(image, [BOARD], camera=other)
     assert len(plain) == len(with_other) == 1
     assert np.array_equal(plain[0].pixels, with_other[0].pixels)
@@ -125,7 +125,7 @@ def test_a_wrong_camera_is_left_aside(rng: np.random.Generator) -> None:
 
 def test_boards_of_other_sizes_come_back_as_they_are(rng: np.random.Generator) -> None:
     scene = one_board(rng, board=BOARD)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     found = detect_boards(image)
     assert complete_boards(image, found, [Board("other", 7, 5, 30.0, 30.0)], scene.camera) == found
     with pytest.raises(InputError, match="image:"):
@@ -136,7 +136,7 @@ def test_boards_of_other_sizes_come_back_as_they_are(rng: np.random.Generator) -
 def test_what_is_covered_stays_missing(camera_known: bool, rng: np.random.Generator) -> None:
     """Two blots with edges of their own over corners of the last columns; the third corner forgotten is in sight."""
     scene = one_board(rng, board=BOARD, square_px=34.0, max_tilt_deg=20.0)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     found = whole(detect_boards(image, [BOARD]))
     assert found is not None
     assert found.complete
@@ -169,7 +169,7 @@ class Cut:
 
 def test_corners_at_the_end_of_the_lens_model_stay_as_they_are(rng: np.random.Generator) -> None:
     scene = one_board(rng, lens="fisheye", board=BOARD)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     (found,) = detect_boards(image, [BOARD])
     camera = Cut(scene.camera, np.quantile(found.pixels[:, 0], 0.8))
     (again,) = complete_boards(image, [found], [BOARD], camera)  # type: ignore[arg-type]

@@ -66,7 +66,7 @@ def test_corners_of_rendered_boards(
     board: Board, lens: str, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = one_board(rng, lens=lens, board=board)
-    assert compared(scene.render(noise_levels=2.0, rng=rng), scene.boards[0].board, monkeypatch) >= 79
+    assert compared(scene.render(supersample=2, noise_levels=2.0, rng=rng), scene.boards[0].board, monkeypatch) >= 79
 
 
 @pytest.mark.parametrize("missing", [0.6, 0.8])
@@ -74,25 +74,25 @@ def test_missing_corners_are_found_by_the_same_rounds(
     missing: float, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = one_board(rng, lens="fisheye", board=KALIBR)
-    image = scene.render(blur_px=2.0, noise_levels=2.0, rng=rng)
+    image = scene.render(blur_px=2.0, supersample=2, noise_levels=2.0, rng=rng)
     assert compared(image, scene.boards[0].board, monkeypatch, missing=missing) >= 40
 
 
 def test_noise_that_neighbours_share(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = one_board(rng, lens="regular", board=KALIBR)
-    image = cv2.GaussianBlur(scene.render(noise_levels=6.0, rng=rng), (0, 0), 0.8)
+    image = cv2.GaussianBlur(scene.render(supersample=2, noise_levels=6.0, rng=rng), (0, 0), 0.8)
     assert compared(image, scene.boards[0].board, monkeypatch) >= 79
 
 
 def test_a_camera_tells_the_same_corners(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = one_board(rng, lens="fisheye", board=KALIBR)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     assert compared(image, scene.boards[0].board, monkeypatch, camera=scene.camera, missing=0.5) >= 70
 
 
 def test_corners_beside_what_covers_them(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = one_board(rng, lens="regular", board=KALIBR)
-    image = scene.render(noise_levels=2.0, rng=rng)
+    image = scene.render(supersample=2, noise_levels=2.0, rng=rng)
     u, v = (int(part) for part in scene.truth()[0].pixels.mean(axis=0))
     image[v - 12 : v + 12, u - 60 : u + 60] = 128
     assert compared(image, scene.boards[0].board, monkeypatch) >= 40

@@ -24,7 +24,7 @@ BLUR_PX, NOISE_LEVELS = 4.0, 10.0
 @pytest.mark.parametrize("pattern", [AprilGrid(0.3), Charuco("DICT_4X4_50", 30.0)])
 def test_two_boards_alike_are_told(pattern: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = Board("b", 8, 6, 40.0, 40.0, pattern=pattern)
-    picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render()
+    picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render(supersample=2)
     for name, image in (("one.png", picture), ("two.png", np.hstack([picture, picture]))):
         path = tmp_path / name
         cv2.imwrite(str(path), np.asarray(image))
@@ -57,7 +57,7 @@ def mirrored(image: np.ndarray) -> np.ndarray:
 def test_marks_in_a_mirror_cannot_be_read(pattern: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     board = Board("b", 8, 6, 40.0, 40.0, pattern=pattern)
     for k in range(2):
-        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render())
+        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render(supersample=2))
         cv2.imwrite(str(tmp_path / f"{k}.png"), mirrored(picture))
     assert main(["board", "identify", str(tmp_path)]) == 1
     assert "the images are mirrored: '0.png' shows its board only" in capsys.readouterr().err
@@ -69,7 +69,7 @@ def test_negatives_of_tags_are_white_tags(tmp_path: Path, capsys: pytest.Capture
     """A board declared black on white is not found, and why is said."""
     board = Board("b", 8, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
     for k in range(2):
-        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render(), np.uint8)
+        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render(supersample=2), np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), 255 - picture)
     assert main(["board", "identify", str(tmp_path)]) == 0
     assert "--board aprilgrid:4x3xMM,spacing=0.3,inverted=true" in capsys.readouterr().out
@@ -78,7 +78,7 @@ def test_negatives_of_tags_are_white_tags(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_a_chessboard_in_a_mirror_is_a_chessboard(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = np.asarray(one_board(np.random.default_rng(0), board=Board("b", 8, 6, 40.0, 40.0)).render())
+    picture = np.asarray(one_board(np.random.default_rng(0), board=Board("b", 8, 6, 40.0, 40.0)).render(supersample=2))
     cv2.imwrite(str(tmp_path / "0.png"), mirrored(picture))
     assert main(["board", "identify", str(tmp_path)]) == 0
     assert "--board 8x6xMM" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_a_chessboard_in_a_mirror_is_a_chessboard(tmp_path: Path, capsys: pytest
 def test_a_grid_too_blurred_to_be_believed_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With its size given it may be found."""
     scene = one_board(np.random.default_rng(0), board=Board("b", 8, 6, 20.0, 20.0), size_px=(320, 240))
-    picture = np.asarray(scene.render(), np.float32)
+    picture = np.asarray(scene.render(supersample=2), np.float32)
     noise = np.random.default_rng(1).normal(0.0, NOISE_LEVELS, picture.shape)
     worse = np.clip(cv2.GaussianBlur(picture, (0, 0), BLUR_PX) + noise, 0.0, 255.0)
     cv2.imwrite(str(tmp_path / "0.png"), worse.astype(np.uint8))
@@ -147,7 +147,7 @@ def test_a_folder_of_two_boards(tmp_path: Path, capsys: pytest.CaptureFixture[st
     """Half of the images show one, half the other; calibration takes the images of one size that show its board."""
     boards = [Board("a", 8, 6, 40.0, 40.0, pattern=AprilGrid(0.3)), Board("b", 8, 6, 40.0, 40.0)]
     for k in range(4):
-        picture = one_board(np.random.default_rng(k), board=boards[k % 2], max_tilt_deg=10.0).render()
+        picture = one_board(np.random.default_rng(k), board=boards[k % 2], max_tilt_deg=10.0).render(supersample=2)
         cv2.imwrite(str(tmp_path / f"{k}.png"), np.asarray(picture))
     assert main(["board", "identify", str(tmp_path)]) == 0
     out = capsys.readouterr().out
