@@ -76,11 +76,14 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
     paper = outline_mm(board)
     middle = paper.mean(axis=0)
     spot = np.stack([u * width, v * height], axis=-1) - 0.5
+    moving = np.arange(len(spot))
     for _ in range(MOVES):
-        held, seen = _placed(camera, board, spot, facing, square_px, middle)
+        held, seen = _placed(camera, board, spot[moving], facing[moving], square_px[moving], middle)
         points = held.in_cam(paper)
         pixels, valid = camera.project(points)
-        spot = spot + _back_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
+        push = _back_inside(camera, pixels, valid & seen[:, None] & _in_field(points, reach.field_deg))
+        spot[moving] += push
+        moving = moving[push.any(axis=1)]
     held, good = _placed(camera, board, spot, facing, square_px, middle)
     good &= sees_held(camera, board, held, reach)
     distance = np.linalg.norm(held.rotation @ middle + held.translation_mm, axis=-1)
