@@ -234,16 +234,18 @@ def _refine(
         descent = -(transposed @ residual[..., None])[..., 0]
         return BatchedProblem(transposed @ jacobian, descent, (residual**2).sum(axis=1))
 
-    def moved(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
-        return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
-
     def small(poses: tuple[FloatArray, ...], step: FloatArray) -> BoolArray:
         moved_by = np.abs(step[:, 3:]).max(axis=1) / np.linalg.norm(poses[1], axis=1)
         return np.asarray(np.abs(step[:, :3]).max(axis=1) + moved_by < POSE_STEP_TOLERANCE)
 
     start = (rotation, translation)
-    found, cost = minimise_each(start, linearise, moved, BOARD_DAMPING, STOP, small=small, until_all=True)
+    found, cost = minimise_each(start, linearise, stepped, BOARD_DAMPING, STOP, small=small, until_all=True)
     return found[0], found[1], cost
+
+
+def stepped(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
+    """Return poses (N, 3, 3), (N, 3) after steps (N, 6), as solvers step: R <- exp(w) R, t <- t + dt."""
+    return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
 
 
 def _differ(rotation: FloatArray, translation: FloatArray, flat: FloatArray, cost: FloatArray) -> bool:

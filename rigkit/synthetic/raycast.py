@@ -299,12 +299,11 @@ def _bounding_box(cx: FloatArray, cy: FloatArray, surface: Surface, per_pixel: i
 
     `cx`, `cy` : where the first sub-sample of every pixel meets the plane.
     """
-    near = (cx >= surface.low[0]) & (cx <= surface.high[0]) & (cy >= surface.low[1]) & (cy <= surface.high[1])
     if min(cx.shape) < 2:
         return (slice(None), slice(None))
     # A rectangle narrower than a pixel falls between the corners: look a pixel further along each axis.
     step_x, step_y = (np.hypot(*np.gradient(c)) for c in (cx, cy))
-    near |= (
+    near = (
         (cx >= surface.low[0] - step_x)
         & (cx <= surface.high[0] + step_x)
         & (cy >= surface.low[1] - step_y)

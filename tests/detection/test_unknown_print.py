@@ -43,7 +43,9 @@ def test_tags_whose_edges_have_moved(pattern: AprilGrid, moved_px: int, rough: b
     images = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        seen = one_board(rng, board=board, max_tilt_deg=35.0).render(optics=Optics(0.6, supersample=2), noise_levels=2.0, rng=rng)
+        seen = one_board(rng, board=board, max_tilt_deg=35.0).render(
+            optics=Optics(0.6, supersample=2), noise_levels=2.0, rng=rng
+        )
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(moved_px) + 1,) * 2)
         run = (cv2.dilate if moved_px > 0 else cv2.erode)(np.asarray(seen, np.uint8), disc)
         images.append(grey_image(cv2.GaussianBlur(run, (0, 0), 0.6)))
@@ -89,7 +91,9 @@ def straight(board: Board) -> list[GreyImage]:
     """Return images of 720 x 520 px of a board with squares of 50 px, corners from row 110 on."""
     camera = Pinhole((720, 520), np.array([500.0, 500.0, 110.0, 110.0]))
     places = [PlacedBoard(board, Rigid3(np.eye(3), [shift, 0.0, 600.0])) for shift in (0.0, 30.0)]
-    return [grey_image(render([place], camera, Rigid3.identity(), optics=Optics(0.6, supersample=2))) for place in places]
+    return [
+        grey_image(render([place], camera, Rigid3.identity(), optics=Optics(0.6, supersample=2))) for place in places
+    ]
 
 
 @pytest.mark.parametrize("board", [MARKED, LEGACY], ids=["today", "legacy"])

@@ -69,7 +69,9 @@ def test_negatives_of_tags_are_white_tags(tmp_path: Path, capsys: pytest.Capture
     """A board declared black on white is not found, and why is said."""
     board = Board("b", 8, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
     for k in range(2):
-        picture = np.asarray(one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render(supersample=2), np.uint8)
+        picture = np.asarray(
+            one_board(np.random.default_rng(k), board=board, max_tilt_deg=10.0).render(supersample=2), np.uint8
+        )
         cv2.imwrite(str(tmp_path / f"{k}.png"), 255 - picture)
     assert main(["board", "identify", str(tmp_path)]) == 0
     assert "--board aprilgrid:4x3xMM,spacing=0.3,inverted=true" in capsys.readouterr().out

@@ -13,7 +13,8 @@ from rigkit.calibration.solving.radial_alignment import align
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, Mat3, Points
-from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation
+from rigkit.geometry.board_pose import stepped
+from rigkit.geometry.rotation import log_so3, nearest_rotation
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
@@ -59,17 +60,13 @@ def refine_each(
         normal = linearise(*poses)
         return BatchedProblem(normal.pp, normal.p, normal.costs)
 
-    def moved(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
-        return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
-
     stop = Stop(steps=MAX_POSE_ITERATIONS, promise=tolerance)
-    found, cost = minimise_each((rotation, translation_mm), around, moved, VIEW_DAMPING, stop)
+    found, cost = minimise_each((rotation, translation_mm), around, stepped, VIEW_DAMPING, stop)
     return found[0], found[1], cost
 
 
 def steps_between(before: tuple[Mat3, Points], after: tuple[Mat3, Points]) -> FloatArray:
-    """Return the steps (N, 6) that take poses `before` to those `after`, (N, 3, 3) and (N, 3) each, as solvers step:
-    R <- exp(w) R, t <- t + dt."""
+    """Return the steps (N, 6) that take poses `before` to those `after`, (N, 3, 3) and (N, 3) each: see `stepped`."""
     return np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
 
 
