@@ -8,7 +8,14 @@ import pytest
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.geometry.board_pose import board_pose, board_poses, moved_board_poses, ray_residuals, tangent_bases
+from rigkit.geometry.board_pose import (
+    board_pose,
+    board_poses,
+    moved_board_poses,
+    ray_residuals,
+    stepped,
+    tangent_bases,
+)
 from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 
 EXACT_ROTATION_RAD = 1e-9
@@ -179,3 +186,18 @@ def test_bad_input() -> None:
         board_pose(rays, points, np.zeros(48))
     with pytest.raises(InputError, match="points_mm"):
         board_pose(rays, points[:5])
+
+
+def test_a_step_is_that_of_which_residuals_have_their_derivatives(rng: np.random.Generator) -> None:
+    """A wrong one only slows a solver down, which takes no step that makes a pose worse."""
+    points = np.array([[0.0, 0.0, 0.0], [60.0, 0.0, 0.0], [60.0, 40.0, 0.0], [0.0, 40.0, 0.0], [25.0, 30.0, 0.0]])
+    rotation, translation = exp_so3(np.array([[0.3, -0.2, 0.1]])), np.array([[-20.0, -10.0, 300.0]])
+    rays = unit(points @ rotation[0].T + translation[0] + rng.normal(0.0, 1.0, (5, 3)))
+    bases = tangent_bases(rays)
+    _, jacobian = ray_residuals(rays, bases, points, rotation, translation)
+    for k, size in enumerate((1e-6, 1e-6, 1e-6, 1e-3, 1e-3, 1e-3)):
+        step = size * np.eye(6)[k : k + 1]
+        ahead, back = (
+            ray_residuals(rays, bases, points, *stepped((rotation, translation), s))[0] for s in (step, -step)
+        )
+        np.testing.assert_allclose((ahead - back) / (2.0 * size), jacobian[..., k], rtol=1e-6, atol=1e-9)
