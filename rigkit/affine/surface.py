@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.core.arrays import Affines, FloatArray
+from rigkit.core.arrays import Affines, BoolArray, FloatArray, Normals
 
 
 class LinearGauge(NamedTuple):
@@ -49,3 +49,21 @@ def linear_gauge(J1: FloatArray, J2: FloatArray) -> LinearGauge:
         G[..., row, 1] = (jv * uu - ju * uv) * inverse
         h[..., row] = jx * d[..., 0] + jy * d[..., 1] + jz * d[..., 2]
     return LinearGauge(G, h, d)
+
+
+def affines_from_normals(J1: FloatArray, J2: FloatArray, normals: Normals) -> tuple[Affines, BoolArray]:
+    """Return A21 (..., 2, 2) of surfaces with `normals` (..., 3; any length and sign), and where it is defined.
+
+    Undefined (NaN) where camera 1 sees the surface edge-on. J1, J2: d pixel / d point (..., 2, 3) in the normals'
+    frame.
+    """
+    G, h, d = linear_gauge(J1, J2)
+    n = np.asarray(normals, dtype=np.float64)
+    uu, uv, vv = (np.sum(J1[..., i, :] * J1[..., j, :], axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    nu, nv, nd = np.sum(J1[..., 0, :] * n, axis=-1), np.sum(J1[..., 1, :] * n, axis=-1), np.sum(n * d, axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / ((uu * vv - uv * uv) * nd)
+        y = np.stack([(nu * vv - nv * uv) * scale, (nv * uu - nu * uv) * scale], axis=-1)
+        A21 = G - h[..., :, None] * y[..., None, :]
+    valid = np.isfinite(A21).all(axis=(-2, -1))
+    return np.where(valid[..., None, None], A21, np.nan), valid

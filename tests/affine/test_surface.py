@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.affine_scenes import FISHEYE, REGULAR, Corners, affines_from_normals, see
+from helpers.affine_scenes import FISHEYE, REGULAR, Corners, see
 from tolerances import EXACT_REL, ROUNDING
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.surface import linear_gauge
+from rigkit.affine.surface import affines_from_normals, linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit

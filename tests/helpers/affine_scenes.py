@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from rigkit.affine.affinities import EpipolarNormals
-from rigkit.affine.surface import linear_gauge
+from rigkit.affine.surface import affines_from_normals
 from rigkit.cameras.base import Camera
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
@@ -20,24 +20,6 @@ REGULAR = Pinhole((1600, 1240), np.array([1350.0, 1350.0, 800.0, 620.0]))
 FISHEYE = KannalaBrandt((1600, 1240), np.array([560.0, 556.0, 798.0, 622.0, -0.02, 0.004, -0.002, 0.0003]))
 SQUARE_MM = 40.0
 GRID = np.stack(np.meshgrid(np.arange(6.0), np.arange(8.0)), axis=-1).reshape(-1, 2) * SQUARE_MM
-
-
-def affines_from_normals(J1: np.ndarray, J2: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return A21 (..., 2, 2) of surfaces with `normals` (..., 3; any length and sign), and where it is defined.
-
-    Undefined (NaN) where camera 1 sees the surface edge-on. J1, J2: d pixel / d point (..., 2, 3) in the normals'
-    frame.
-    """
-    G, h, d = linear_gauge(J1, J2)
-    n = np.asarray(normals, dtype=np.float64)
-    uu, uv, vv = (np.sum(J1[..., i, :] * J1[..., j, :], axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    nu, nv, nd = np.sum(J1[..., 0, :] * n, axis=-1), np.sum(J1[..., 1, :] * n, axis=-1), np.sum(n * d, axis=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / ((uu * vv - uv * uv) * nd)
-        y = np.stack([(nu * vv - nv * uv) * scale, (nv * uu - nu * uv) * scale], axis=-1)
-        A21 = G - h[..., :, None] * y[..., None, :]
-    valid = np.isfinite(A21).all(axis=(-2, -1))
-    return np.where(valid[..., None, None], A21, np.nan), valid
 
 
 @dataclass(frozen=True)
