@@ -211,3 +211,14 @@ def test_a_board_that_may_bow_is_shown_turned() -> None:
     flat_gain, warp_gain = (unknown(k, same) / unknown(k, turned) for k in (known, unsure))
     assert warp_gain > 2.0 * flat_gain
     assert unknown(unsure, turned) > unknown(known, turned)
+
+
+def test_boards_are_pushed_until_they_are_in_the_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A push brings most of them in, and further ones those that the first left half outside (1576, 1851 poses)."""
+    monkeypatch.setattr("rigkit.planning.candidates.CANDIDATES_KEPT", 9999)
+    camera, board = Pinhole((640, 480), np.array([545.0, 545.0, 318.0, 242.0])), Board("a", 9, 6, 25.0, 25.0)
+    counts = []
+    for moves in (1, 5):
+        monkeypatch.setattr("rigkit.planning.candidates.MOVES", moves)
+        counts.append(len(held_boards(camera, board, Reach())))
+    assert counts[1] > 1.1 * counts[0]
