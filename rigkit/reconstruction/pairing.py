@@ -71,10 +71,10 @@ class MatchedPair:
         noise = DirectionNoise(self.noise.covariance1 * factor**2, self.noise.covariance2 * factor**2)
         return replace(self, captured=scaled(self.captured), matches=scaled(self.matches), noise=noise)
 
-    def in_chain(self, chain: Chain, *, support: Support = "patch") -> MatchedPair:
+    def in_chain(self, chain: Chain, *, support: Support = "patch", window: int | None = 2) -> MatchedPair:
         """Return the same corners, identified as they are, in the coordinates of another chain; see `match_pair`."""
         both = (self.camera1, self.camera2)
-        return _matched(self.pair_id, *both, self.boards, self.identity, chain, support)
+        return _matched(self.pair_id, *both, self.boards, self.identity, chain, support, window)
 
 
 def match_pair(
