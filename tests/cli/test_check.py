@@ -158,7 +158,7 @@ def test_flipped_pictures_of_a_rig_are_named(
     assert check_pictures(rig, pictures, options).check.holds
     for path in pictures:
         if path.stem[:-1] in whose:
-            cv2.imwrite(str(path), cv2.flip(cv2.imread(str(path)), flip))
+            cv2.imwrite(str(path), cv2.flip(np.asarray(read_image(path)), flip))
     if board.looks_same_turned and len(whose) == 2:
         with pytest.raises(InputError, match=f"'left' and 'right' are exchanged, or {words}: put right"):
             check_pictures(rig, pictures, options)

@@ -204,7 +204,7 @@ def test_tags_that_light_parts_from_the_squares_between_them_are_sought_alone() 
     """Of the saddles a few are left, which say that it is this board."""
     board, rng = Board("grid", 8, 8, 60.0, 60.0, pattern=AprilGrid(0.3)), np.random.default_rng(0)
     scene = one_board(rng, board=board, size_px=(1280, 960))
-    clear = scene.render(blur_px=0.6, noise_levels=2.0, rng=rng)
+    clear = np.asarray(scene.render(blur_px=0.6, noise_levels=2.0, rng=rng), np.uint8)
     image, _ = degraded("run over", 2.0, clear, rng)
     (found,) = detect_boards(image, [board])
     assert len(found.grid) == 64

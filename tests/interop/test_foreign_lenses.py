@@ -151,7 +151,7 @@ def test_kalibrs_pinhole_fov(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO):
         (camera,), _ = read_kalibr(chain)
     r = np.tan(np.radians(40.0))
-    pixels, valid = camera.project([[r, 0.0, 1.0]])
+    pixels, valid = camera.project(np.array([[r, 0.0, 1.0]]))
     assert valid.all()
     assert pixels[0, 0] == pytest.approx(370.0 + 460.0 * np.arctan(2.0 * r * np.tan(0.46)) / 0.92, abs=1e-3)
     assert "pinhole-fov was refitted" in caplog.text

@@ -66,9 +66,9 @@ def test_what_is_left_is_noise_where_corners_were_right_from_the_start(rng: np.r
     """Then the first step moves nothing, and the light is not fitted yet."""
     maps, ink = told("straight")
     image = picture((42, 40), maps, CENTRE, SCALE, np.zeros((4, 2)), ink, BREAKS, 0.76, 190.0, 160.0)
-    image = (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32)
     found = fit_tags(
-        *(image, maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
+        (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32),
+        *(maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
         *(np.array([0.76]), np.array([160.0]), np.array([1e-3]), WHOLE_ROUNDS[0]),
     )[0]
     # 250 pixels: their rms is known to a twentieth.

@@ -44,8 +44,8 @@ once more. Squares at a slant, or at the rim, do not make a sharp image slower b
 MORE_EVIDENCE, BESIDE_PAPER = 0.5, 1.5
 """Of lattices with small squares: the second fit adds no more to their promise than the first number (measured: 0.13),
 and what lies beyond their outer squares and the second fit together no more than the second (0.53 where the promise is
-above -3.5; 1.8 at -4.4, 1.1 below). Of 173 such lattices in real images, some of them blurred, boards have 3.7 and more;
-one sample of a board that is found whole besides has -4.6."""
+above -3.5; 1.8 at -4.4, 1.1 below). Of 173 such lattices in real images, some of them blurred, boards have 3.7 and
+more; one sample of a board that is found whole besides has -4.6."""
 
 
 def refine(
