@@ -312,7 +312,8 @@ def test_images_of_two_sizes(session: Path, capsys: pytest.CaptureFixture[str]) 
     halve("03.jpg")
     assert main(["calibrate", str(session), "--force"]) == 2
     error = capsys.readouterr().err
-    assert "1624x1240 px (3, such as '00.jpg') and 812x620 px (2, such as '03.jpg')" in error and "list only" in error
+    assert "1624x1240 px (3, such as '00.jpg') and 812x620 px (2, such as '03.jpg')" in error
+    assert "in a folder of their own" in error
 
 
 def test_large_squares_through_a_small_fisheye(tmp_path: Path) -> None:

@@ -57,8 +57,8 @@ def test_a_spline_that_no_model_follows_comes_with_its_error(monkeypatch: pytest
             raise InputError("it cannot be fitted")
         return fit_camera(model, *given, **more)
 
-    monkeypatch.setattr("rigkit.interop.mrcal.fit_camera", fitted)
-    monkeypatch.setattr("rigkit.interop.mrcal.SPLINE_GRID", (41, 31))
+    monkeypatch.setattr("rigkit.interop.nearest.fit_camera", fitted)
+    monkeypatch.setattr("rigkit.interop.nearest.CHECKED", (61, 51))
     values = ", ".join(map(repr, WAVY_INTRINSICS.tolist()))
     camera, pose, error_px = read_cameramodel(
         f"{{'lensmodel': '{WAVY}', 'intrinsics': [{values}], 'extrinsics': [0, 0, 0, 0, 0, 0], "

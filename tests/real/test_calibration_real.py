@@ -102,7 +102,7 @@ def test_plane_with_published_corners(shape: str, limit: float) -> None:
 def _rms_of_other_views(result: Calibration, views: list[BoardView]) -> float:
     observations = Observations.from_views(views)
     ahead = np.tile([0.0, 0.0, 100.0], (len(views), 1))
-    state = State.start(result.camera, np.tile(np.eye(3), (len(views), 1, 1)), ahead, observations)
+    state = State.start(result.near, np.tile(np.eye(3), (len(views), 1, 1)), ahead, observations)
     state = replace(state, shape=replace(state.shape, flat=result.boards[0].points_mm))
     state = find_poses(observations, state, observations.weight, 0.5)
     state, _ = refine_poses(observations, state, observations.weight)
