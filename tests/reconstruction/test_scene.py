@@ -243,6 +243,7 @@ def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_kno
         off = (whole.cloud.points_mm[b] - exact.reconstruction.cloud.points_mm[a]) ** 2
         tilt = (whole.cloud.normals[b] - exact.reconstruction.cloud.normals[a]) ** 2
         share = (whole.cloud.sigma_mm**2 - alone.cloud.sigma_mm**2)[b]
+        np.testing.assert_allclose(share, (shifts.points()[:, b] ** 2).sum(axis=(0, 2)), rtol=1e-9, atol=1e-12)
         turned = (whole.cloud.normal_sigma_rad**2 - alone.cloud.normal_sigma_rad**2)[b]
         moves.append([off.sum(), share.sum()])
         tilts.append([tilt.sum(), turned.sum()])
