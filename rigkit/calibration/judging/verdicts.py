@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from rigkit.calibration.judging.boards import judge_boards
 from rigkit.calibration.judging.captured import (
     ASKED_DEG,
     SMALL_PX,
@@ -58,8 +59,6 @@ OVERFIT = 1.25
 """Held-out over training RMS."""
 UNSURE_PX = 1.0
 """Worst-direction standard deviation of a projection, in the covered part of the image."""
-ASPECT = 2e-3
-"""Squares that are longer one way by this part are worth measuring again."""
 OUTLIER_SHARE = 0.03
 NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
@@ -131,8 +130,8 @@ def judge(
             *unclear,
             *([] if contradicting else pattern),
             *_overfit(calibration),
-            *_boards(calibration, " if pixels are square" if upright else ""),
-            *_outliers(calibration),
+            *judge_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),
+            *_outliers(calibration, [finding.image for finding in (*unlike, *unclear)]),
         ]
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
 
@@ -297,9 +296,9 @@ def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
         else:
             continue
         other = times[i] > UNLIKE and middle[i] > SMALL_PX
-        remedy = "look whether the board or the camera moved" + (", or another camera took it" if other else "")
+        causes = " or the camera moved" + (", another camera took it or a program mirrored it" if other else "")
         (unlike if other else found).append(
-            Finding.look(f"image '{view.image}' {what}", f"{remedy}, and retake it", view.image)
+            Finding.look(f"image '{view.image}' {what}", f"look whether the board{causes}, and retake it", view.image)
         )
     return unlike, found
 
@@ -360,34 +359,9 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     return [Finding.bad(what, "take more views there, with the board tilted")]
 
 
-def _boards(c: Calibration, provided: str = "") -> list[Finding]:
-    """What the solved shapes say: a bow, or squares longer one way than the other, `provided` that it is told."""
-    out = []
-    for board in c.boards:
-        if board.kind == "flat":
-            continue
-        extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
-        if board.bow_mm > 2e-3 * extent:
-            out.append(
-                Finding.look(
-                    f"board '{board.board_id}' departs from a plane by {board.bow_mm:.2f} mm",
-                    "its shape is part of the solution, but glue it to something flat: it may bend otherwise next time",
-                )
-            )
-        if abs(board.aspect) > ASPECT:
-            longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
-            out.append(
-                Finding.look(
-                    f"board '{board.board_id}' has squares {100 * abs(board.aspect):.2f} % longer in {longer} than "
-                    f"stated, compared with {other}{provided}",
-                    "measure square_x_mm and square_y_mm again",
-                )
-            )
-    return out
-
-
-def _outliers(c: Calibration) -> list[Finding]:
-    far = [outlier for outlier in c.outliers if not outlier.residual_px <= SMALL_PX]
+def _outliers(c: Calibration, named: Collection[str]) -> list[Finding]:
+    """Those of images that are `named` have no cause but theirs."""
+    far = [outlier for outlier in c.outliers if not (outlier.residual_px <= SMALL_PX or outlier.image in named)]
     share = len(far) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:
         return []

@@ -1,0 +1,75 @@
+"""What the solved shapes say of the boards: bent, stretched, or not as they are declared."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rigkit.calibration.board_shape import BoardShape
+from rigkit.calibration.result import Calibration
+from rigkit.core.findings import Finding
+from rigkit.core.patterns.aprilgrid import AprilGrid
+
+ASPECT = 2e-3
+"""Squares that are longer one way by this part are worth measuring again."""
+BOW = 2e-3
+"""So is a board that departs from a plane by this part of its extent."""
+OFF_SPACING = 0.01
+"""And one whose tags are apart by this part of a tag's side more or less than declared: a ruler reads half a millimetre
+of 50 amiss. A REAL board of 88 mm tags shows 0.001 at most, however it is declared, and an entry for another print is
+off by 0.05."""
+
+
+def judge_boards(c: Calibration, provided: str, *, sure: bool) -> list[Finding]:
+    """Return what is to be said of the boards whose shape was solved for.
+
+    Squares longer one way than the other are told `provided` that something holds; a lens that is not `sure` does not
+    tell them from its own two focal lengths.
+    """
+    out = []
+    for board in c.boards:
+        if board.kind == "flat":
+            continue
+        name = f"board '{board.board_id}'"
+        extent = float(np.linalg.norm(np.ptp(board.points_mm, axis=0)))
+        if board.bow_mm > BOW * extent:
+            out.append(
+                Finding.look(
+                    f"{name} departs from a plane by {board.bow_mm:.2f} mm",
+                    "its shape is part of the solution, but glue it to something flat: it may bend otherwise next time",
+                )
+            )
+        if sure and abs(board.aspect) > ASPECT:
+            longer, other = ("x", "y") if board.aspect > 0 else ("y", "x")
+            out.append(
+                Finding.look(
+                    f"{name} has squares {100 * abs(board.aspect):.2f} % longer in {longer} than stated, compared with "
+                    f"{other}{provided}",
+                    "measure square_x_mm and square_y_mm again",
+                )
+            )
+        out += _spacing(name, board)
+    return out
+
+
+def _spacing(name: str, board: BoardShape) -> list[Finding]:
+    """Tags nearer or farther than declared are part of the shape that is solved for; lengths in mm are off."""
+    pattern = None if board.declared is None else board.declared.pattern
+    if board.declared is None or not isinstance(pattern, AprilGrid):
+        return []
+    lattice = board.points_mm.reshape(board.declared.rows, board.declared.columns, 3)
+    # Sides of tags and gaps between them take turns, along both axes; a single tag has no gap.
+    steps = [np.linalg.norm(np.diff(lattice, axis=axis), axis=-1) for axis in (1, 0)]
+    sides = np.concatenate([steps[0][:, ::2].ravel(), steps[1][::2].ravel()])
+    gaps = np.concatenate([steps[0][:, 1::2].ravel(), steps[1][1::2].ravel()])
+    if not len(gaps):
+        return []
+    found = float(gaps.mean() / sides.mean())
+    if abs(found - pattern.spacing) <= OFF_SPACING:
+        return []
+    return [
+        Finding.look(
+            f"{name} has its tags {found:.2f} of a tag's side apart, {pattern.spacing:g} is declared: its lengths in "
+            "mm, and those of all poses, are off",
+            "measure a tag's side and the gap, correct tag_mm and spacing, and calibrate again",
+        )
+    ]

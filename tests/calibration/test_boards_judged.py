@@ -1,0 +1,49 @@
+"""What is said of boards, and of images that are unlike the others: true, and once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration.test_wrong_sessions import poses, seen
+from helpers.calibration_scenes import SIZE, lens, random_views
+
+from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.result import Calibration
+from rigkit.core.boards import Board
+from rigkit.core.findings import Severity, worst
+from rigkit.core.patterns.aprilgrid import AprilGrid
+
+
+def said(result: Calibration, text: str) -> bool:
+    return any(text in finding.message for finding in result.verdicts)
+
+
+@pytest.mark.parametrize("declared", [0.25, 0.3])
+def test_tags_nearer_than_declared_are_told(declared: float, rng: np.random.Generator) -> None:
+    board = Board("tags", 8, 8, 40.0, 40.0, pattern=AprilGrid(declared))
+    true = replace(board, pattern=AprilGrid(0.3)).points()
+    views, _, _ = random_views(lens("reg"), 15, rng, reach_deg=33.0, board=board, points_mm=true, noise_px=0.05)
+    result = calibrate(views, SIZE, model="brown")
+    assert said(result, "has its tags 0.30 of a tag's side apart, 0.25 is declared") == (declared == 0.25)
+    assert said(result, "of a tag's side apart") == (declared == 0.25)
+
+
+def test_an_unsure_lens_tells_nothing_of_how_long_squares_are(rng: np.random.Generator) -> None:
+    """Boards that are the same way up, and a zoom that changed: squares seem longer by per cent, and none is."""
+    upright = np.array([1.0, 1.0, 0.05]) * 0.3 * rng.normal(size=(24, 3))
+    views, middle = seen(lens("reg"), *poses(rng, 24, upright), rng), 0.5 * (np.array(SIZE) - 1.0)
+    zoomed = [replace(v, pixels=(v.pixels - middle) / (1.15 if k < 8 else 1.0) + middle) for k, v in enumerate(views)]
+    result = calibrate(zoomed, SIZE, model="brown", board="warp")
+    assert worst(result.verdicts) is Severity.BAD
+    assert abs(result.boards[0].aspect) > 2e-3 and not said(result, "than stated")
+
+
+def test_outliers_of_an_image_that_is_named_are_not_told_again(rng: np.random.Generator) -> None:
+    views, _, _ = random_views(lens("reg"), 8, rng, reach_deg=33.0, noise_px=0.05)
+    moved = views[4].pixels.copy()
+    moved[rng.permutation(54)[:16]] += rng.choice([-1.0, 1.0], size=(16, 2))
+    result = calibrate([*views[:4], replace(views[4], pixels=moved), *views[5:]], SIZE, model="brown", board="flat")
+    assert len(result.outliers) > 0.03 * (result.corner_count + len(result.outliers))
+    assert said(result, "image '004.png' has 16 outliers") and not said(result, "of the corners are outliers")
