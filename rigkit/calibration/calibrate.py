@@ -33,7 +33,13 @@ from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.calibration.views.usable import usable_views
-from rigkit.calibration.with_pupil import against_central, require_known, solved_with_pupil, surely_moves
+from rigkit.calibration.with_pupil import (
+    against_central,
+    kept_central,
+    require_known,
+    solved_with_pupil,
+    surely_moves,
+)
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.detections import BoardView
@@ -249,7 +255,7 @@ def _result(
             result = central
         if result.pupil is not None and (how.pupil == "moving" or (better and surely_moves(result))):
             return result
-        central = replace(central, candidates=(*central.candidates, *candidates))
+        central = replace(central, candidates=(*central.candidates, *kept_central(candidates)))
     if how.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not tell how the entrance pupil moves; take boards near and far, up to the "

@@ -70,6 +70,15 @@ def against_central(central: Solved, moving: Solved, how: How) -> tuple[bool, li
     return chosen.name == MOVING, described(options, chosen)
 
 
+def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates of `against_central` where the lens stays central: a pupil that shows images better may do
+    so by chance."""
+    if not any(c.chosen and c.name == MOVING for c in candidates):
+        return list(candidates)
+    said = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
+    return [replace(c, chosen=c.name == CENTRAL, reason=said[c.name]) for c in candidates]
+
+
 def surely_moves(calibration: Calibration) -> bool:
     """Say whether the images agree that the pupil of a calibration moves."""
     return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE

@@ -86,11 +86,20 @@ def left_out(calibration: Calibration) -> list[str]:
 def _choices(candidates: Sequence[Candidate]) -> list[str]:
     """Return what was chosen of how many; the page and --json have every figure."""
     lines = []
-    for what in ("model", "board"):
-        tried = [c for c in candidates if c.name.startswith("board ") == (what == "board")]
+    for what in ("model", "board", "lens with"):
+        tried = [c for c in candidates if _chosen_of(c) == what]
         taken = [c for c in tried if c.chosen and math.isfinite(c.rms_px)]
         if len(tried) > 1 and taken:
             lines.append(
                 f"{what} {taken[-1].name.removeprefix('board ')}, of {len(tried)} compared: {taken[-1].reason}"
             )
     return lines
+
+
+def _chosen_of(candidate: Candidate) -> str:
+    """Return of what a candidate is one: models, shapes of boards, or whether the lens looks from one point."""
+    from rigkit.calibration.with_pupil import CENTRAL, MOVING
+
+    if candidate.name in (CENTRAL, MOVING):
+        return "lens with"
+    return "board" if candidate.name.startswith("board ") else "model"

@@ -14,8 +14,9 @@ from report.test_page_in_browser import MIN_FONT_PX, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.verdicts import judge
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
+from rigkit.calibration.with_pupil import CENTRAL, MOVING, kept_central
 from rigkit.cameras.eucm import EUCM
 from rigkit.cli.calibration_words import describe
 from rigkit.core.findings import Finding
@@ -108,6 +109,20 @@ def test_a_training_rms_above_the_heldout_one_is_explained(calibration: Calibrat
             r"training RMS [\d.]+ px \(.*every corner alike, in the held-out RMS blurred ones count less\)", text
         )
     assert "every corner alike" not in describe(replace(calibration, heldout_rms_px=2.0 * calibration.rms_px))
+
+
+def test_what_was_chosen_is_called_what_it_is(calibration: Calibration) -> None:
+    """Whether the lens looks from one point is no model of it, and what was not kept is not called chosen."""
+    asked = [Candidate(name, 9, 0.1, 0.1, name == MOVING, f"why {name}") for name in (CENTRAL, MOVING)]
+    models = [Candidate(name, 9, 0.1, 0.1, name == "brown 5", f"why {name}") for name in ("ucm", "brown 5")]
+    moving, central = (
+        describe(replace(calibration, candidates=(*models, *two))) for two in (asked, kept_central(asked))
+    )
+    for said in (moving, central):
+        assert "model brown 5, of 2 compared: why brown 5" in said
+    assert f"lens with {MOVING}, of 2 compared: why {MOVING}" in moving
+    assert f"lens with {CENTRAL}, of 2 compared: images do not surely agree" in central
+    assert [one.reason for one in kept_central(models)] == [one.reason for one in models]
 
 
 def told_focal_px(calibration: Calibration) -> tuple[float, float]:
