@@ -20,9 +20,17 @@ from rigkit.io.reading import about
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session, files_of_session, load_session
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
-from rigkit.workflows.inputs.corners import Cache, SessionCorners, given_corners, session_corners, session_views
+from rigkit.workflows.inputs.corners import (
+    Cache,
+    SessionCorners,
+    given_corners,
+    named_images,
+    session_corners,
+    session_views,
+)
 from rigkit.workflows.inputs.folder_session import Known
 from rigkit.workflows.inputs.identify_board import misread
+from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
@@ -146,7 +154,8 @@ def calibration_from(
             if shown is None:
                 raise
             raise InputError(f"{shown} ({error})") from error
-    verdicts = judge_session(result, dropped, suggest_ties(views, result))
+    also = [*suggest_ties(views, result), *interlaced(result, named_images(session))]
+    verdicts = judge_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = misread(session.images, session.boards)
         if shown is not None and 2 * len(views) < len(session.images):

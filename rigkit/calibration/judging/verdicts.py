@@ -359,7 +359,7 @@ def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
     return [Finding.bad(what, "take more views there, with the board tilted")]
 
 
-def _outliers(c: Calibration, named: Collection[str]) -> list[Finding]:
+def _outliers(c: Calibration, named: Collection[str | None]) -> list[Finding]:
     """Those of images that are `named` have no cause but theirs."""
     far = [outlier for outlier in c.outliers if not (outlier.residual_px <= SMALL_PX or outlier.image in named)]
     share = len(far) / max(len(c.outliers) + c.corner_count, 1)
