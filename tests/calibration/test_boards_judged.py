@@ -9,7 +9,9 @@ import pytest
 from calibration.test_wrong_sessions import poses, seen
 from helpers.calibration_scenes import SIZE, lens, random_views
 
+from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.judging.boards import _spacing
 from rigkit.calibration.result import Calibration
 from rigkit.core.boards import Board
 from rigkit.core.findings import Severity, worst
@@ -28,6 +30,11 @@ def test_tags_nearer_than_declared_are_told(declared: float, rng: np.random.Gene
     result = calibrate(views, SIZE, model="brown")
     assert said(result, "has its tags 0.30 of a tag's side apart, 0.25 is declared") == (declared == 0.25)
     assert said(result, "of a tag's side apart") == (declared == 0.25)
+
+
+def test_one_tag_has_no_gap() -> None:
+    board = Board("tag", 2, 2, 40.0, 40.0, pattern=AprilGrid(0.3))
+    assert _spacing("tag", BoardShape("tag", "released", board.points(), declared=board)) == []
 
 
 def test_an_unsure_lens_tells_nothing_of_how_long_squares_are(rng: np.random.Generator) -> None:
