@@ -53,6 +53,39 @@ def test_what_is_printed_is_what_opencv_reads(extra: list[str], tmp_path: Path) 
     assert np.abs(np.diff(grid, axis=0) - [0.0, 20.0]).max() < 1.5 / PX_PER_MM
 
 
+@pytest.mark.parametrize(
+    ("size", "extra"), [("7x5", []), ("7x5", ["--legacy"]), ("8x5", []), ("5x4", []), ("9x6", []), ("12x9", [])]
+)
+@pytest.mark.parametrize("seen", ["as printed", "slanted", "blurred"])
+def test_one_picture_of_the_whole_print_tells_what_it_is(
+    size: str, extra: list[str], seen: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Bare paper below the board is where its rows end. The sharp picture has large modules, in whose blocks markers of
+    dictionaries with fewer bits are read by chance."""
+    name, picture = tmp_path / "board", tmp_path / "picture.png"
+    sheet = ["--paper", "a3", "--square-mm", "20" if len(size) == 3 else "15"]
+    assert main(["board", size, *sheet, "--charuco", "DICT_5X5_100", *extra, "-o", str(name)]) == 0
+    image = cv2.resize(printed(name.with_suffix(".svg")), None, fx=0.35, fy=0.35, interpolation=cv2.INTER_AREA)
+    height, width = image.shape
+    if seen == "slanted":
+        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+        moved = corners * 0.8 + np.array([[90, 60], [80, 130], [100, 90], [110, 70]], np.float32)
+        warp = cv2.getPerspectiveTransform(corners, moved)
+        image = cv2.GaussianBlur(cv2.warpPerspective(image, warp, (width, height), borderValue=[90.0]), (0, 0), 1.0)
+        noise = np.random.default_rng(0).normal(0.0, 2.0, image.shape)
+        image = np.clip(0.7 * image + 30.0 + noise, 0.0, 255.0).astype(np.uint8)
+    elif seen == "blurred":
+        image = cv2.GaussianBlur(image, (0, 0), 2.0)
+    cv2.imwrite(str(picture), image)
+    capsys.readouterr()
+    assert main(["board", "identify", str(picture)]) == 0
+    told = capsys.readouterr()
+    assert f"--board charuco:{size}xMM,dictionary=DICT_5X5_" in told.out
+    # The two patterns are the same board where it has an even number of rows of corners.
+    assert ("legacy_pattern=true" in told.out) == (bool(extra) and int(size.split("x")[1]) % 2 == 1)
+    assert "differ in one column" not in told.err
+
+
 def test_the_measured_print_keeps_its_markers(tmp_path: Path) -> None:
     name = tmp_path / "c"
     assert main(["board", "7x5", "--square-mm", "20", "--charuco", "DICT_4X4_50", "-o", str(name)]) == 0

@@ -105,6 +105,25 @@ def test_whether_a_board_has_one_more_row_of_markers(board: Board) -> None:
     assert next_row(replace(MARKED, rows=4), [image[:330].copy() for image in whole]) is None
 
 
+@pytest.mark.parametrize(
+    ("level", "told"), [(235.0, False), (0.0, None)], ids=["paper", "outside of a corrected picture"]
+)
+def test_bare_paper_ends_a_board_and_what_is_black_does_not(level: float, told: bool | None) -> None:
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (520, 720)).astype(np.float32)
+    whole = [image + noise * (level > 0.0) for image in straight(MARKED)]
+    for image in whole:
+        # Seven rows of corners, and the squares beyond the last, end 460 px down.
+        image[461:] = level + noise[461:] * (level > 0.0)
+    assert next_row(MARKED, whole) is told
+
+
+def test_paper_that_covers_a_part_of_a_row_does_not_end_a_board() -> None:
+    whole = straight(MARKED)
+    for image in whole:
+        image[311:, 200:] = 235.0
+    assert next_row(replace(MARKED, rows=4), whole) is not False
+
+
 def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
     guess = guess_board([image[:330].copy() for image in straight(MARKED)])
     assert guess is not None and guess.board.pattern.type == "charuco" and not guess.told

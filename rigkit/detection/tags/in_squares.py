@@ -14,7 +14,7 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import foretold
-from rigkit.detection.saddles.response import GreyImage
+from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, read_tags, transferred
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.placing import squares_of, voted_place
@@ -83,11 +83,35 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
 
 def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers: IntArray, board: Board) -> FloatArray:
     """Return how like the markers of these `numbers` (N,) squares of the grid of a ChArUco board are, (N,), as
-    `excess_likeness`: by chance of mean 0 and standard deviation 1; 0 where the corners do not foretell the square.
+    `excess_likeness`: by chance of mean 0 and standard deviation 1; 0 where there is nothing to read, NaN where the
+    corners do not foretell the square, or foretell it out of the image.
 
     pixels : (R, C, 2) corners, NaN where unknown.
     squares : (N, 2) column and row, the one before the first corner (0, 0), or one beyond the board's.
     """
+    quads = _outlines(image, pixels, squares, board)
+    inside = np.isfinite(quads).all(axis=(1, 2))
+    out, codes = np.full(len(squares), np.nan), marker_codes(board)
+    if inside.any():
+        excess = excess_likeness(_as_printed(image, board), quads[inside], codes)
+        upright = {int(n): k for k, (n, turns) in enumerate(zip(codes.numbers, codes.turns, strict=True)) if turns == 0}
+        out[inside] = excess[np.arange(len(excess)), [upright[int(n)] for n in numbers[inside]]]
+    return out
+
+
+def brightness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
+    """Return the brightness (N, K) of the modules that markers in these squares have; NaN and else as `likeness_at`."""
+    modules = marker_codes(board).modules
+    middles = (np.stack(np.meshgrid(*2 * [np.arange(modules)]), axis=-1).reshape(-1, 2) + 0.5) / modules
+    quads = _outlines(image, pixels, squares, board)
+    out, seen = np.full((len(squares), len(middles)), np.nan), np.isfinite(quads).all(axis=(1, 2))
+    if seen.any():
+        out[seen] = sample(image, transferred(maps_of_quads(quads[seen]), middles))
+    return out
+
+
+def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Board) -> FloatArray:
+    """Return the outlines (N, 4, 2) of the markers in squares; NaN and else as `likeness_at`."""
     grown = np.pad(pixels, ((2, 2), (2, 2), (0, 0)), constant_values=np.nan)
     wanted = np.zeros(grown.shape[:2], np.bool_)
     rows, columns = (squares[:, k, None] + 1 + np.array(step) for k, step in ((1, (0, 0, 1, 1)), (0, (0, 1, 1, 0))))
@@ -97,11 +121,9 @@ def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers
     grown[wanted] = np.where(ahead.gain[:, None] < MAX_FORETOLD_GAIN, ahead.pixels, np.nan)
     quads = grown[rows, columns]
     inside = ((quads >= 0.0) & (quads <= np.array(image.shape[::-1]) - 1.0)).all(axis=(1, 2))
-    out, codes = np.zeros(len(squares)), marker_codes(board)
+    out = np.full(quads.shape, np.nan)
     if inside.any():
-        excess = excess_likeness(_as_printed(image, board), _within(quads[inside], board), codes)
-        upright = {int(n): k for k, (n, turns) in enumerate(zip(codes.numbers, codes.turns, strict=True)) if turns == 0}
-        out[inside] = excess[np.arange(len(excess)), [upright[int(n)] for n in numbers[inside]]]
+        out[inside] = _within(quads[inside], board)
     return out
 
 

@@ -43,6 +43,10 @@ OFF_SQUARE = 0.2
 MAX_SQUARES_APART = 2
 """Squares, along rows and columns, over which one marker says where another is."""
 
+WITHIN_MARKER = 0.25
+"""A marker lies where another is read whose middle is this near, in diagonals of that one: the middles of two squares
+with markers are at least a diagonal of a square apart."""
+
 Markers: TypeAlias = tuple[IntArray, IntArray, float]
 """Numbers (N,), squares (N, 2) upright from any origin, side of a marker in squares."""
 
@@ -83,8 +87,23 @@ class MarkerSightings:
         for inverted in (False, True):
             names = [name for name, other in wanted if other == inverted]
             seen = read_markers(255 - grey if inverted else grey, names) if names else {}
-            read += [((name, inverted), markers) for name, markers in seen.items()]
+            read += [((name, inverted), markers) for name, markers in _read_best(seen).items()]
         return sorted(read, key=lambda item: (item[0] not in before, -float(item[1].likeness.sum())))
+
+
+def _read_best(seen: dict[str, ReadMarkers]) -> dict[str, ReadMarkers]:
+    """Return the markers without those that another dictionary reads better where they are: in the modules of a large
+    marker chance reads others of fewer bits, one or two of them in each, so that there are more of them."""
+    own = {}
+    for name, markers in seen.items():
+        middle, best = markers.corners.mean(axis=1), np.ones(len(markers.numbers), np.bool_)
+        for other in (others for key, others in seen.items() if key != name):
+            apart = np.linalg.norm(middle[:, None] - other.corners.mean(axis=1), axis=2)
+            reach = WITHIN_MARKER * np.linalg.norm(other.corners[:, 2] - other.corners[:, 0], axis=1)
+            best &= ~((apart < reach) & (other.likeness > markers.likeness[:, None])).any(axis=1)
+        if best.any():
+            own[name] = ReadMarkers(markers.corners[best], markers.numbers[best], markers.likeness[best])
+    return own
 
 
 def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
