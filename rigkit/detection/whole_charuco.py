@@ -34,11 +34,11 @@ that run over: 0.6 to 1.0 where there is one more row, -0.4 to 0.2 where there i
 PERCENT_INK_PAPER = (10.0, 90.0)
 """Percentiles of the brightness of the modules of markers: at least a fifth of them are paper, more than half ink."""
 
-LIKE_PAPER, MAX_UNEVEN = 0.7, 0.2
+LIKE_PAPER, MAX_UNEVEN, AS_UNEVEN = 0.7, 0.2, 0.5
 """Bare paper is brighter than this, 0 for the ink and 1 for the paper of the markers beside it, and scatters by less
 than this part of their scatter. Beyond the last rows of 3 boards in 26 REAL images: 0.8 to 1.7; below 0.15, but for
 squares in which a shadow, a fold or the end of the paper lies, 0.15 to 0.36; markers 0.95 and more. What is too uneven
-is asked how like markers it is, as ever."""
+is asked how like markers it is; where some is half as uneven as markers, paper beside it may be a cover."""
 
 
 def of_pattern(boards: Sequence[Board], images: Sequence[GreyImage]) -> tuple[Board, bool]:
@@ -89,20 +89,23 @@ def next_row(board: Board, images: Sequence[GreyImage]) -> bool | None:
 
 
 def _blank(bright: FloatArray, columns: IntArray, marked: BoolArray) -> BoolArray:
-    """Say which squares, by the brightness (N, K) of their modules, are bare paper beside those with markers.
+    """Say which squares, by the brightness (N, K) of their modules, are bare paper beside those with markers; none
+    where others are as uneven as markers: the edge of a cover may cross these.
 
     columns : (N,) of the squares.
     marked : (N,) those that have markers, in one row.
     """
     marked = marked & np.isfinite(bright).all(axis=1)
     blank = np.zeros(len(bright), np.bool_)
-    for k in np.flatnonzero(np.isfinite(bright).all(axis=1)):
+    for k in np.flatnonzero(np.isfinite(bright).all(axis=1) & ~marked):
         beside = bright[marked & (np.abs(columns - columns[k]) == 1)]
         if len(beside):
             ink, paper = np.percentile(beside, PERCENT_INK_PAPER)
             contrast = max(paper - ink, 1e-3)
-            even = float(bright[k].std()) < MAX_UNEVEN * float(beside.std(axis=1).mean())
-            blank[k] = even and float(bright[k].mean()) - ink > LIKE_PAPER * contrast
+            uneven = float(bright[k].std()) / max(float(beside.std(axis=1).mean()), 1e-3)
+            if uneven > AS_UNEVEN:
+                return np.zeros(len(bright), np.bool_)
+            blank[k] = uneven < MAX_UNEVEN and float(bright[k].mean()) - ink > LIKE_PAPER * contrast
     return blank
 
 

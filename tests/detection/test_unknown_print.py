@@ -124,6 +124,14 @@ def test_paper_that_covers_a_part_of_a_row_does_not_end_a_board() -> None:
     assert next_row(replace(MARKED, rows=4), whole) is not False
 
 
+def test_paper_laid_aslant_over_a_board_does_not_end_it() -> None:
+    row, column = np.indices((520, 720))
+    whole = straight(MARKED)
+    for image in whole:
+        image[row > 300 + 0.05 * (column - 60)] = 235.0
+    assert next_row(replace(MARKED, rows=4), whole) is not False
+
+
 def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
     guess = guess_board([image[:330].copy() for image in straight(MARKED)])
     assert guess is not None and guess.board.pattern.type == "charuco" and not guess.told
