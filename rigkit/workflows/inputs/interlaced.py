@@ -20,8 +20,8 @@ IMAGES_OF_FIELDS = 4
 MIN_INTERLACED = 2
 APART_PX = 0.2
 """Fields this far apart are of two moments. On 239 boards in REAL images of one moment, 50 of them made worse in other
-ways, they are 0.06 px apart at most (squares of 9 px), in an interlaced REAL one 0.37, in 14 whose odd lines were moved by
-2.5 px rms 1.4 (median)."""
+ways, they are 0.06 px apart at most (squares of 9 px), in an interlaced REAL one 0.37, in 14 whose odd lines were moved
+by 2.5 px rms 1.4 (median)."""
 
 
 def interlaced(calibration: Calibration, images: Mapping[str, Path]) -> list[Finding]:
