@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,13 +14,10 @@ from fuzzing.seeds import write_seeds
 
 
 @pytest.fixture(scope="session")
-def seeds(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The good files, which every case of `fuzz.case_of` links to: a program that writes into one of them is found."""
+def seeds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fuzz") / "seeds"
     write_seeds(folder)
-    good = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    yield folder
-    assert [path.name for path, data in good.items() if path.read_bytes() != data] == []
+    return folder
 
 
 @pytest.fixture
