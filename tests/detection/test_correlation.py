@@ -175,6 +175,7 @@ def test_windows_of_few_pixels_say_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(subpixel, "sigma_factors", kept)
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        detect_boards(small_board(rng, square_px=6.0).render(blur_px=2.0, noise_levels=1.0, rng=rng))
+        scene = small_board(rng, square_px=6.0)
+        detect_boards(scene.render(blur_px=2.0, noise_levels=1.0, rng=rng), [scene.boards[0].board])
     assert sum(len(factors) for factors in seen) >= 4
     assert all((factors == 1.0).all() for factors in seen)
