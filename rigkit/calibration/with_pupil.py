@@ -47,7 +47,7 @@ def solved_with_pupil(found: Solved, how: How) -> Solved | None:
         return None
     options = compared(observations, options, how.folds, how.progress)
     chosen = choose(options, SURELY)
-    candidates = described(options, chosen)
+    candidates = described(options, chosen, rivals=how.model == "auto")
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, how.board, how.folds, how.progress)
     return replace(
         found,
