@@ -17,12 +17,12 @@ from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
-from rigkit.calibration.with_pupil import MOVING
+from rigkit.calibration.with_pupil import CENTRAL, MOVING
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import InputError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Severity
 
 NEAR, FAR = Board("near", 9, 6, 12.0, 12.0), Board("far", 9, 6, 120.0, 120.0)
@@ -168,6 +168,23 @@ def test_the_pupil_is_neither_asked_for_nor_left_in_vain() -> None:
     assert forced is not None and forced.chance(1e9) > BY_CHANCE
     with pytest.raises(InputError, match="auto, central, moving"):
         session(NEAR, 0.0, 1, pupil="perhaps")
+
+
+def test_a_pupil_that_may_be_chance_is_not_kept_and_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rigkit.calibration.calibrate.surely_moves", lambda _: False)
+    found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
+    assert found.pupil is None
+    said = {c.name: c for c in found.candidates}
+    assert said[CENTRAL].chosen and said[CENTRAL].reason == "images do not surely agree that the pupil moves"
+    assert not said[MOVING].chosen and said[MOVING].reason == "by how much it moves may be chance"
+    assert session(NEAR, MM_PER_RAD2, 0, pupil="moving").pupil is not None
+
+
+def test_a_pupil_that_is_asked_for_and_that_images_leave_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rigkit.calibration.calibrate.solved_with_pupil", lambda *_: None)
+    with pytest.raises(DegenerateError, match="the images do not tell how the entrance pupil moves"):
+        session(NEAR, MM_PER_RAD2, 0, pupil="moving")
+    assert session(NEAR, MM_PER_RAD2, 0, pupil="auto").pupil is None
 
 
 def test_far_sigmas_count_the_pupil_in() -> None:
