@@ -86,23 +86,8 @@ def calibrate(
         The views do not determine the camera.
     """
     require_known(pupil)
-    return calibrate_together(
-        [
-            (
-                "",
-                views,
-                How(
-                    size_px=size_px,
-                    model=model,
-                    degree=degree,
-                    board=board,
-                    folds=folds,
-                    progress=progress,
-                    pupil=pupil,
-                ),
-            )
-        ]
-    )[0]
+    how = How(size_px=size_px, model=model, degree=degree, board=board, folds=folds, progress=progress, pupil=pupil)
+    return calibrate_together([("", views, how)])[0]
 
 
 def calibrate_together(
