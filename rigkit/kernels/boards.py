@@ -60,8 +60,7 @@ def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], aroun
     left, top, width, height = box
     rows, columns = coefficients.shape[0] - 2, coefficients.shape[1] - 2
     places = np.empty((height, width, 2))
-    spline = np.ascontiguousarray(coefficients, np.float64)
-    kernels().board_places(spline, rows, columns, left, top, width, height, around, places)
+    kernels().board_places(coefficients, rows, columns, left, top, width, height, around, places)
     return places
 
 
@@ -117,8 +116,7 @@ class Shares:
         """Return `values` (K, R, C) at the nodes as pictures (K, H, W)."""
         height, width = self.nodes.shape[:2]
         out = np.empty((len(values), height, width), np.float32)
-        known = np.ascontiguousarray(values, np.float64)
-        kernels().board_values(self.nodes, self.weights, width, height, *self.size, known, len(known), out)
+        kernels().board_values(self.nodes, self.weights, width, height, *self.size, values, len(values), out)
         return out
 
 
@@ -132,7 +130,7 @@ def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture)
     blocks = Blocks.empty(shares.boxes, 2)
     room = int(areas(blocks.boxes).max(initial=1))
     kernels().move_blocks(
-        *(shares.nodes, shares.weights, width, height, *shares.size, np.ascontiguousarray(slopes), weight, taps),
+        *(shares.nodes, shares.weights, width, height, *shares.size, slopes, weight, taps),
         *(len(taps) // 2,),
         *(blocks.boxes, blocks.starts, room, np.empty(3 * room, np.float32), len(blocks.data), blocks.data),
     )

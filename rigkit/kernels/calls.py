@@ -1,7 +1,8 @@
 """Calls of the kernels with their arguments checked: type, shape and C-contiguity of every array, as api.h says.
 
 A detection makes sixty calls, some of functions that take ten microseconds: so the checks of each are compiled once,
-into one expression. What that refuses is looked at again, array by array, to say what is wrong.
+into one expression. What that refuses is looked at again, array by array: what a kernel only reads is copied into the
+type and order that api.h says, and of all else is said what is wrong.
 """
 
 from __future__ import annotations
@@ -69,7 +70,10 @@ class _Checks:
         # A type is one object, but for those of another order of bytes.
         tests += [_is_of(name, array.dtype) for name, array in self._arrays.items() if array.dtype is not None]
         passed = [self._passed(name, "_addressof(_from_buffer({0})) if {0}.size else _empty") for name in self.names]
-        checked = [self._passed(name, f"_checked('{name}', {{}}, {self._shape(name)})") for name in self.names]
+        ready = [f"{name} = _ready('{name}', {name}, {array.shape})" for name, array in self._arrays.items()]
+        checked = [self._passed(name, "_address({0})") for name in self.names]
+        # A structure keeps alive what it points to; a function is done with it when it returns.
+        keep = f"out._ready = ({''.join(f'{name}, ' for name in self._arrays)})" if isinstance(target, type) else "pass"
         code = f"""
 def call({", ".join(self.names)}):
     if {" and ".join(tests) or "True"}:
@@ -77,12 +81,15 @@ def call({", ".join(self.names)}):
             return _target({", ".join(passed)})
         except (TypeError, ValueError, BufferError):
             pass
-    return _target({", ".join(checked)})
+    {"; ".join(ready) or "pass"}
+    out = _target({", ".join(checked)})
+    {keep}
+    return out
 """
         scope: dict[str, Any] = dict(NAMES_IN_SIZES)
         scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}
-        scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_checked": self._checked}
-        scope |= {"_addressof": ctypes.addressof, "_from_buffer": FIRST_BYTE}
+        scope |= {"_bool": np.dtype(np.bool_), "_pointer": ctypes.pointer, "_target": target, "_ready": self._ready}
+        scope |= {"_addressof": ctypes.addressof, "_from_buffer": FIRST_BYTE, "_address": address}
         scope |= {"_empty": ctypes.addressof(EMPTY)}
         exec(compile(code, f"api.h: {self.owner}", "exec"), scope)
         return cast("Callable[..., Any]", scope["call"])
@@ -93,21 +100,19 @@ def call({", ".join(self.names)}):
             return of_array.format(name)
         return f"_pointer({name})" if name in self._pointed else name
 
-    def _shape(self, name: str) -> str:
-        return self._arrays[name].shape if name in self._arrays else ""
-
-    def _checked(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> int:
-        """Return the address of an array; raises TypeError where it is not as declared."""
-        dtype = self._arrays[name].dtype
-        same = dtype is None or array.dtype == dtype or (dtype == np.uint8 and array.dtype == np.bool_)
-        if array.shape != shape or not same:
-            raise TypeError(
-                f"{self.owner}: '{name}' is {array.dtype} {array.shape}, wants {dtype or 'any type'} {shape}"
-            )
-        try:
-            return address(array)
-        except ValueError as error:
-            raise TypeError(f"{self.owner}: '{name}' is {error}") from None
+    def _ready(self, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """Return an array, or a copy as declared of one that is only read; raises TypeError where it is not as declared
+        and a copy would not do."""
+        declared = self._arrays[name]
+        dtype = array.dtype if declared.dtype is None else declared.dtype
+        same = array.dtype == dtype or (dtype == np.uint8 and array.dtype == np.bool_)
+        if array.shape != shape or not (same or (declared.read_only and np.can_cast(array.dtype, dtype, "safe"))):
+            raise TypeError(f"{self.owner}: '{name}' is {array.dtype} {array.shape}, wants {dtype} {shape}")
+        if declared.read_only:
+            return np.ascontiguousarray(array, array.dtype if same else dtype)
+        if not array.flags.c_contiguous:
+            raise TypeError(f"{self.owner}: '{name}' is not C-contiguous")
+        return array
 
 
 def _is_of(name: str, dtype: np.dtype[Any]) -> str:

@@ -47,7 +47,7 @@ def brown_places(
     `start` (2, N) inside the circle of `max_r`, and where it came to an end (N,)."""
     plane, valid = np.array(start, order="C"), np.empty(m.shape[1], dtype=bool)
     own, rational = _of_twelve(parameters), int(parameters.size > 9)
-    kernels().undistort_brown(own, max_r, rational, np.ascontiguousarray(m), m.shape[1], plane, valid)
+    kernels().undistort_brown(own, max_r, rational, m, m.shape[1], plane, valid)
     return plane, valid
 
 
@@ -90,7 +90,7 @@ def _written(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Call the kernel for the points and the `camera`, members of the structure, and return u, v and valid."""
     count = len(points[0])
-    x, y, z = (np.ascontiguousarray(one, np.float64) for one in points)
+    x, y, z = points
     by_point, by_parameters = (_memory(out, count) for out in (d_pixels_d_point, d_pixels_d_parameters))
     at = struct.of(x=x, y=y, z=z, count=count, axes=by_point.shape[1], rows=by_parameters.shape[1], **camera)
     u, v, valid = np.empty(count), np.empty(count), np.empty(count, dtype=bool)

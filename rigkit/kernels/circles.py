@@ -30,10 +30,8 @@ def fit_circles(
 ) -> FloatArray:
     """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `most` : pixels of
     the largest window."""
-    known = [np.ascontiguousarray(part, np.float64) for part in (pixels, maps, bends, blur, reach)]
-    out = np.empty((len(pixels), CIRCLE_OUTCOMES))
-    scratch = np.empty((SPOT, most))
+    out, scratch = np.empty((len(pixels), CIRCLE_OUTCOMES)), np.empty((SPOT, most))
     kernels().fit_circles(
-        *image_arguments(image), len(pixels), *known, np.ascontiguousarray(beside, np.int64), rules, most, scratch, out
+        *(*image_arguments(image), len(pixels), pixels, maps, bends, blur, reach, beside, rules, most, scratch, out)
     )
     return out

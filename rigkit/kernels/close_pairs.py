@@ -14,7 +14,6 @@ USUAL_PARTNERS = 2
 def pairs_within(points: FloatArray, reach: float, ends: IntArray) -> IntArray:
     """Return the pairs (P, 2) of points (N, D) that are within `reach` of each other along every axis; the partners of
     each are sought between the first and the second, and the third and the fourth of its `ends` (N, 4)."""
-    points, ends = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(ends, np.int64)
     pairs = np.empty((USUAL_PARTNERS * len(points), 2), np.int64)
     found = kernels().close_pairs(points, *points.shape, reach, ends, pairs, len(pairs))
     if found > len(pairs):

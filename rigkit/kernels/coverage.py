@@ -15,7 +15,5 @@ def covered_pixels(grid: IntArray, corners: Pixels, counts: IntArray, squares: f
     says. A square is as long as the longer side of those that the affine map of a view's grid into the image has.
     """
     covered = np.empty(len(pixels), dtype=bool)
-    grid, counts = (np.ascontiguousarray(a, np.int64) for a in (grid, counts))
-    corners, pixels = (np.ascontiguousarray(a, np.float64) for a in (corners, pixels))
     kernels().cover_pixels(grid, corners, len(corners), counts, len(counts), squares, pixels, len(pixels), covered)
     return covered

@@ -33,10 +33,12 @@ DTYPES: dict[str, np.dtype[np.generic] | None] = {
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """An array that is passed by its address: its type, None for any, and what its shape must be."""
+    """An array that is passed by its address: its type, None for any, what its shape must be, and whether the kernel
+    only reads it."""
 
     dtype: np.dtype[np.generic] | None
     shape: str
+    read_only: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +121,9 @@ def _python(expression: str) -> str:
 def _declared(text: str, constants: dict[str, int]) -> list[Declaration]:
     """Return what one declaration declares: several members if it names several."""
     text = " ".join(text.split())
-    if found := re.fullmatch(r"ARRAY\((?:const )?(\w+), (\w+), (.*)\)", text):
-        kind, name, sizes = found.groups()
-        return [Declaration(name, kind, Array(DTYPES[kind], f"({_python(sizes)},)"))]
+    if found := re.fullmatch(r"ARRAY\((const )?(\w+), (\w+), (.*)\)", text):
+        const, kind, name, sizes = found.groups()
+        return [Declaration(name, kind, Array(DTYPES[kind], f"({_python(sizes)},)", const is not None))]
     found = re.fullmatch(r"(?:const )?(\w+) (.*)", text)
     if found is None:
         raise ValueError(f"api.h: cannot read {text!r}")

@@ -40,18 +40,16 @@ class LensCorners(Struct):
         pixels : u and v, (N,) each, where the corners project.
         residuals, told : (N, 2) px, and (N,) which corners tell anything.
         """
-        arrays = (d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, *pixels, residuals)
-        by_point, by_parameters, sigmas, lever, u, v, residuals = (np.ascontiguousarray(a, np.float64) for a in arrays)
         return cls.of(
-            d_pixels_d_point=by_point,
-            d_pixels_d_parameters=by_parameters,
+            d_pixels_d_point=d_pixels_d_point,
+            d_pixels_d_parameters=d_pixels_d_parameters,
             sigmas=sigmas,
             lever=lever,
-            u=u,
-            v=v,
+            u=pixels[0],
+            v=pixels[1],
             residuals=residuals,
-            told=np.ascontiguousarray(told),
-            counts=np.ascontiguousarray(counts, np.int64),
+            told=told,
+            counts=counts,
             count=len(told),
             parameters=len(sigmas),
             views=len(counts),
@@ -80,7 +78,6 @@ def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArr
     Beforehand a is normal with mean zero, those along the radius of one of the `sizes` (S,), the others of one, all
     pairs alike; each counts as far as the images bear it out.
     """
-    information, score, sizes = (np.ascontiguousarray(a, np.float64) for a in (information, score, sizes))
     out = np.empty((DISPLACEMENTS, DISPLACEMENTS))
     kernels().average_amounts(information, score, sizes, len(sizes), out)
     return out
@@ -93,15 +90,13 @@ def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
     aspect ratio and shear.
     """
     out = np.empty((2, DISPLACEMENTS, len(pixels)))
-    u, v = (np.ascontiguousarray(pixels[:, k], np.float64) for k in range(2))
-    kernels().displace_pixels(u, v, len(pixels), *size_px, out)
+    kernels().displace_pixels(pixels[:, 0], pixels[:, 1], len(pixels), *size_px, out)
     return out
 
 
 def displacement(u: FloatArray, v: FloatArray, amounts: FloatArray, size_px: tuple[int, int]) -> FloatArray:
     """Return how far amounts (J,) of the displacements move pixels u, v (M,), (2, M) px; beyond the corners of the
     image as on the circle through them."""
-    u, v, amounts = (np.ascontiguousarray(a, np.float64) for a in (u, v, amounts))
     out = np.empty((2, len(u)))
     kernels().displace_by(u, v, len(u), *size_px, amounts, out)
     return out

@@ -3,7 +3,7 @@ how the lines of a lattice bend."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,15 +58,10 @@ def fit_corners(
     rules: Rules,
 ) -> FloatArray:
     """Return the `OUTCOMES` of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
-    library = kernels()
-    corners = (pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper, single, sign)
-    starts = (blur, window_blur, contrast)
-    known = [np.ascontiguousarray(part, np.float64) for part in (*corners, *starts)]
     out = np.empty((len(pixels), OUTCOMES))
-    library.fit_edges(
-        *image_arguments(image),
-        len(pixels),
-        *(*known, np.ascontiguousarray(ends, np.bool_), rules, scratch_of(rules), out),
+    kernels().fit_edges(
+        *(*image_arguments(image), len(pixels), pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper),
+        *(single, sign, blur, window_blur, contrast, ends, rules, scratch_of(rules), out),
     )
     return out
 
@@ -98,24 +93,18 @@ class NoiseOfCorners(NamedTuple):
     good: BoolArray
     owner: IntArray
 
-    def arguments(self) -> tuple[NDArray[Any], ...]:
-        """Return them as the kernels take them."""
-        *known, good, owner = self
-        numbers = (np.ascontiguousarray(part, np.float64) for part in known)
-        return (*numbers, np.ascontiguousarray(good, np.bool_), np.ascontiguousarray(owner, np.int64))
-
 
 def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.sigma_factors` does."""
     out = np.empty(boards)
-    kernels().sigma_factors(*corners.arguments(), len(corners.pixels), boards, rules, out)
+    kernels().sigma_factors(*corners, len(corners.pixels), boards, rules, out)
     return out
 
 
 def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.uneven_factors` does."""
-    boards, out = np.ascontiguousarray(usual, np.float64), np.empty(len(corners.pixels))
-    kernels().uneven_factors(*corners.arguments(), len(corners.pixels), len(boards), boards, rules, out)
+    out = np.empty(len(corners.pixels))
+    kernels().uneven_factors(*corners, len(corners.pixels), len(usual), usual, rules, out)
     return out
 
 
@@ -123,10 +112,9 @@ def line_bends(
     pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
 ) -> tuple[FloatArray, FloatArray]:
     """Return what `detection.subpixel.edge_curvature.line_curvature` does."""
-    places, sigmas = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
-    wanted, sides = np.ascontiguousarray(cells, np.bool_), np.ascontiguousarray(sides_px, np.float64)
-    if np.count_nonzero(wanted) != len(sides):
-        raise ValueError(f"line_bends: {len(sides)} sides for {np.count_nonzero(wanted)} cells")
-    out, out_sigma = np.empty((2, len(sides), 2))
-    kernels().line_bends(places, sigmas, wanted, *wanted.shape, len(sides), sides, rules, out, out_sigma)
+    count = len(sides_px)
+    if np.count_nonzero(cells) != count:
+        raise ValueError(f"line_bends: {count} sides for {np.count_nonzero(cells)} cells")
+    out, out_sigma = np.empty((2, count, 2))
+    kernels().line_bends(pixels, sigma_px, cells, *cells.shape, count, sides_px, rules, out, out_sigma)
     return out, out_sigma

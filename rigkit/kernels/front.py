@@ -30,7 +30,7 @@ class RingRules(Struct):
     @classmethod
     def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
         """Return the rules; `circle` (2 * HALF, 2) are the samples of a ring of radius 1."""
-        samples, gains = np.ascontiguousarray(circle, np.float32), np.ascontiguousarray(gains, np.float64)
+        samples = np.ascontiguousarray(circle, np.float32)
         return cls.of(circle=samples, gains=gains, gain_count=len(gains), **numbers)
 
 
@@ -86,7 +86,7 @@ def shrunk(image: GreyImage, factor: int) -> Image:
     sums = np.empty(2 * width, np.uint16) if bytewise else np.empty(width, np.float32)
     out = np.empty((height // factor, width // factor), np.float32)
     shrink = kernels().shrink_bytes if bytewise else kernels().shrink_floats
-    shrink(np.ascontiguousarray(image), height, width, factor, sums, out)
+    shrink(image, height, width, factor, sums, out)
     return out
 
 
@@ -100,10 +100,10 @@ def smoothed(image: GreyImage, kernel: Image) -> tuple[Image, Image]:
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
     if image.dtype == np.uint8:
         column = np.empty(width + 4, np.uint16)
-        kernels().smooth_bytes(np.ascontiguousarray(image), height, width, kernel, WHOLE, column, smooth, half)
+        kernels().smooth_bytes(image, height, width, kernel, WHOLE, column, smooth, half)
     else:
         sums = np.empty(width + 4, np.float32)
-        kernels().smooth_floats(np.ascontiguousarray(image), height, width, kernel, sums, smooth, half)
+        kernels().smooth_floats(image, height, width, kernel, sums, smooth, half)
     return smooth, half
 
 
@@ -172,7 +172,6 @@ def corners(
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
     """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2), M > 0."""
-    fresh, known = np.ascontiguousarray(fresh, np.float64), np.ascontiguousarray(known, np.float64)
     mark = np.empty(len(fresh), np.bool_)
     if not kernels().mark_known(fresh, len(fresh), known, len(known), reach, mark):
         raise MemoryError
@@ -195,9 +194,10 @@ def links(
     `lines` (N, 2, 2) are the unit vectors of A and B, `bounds` the contrasts (N,) of those looked at, `reach` (N,) the
     largest distance of the places that are looked at from the edge.
     """
-    arrays = [np.ascontiguousarray(a, np.float64) for a in (pixels, lines, contrast, *bounds, reach)]
-    names = ("pixels", "lines", "contrast", "least", "most", "reach")
-    given = _CornerArrays.of(**dict(zip(names, arrays, strict=True)), count=len(pixels))
+    least, most = bounds
+    given = _CornerArrays.of(
+        pixels=pixels, lines=lines, contrast=contrast, least=least, most=most, reach=reach, count=len(pixels)
+    )
     nearest, both = np.empty((2, len(pixels), 4), np.int64)
     if not kernels().find_links(given, ImageOf.make(image), scale, offset, rules, nearest, both):
         raise MemoryError

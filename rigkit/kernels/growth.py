@@ -64,8 +64,6 @@ class GridBuckets(Struct):
 
 def fit(lattice: FloatArray, cells: BoolArray, rules: FitRules) -> FloatArray:
     """Return the fits of M `cells` (R, C) of `lattice` (R, C, 2): (M, 12), in the order of `LocalFit`."""
-    lattice = np.ascontiguousarray(lattice, np.float64)
-    cells = np.ascontiguousarray(cells, np.bool_)
     out = np.empty((int(np.count_nonzero(cells)), FIT_COLUMNS))
     kernels().fit_cells(lattice, *cells.shape, cells, rules, len(out), out)
     return out

@@ -31,7 +31,6 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
 
     That is `typical` and `seen` of the inner columns and then of the inner rows, and `every` of both.
     """
-    pixels = np.ascontiguousarray(pixels, np.float64)
     rows, columns = pixels.shape[:2]
     inner = max(columns - 2, 0) + max(rows - 2, 0)
     scratch, typical, every = np.empty(2 * rows * columns), np.empty(inner), np.empty(2)
@@ -43,7 +42,6 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
 
 def line_gaps(sides: FloatArray, bends: FloatArray) -> FloatArray:
     """Return what `detection.lattice.local_fit.LocalFit.gaps` does of its `sides` and `bends`, (M, 2, 2)."""
-    sides, bends = np.ascontiguousarray(sides, np.float64), np.ascontiguousarray(bends, np.float64)
     out = np.empty(sides.shape)
     kernels().line_gaps(sides, bends, len(sides), out)
     return out
@@ -56,7 +54,6 @@ def excess_scatter(
     rules: ScatterRules,
 ) -> FloatArray:
     """Return what `subpixel.scatter.excess_scatter` does of `pixels` (R, C, 2) and `sigma_px` (R, C), (P,)."""
-    pixels, sigma_px = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
     where = np.array(
         [(rows.start, columns.start, rows.stop - rows.start, columns.stop - columns.start) for rows, columns in parts],
         np.int64,
@@ -71,7 +68,6 @@ def surface_scatter(pixels: FloatArray, sigma_px: FloatArray, rules: ScatterRule
 
     NaN where these fit any, or where rows and columns have differences enough to tell (`excess_scatter`).
     """
-    pixels, sigma_px = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
     scratch, out = np.empty(ROOM_FOR_SURFACES * sigma_px.size), np.empty(2)
     kernels().surface_scatter(pixels, sigma_px, *sigma_px.shape, rules, scratch, out)
     lower, higher = out.tolist()
@@ -90,7 +86,7 @@ def shifts_of_edges(
     most: int,
 ) -> FloatArray:
     """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, from about `most` edges."""
-    pixels, image = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(image, np.float32)
+    image = np.ascontiguousarray(image, np.float32)
     places = np.array(along, np.float64)
     rows, columns = pixels.shape[:2]
     sums, out = np.empty((len(places), steps + 1)), np.empty(len(places))
@@ -107,7 +103,6 @@ def clearest_splits(
     """Return the clearest split of `pixels` (R, C, 2), `sigma_px` (R, C), between columns, and that between rows: how
     many times better the two sides fit alone, 0 where there is none, and the first and the last (exclusive) between
     them. `detection.checks.discontinuity` says what that is."""
-    pixels, sigma_px = np.ascontiguousarray(pixels, np.float64), np.ascontiguousarray(sigma_px, np.float64)
     scratch, out = np.empty(kernels().splits_scratch(*sigma_px.shape)), np.empty((2, 3))
     kernels().clearest_splits(pixels, sigma_px, *sigma_px.shape, several, rules, scratch, out)
     return [(ratio, int(start), int(end)) for ratio, start, end in out.tolist()]

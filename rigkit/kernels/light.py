@@ -33,12 +33,11 @@ def fit_light_steps(
 ) -> FloatArray:
     """Return the outcomes of N corners, (N, 8). Arguments as `detection.subpixel.shadows.light_steps`; what a step
     of the fit changes is `most_step` (11,) at most."""
-    known = [np.ascontiguousarray(part, np.float64) for part in (start, sides, curvature, aside)]
     most = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
     out = np.empty((len(start), LIGHT_OUTCOMES))
     kernels().fit_light_steps(
-        *(*image_arguments(image), len(start), *known, blur, most_step, rules),
-        *(most, np.empty((4, most)), out),
+        *(*image_arguments(image), len(start), start, sides, curvature, aside),
+        *(blur, most_step, rules, most, np.empty((4, most)), out),
     )
     return out
 
@@ -58,10 +57,9 @@ def lit_unevenly(
 
     The last four are its constants.
     """
-    known = [np.ascontiguousarray(part, np.float64) for part in (pixels, sides, aside)]
     out = np.empty(len(pixels), np.bool_)
     kernels().lit_unevenly(
-        *(*image_arguments(image), len(pixels), *known, np.ascontiguousarray(ends, np.bool_)),
+        *(*image_arguments(image), len(pixels), pixels, sides, aside, ends),
         *(along, len(along), most_aside, least_px, uneven, out),
     )
     return out

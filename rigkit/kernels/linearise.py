@@ -89,9 +89,9 @@ class ViewSums:
         """Add the views from `first` on, of N corners in all: `by_point` (2, 3, N), `by_parameters` (2, P, N) and what
         `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
         count, parameters = lever.shape[1], by_parameters.shape[1]
-        u, v, valid = (np.ascontiguousarray(one) for one in projected)
         kernels().add_views(
-            self.seen, first, count, parameters, by_point, by_parameters, u, v, valid, lever, self._memory, self._struct
+            *(self.seen, first, count, parameters, by_point, by_parameters, *projected, lever),
+            *(self._memory, self._struct),
         )
 
 
@@ -112,7 +112,6 @@ def schur_step(
     gg, gp, pp : (G, G), (V, G, 6) and (V, 6, 6) of J^T W J: globals, globals with poses, poses.
     g, p : (G,) and (V, 6) of J^T W r.
     """
-    gg, gp, pp, g, p = (np.ascontiguousarray(block, np.float64) for block in (gg, gp, pp, g, p))
     views, count, _ = gp.shape
     normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p, globals=count, views=views)
     step_g, step_p, predicted = np.empty(count), np.empty((views, 6)), np.empty(1)
@@ -127,8 +126,7 @@ def chebyshev_series(matrices: FloatArray, vectors: FloatArray, bound: float, se
 
     `series` has two terms or more; the eigenvalues of M lie between 0 and `bound`.
     """
-    matrices, vectors, series = (np.ascontiguousarray(a, np.float64) for a in (matrices, vectors, series))
-    out = np.empty_like(vectors)
+    out = np.empty(vectors.shape)
     memory = np.empty(3 * vectors.shape[1])
     kernels().sum_series(matrices, vectors, *vectors.shape, bound, series, len(series), memory, out)
     return out

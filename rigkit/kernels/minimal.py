@@ -19,7 +19,7 @@ MAX_ROOTS = header().constants["MAX_ROOTS"]
 
 def five_rows(rows: FloatArray) -> Mat3:
     """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
-    rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), MAX_ROOTS, 3, 3))
+    out = np.empty((len(rows), MAX_ROOTS, 3, 3))
     kernels().five_rows(rows, len(rows), out)
     return out
 
@@ -31,6 +31,6 @@ def six_rows(rows: FloatArray) -> Mat3:
     The monomials are scaled so that the answer does not depend on the choice of the basis: all 27 products of three of
     the unknowns, of which ten differ, have the length one together.
     """
-    rows, out = np.ascontiguousarray(rows, np.float64), np.empty((len(rows), 1, 3, 3))
+    out = np.empty((len(rows), 1, 3, 3))
     kernels().six_rows(rows, len(rows), out)
     return out

@@ -31,14 +31,14 @@ def inverses(
     parts : linear, factor and offset, (N,) each.
     target : (N,) by which the `table` of x (cells + 1,), even in it from the first of `values` to the second, is read.
     """
-    linear, factor, offset = (np.ascontiguousarray(part, np.float64) for part in parts)
+    linear, factor, offset = parts
     out = np.empty(len(target))
     functions = _Increasing.of(
-        polynomial=np.ascontiguousarray(polynomial, np.float64),
+        polynomial=polynomial,
         linear=linear,
         factor=factor,
         offset=offset,
-        target=np.ascontiguousarray(target, np.float64),
+        target=target,
         table=table,
         count=len(out),
         terms=len(polynomial),
@@ -55,5 +55,4 @@ def inverses(
 def smallest_root(polynomials: FloatArray, limit: float) -> float:
     """Return the smallest root in (0, `limit`] of polynomials (M, K) that do not vanish at zero, of the power zero
     first, or `limit` where there is none; NaN where one overflows."""
-    polynomials = np.ascontiguousarray(polynomials, np.float64)
     return float(kernels().smallest_root(polynomials, *polynomials.shape, limit, np.empty(2 * polynomials.shape[1])))

@@ -28,17 +28,11 @@ def find_paper(
 ) -> tuple[FloatArray, FloatArray]:
     """Return `paper` and `gaps`, (N, 2, 2) each, as `detection.subpixel.outer_squares.with_paper` sets them."""
     library, count = kernels(), len(pixels)
-    before, after = (
-        [np.ascontiguousarray(part, np.float64) for part in parts]
-        for parts in ((pixels, sides, gaps), (contrast, blur, sign))
-    )
     scratch, near = np.empty(2 * rules.step_count + 4 * count), np.empty(4 * count, np.int64)
     memory = np.empty(library.paper_memory(count), np.uint8)
     paper, out_gaps = np.empty((2, count, 2, 2))
     library.find_paper(
-        *image_arguments(image),
-        count,
-        *(*before, np.ascontiguousarray(ends, np.bool_), *after, np.ascontiguousarray(owner, np.int64)),
+        *(*image_arguments(image), count, pixels, sides, gaps, ends, contrast, blur, sign, owner),
         *(rules, scratch, memory, near, paper, out_gaps),
     )
     return paper, out_gaps

@@ -46,13 +46,12 @@ class EpipolarKnowledge(Struct):
         cls, rays2: FloatArray, spacing: float, E21: Mat3, *, sigma: float, sigma_A: float, most_distance: float
     ) -> EpipolarKnowledge:
         """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where there is none."""
-        entries = np.ascontiguousarray(E21, np.float64).reshape(9)
         return cls.of(
-            rays2=np.ascontiguousarray(rays2, np.float64),
+            rays2=rays2,
             rows=rays2.shape[0],
             columns=rays2.shape[1],
             spacing=float(spacing),
-            E21=tuple(entries),
+            E21=tuple(E21.reshape(9)),
             sigma=sigma,
             sigma_A=sigma_A,
             most_distance=most_distance,
@@ -90,7 +89,7 @@ def _table(out: FloatArray) -> PatchTable:
 
 def starts_of(pixels1: Pixels, pixels2: Pixels, A21: Affines) -> FloatArray:
     """Return where alignments start, (N, 8)."""
-    return np.ascontiguousarray(np.concatenate([pixels1, pixels2, A21.reshape(-1, 4)], axis=1), np.float64)
+    return np.concatenate([pixels1, pixels2, A21.reshape(-1, 4)], axis=1)
 
 
 def aligned(first: Pyramid, second: Pyramid, rules: PatchRules, starts: FloatArray) -> PatchTable:
@@ -115,8 +114,8 @@ def grown(
     rows, columns = rays1.shape[:2]
     out = np.empty((rows, columns, PATCH_COLUMNS))
     grid = _Grid.of(
-        rays1=np.ascontiguousarray(rays1, np.float64),
-        jacobians1=np.ascontiguousarray(jacobians1, np.float64),
+        rays1=rays1,
+        jacobians1=jacobians1,
         out=out,
         tries=np.empty((rows, columns), np.uint8),
         heap=np.empty((rows, columns), np.int32),

@@ -24,7 +24,6 @@ def fitted_planes(
     1 / (1 + s^2 / (3 turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane.
     """
     rows, columns = values.shape[:2]
-    values, information, frames = (np.ascontiguousarray(v, np.float64) for v in (values, information, frames))
     grid = _PlaneGrid.of(
         values=values,
         information=information,

@@ -19,7 +19,6 @@ class _Problem(Struct):
 
 def residuals(packed: FloatArray, E21: Mat3) -> FloatArray:
     """Return the distances (H, N) in sigmas of the matches `packed` (18, N) from hypotheses (H, 3, 3)."""
-    E21 = np.ascontiguousarray(E21, np.float64)
     out = np.empty((len(E21), packed.shape[1]))
     kernels().residuals(packed, packed.shape[1], E21, len(E21), out)
     return out
@@ -27,7 +26,6 @@ def residuals(packed: FloatArray, E21: Mat3) -> FloatArray:
 
 def qualities(packed: FloatArray, E21: Mat3, noise: float) -> FloatArray:
     """Return the sums (H,) of the marginal quality at a noise level of hypotheses (H, 3, 3)."""
-    E21 = np.ascontiguousarray(E21, np.float64)
     out = np.empty(len(E21))
     kernels().qualities(packed, packed.shape[1], E21, len(E21), noise, out)
     return out
@@ -35,7 +33,6 @@ def qualities(packed: FloatArray, E21: Mat3, noise: float) -> FloatArray:
 
 def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, sigmas: float) -> FloatArray:
     """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3), as pose_quality.c."""
-    R, t = np.ascontiguousarray(R, np.float64), np.ascontiguousarray(t, np.float64)
     out = np.empty(len(t))
     kernels().qualities_ahead(packed, packed.shape[1], R, t, len(t), noise, sigmas, out)
     return out
@@ -52,7 +49,6 @@ def improve(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
-    free = np.ascontiguousarray(free, np.int64)
     kernels().improve(packed, packed.shape[1], R, t, noise, len(R), free, len(free), most_steps, settled_rad)
     return R, t
 
@@ -74,8 +70,6 @@ def minimise(
     `affine` (25, K) are the affinities of the matches `which` (K,), see pose_minimum.c; `loss` is 0 for none,
     1 for Cauchy's or 2 for the marginal one, and its scale; `free` which of the five unknowns move.
     """
-    packed, affine, point_weights = (np.ascontiguousarray(a, np.float64) for a in (packed, affine, point_weights))
-    which, free = (np.ascontiguousarray(a, np.int64) for a in (which, free))
     problem = _Problem.of(
         packed=packed,
         affine=affine,

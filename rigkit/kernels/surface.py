@@ -33,8 +33,7 @@ def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, flo
     the least depth of a place (Hartley and Zisserman, Multiple View Geometry, 2004, algorithm 4.2).
     """
     out = np.empty((3, 3))
-    known = (np.ascontiguousarray(part, np.float64) for part in (places, pixels))
-    return out, float(kernels().fit_perspective(*known, len(places), out))
+    return out, float(kernels().fit_perspective(places, pixels, len(places), out))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,7 +109,6 @@ class TagSurface:
 def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     """Return what a homography (3, 3) does of `places` (M, 2), without curvatures and heights."""
     out = np.empty((len(places), SURFACE_COLUMNS))
-    places, homography = np.ascontiguousarray(places, np.float64), np.ascontiguousarray(homography, np.float64)
     kernels().project_places(places, len(places), homography, out)
     return TagSurface(out)
 
@@ -157,8 +155,7 @@ class Polynomials:
     def through(cls, places: FloatArray, values: FloatArray, most: int, most_leverage: float) -> Polynomials:
         """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
         room = _Room(len(places), most)
-        known = (np.ascontiguousarray(part, np.float64) for part in (places, values))
-        best = kernels().fit_polynomials(*known, *room.sizes, most_leverage, *room.scratch, *room.results)
+        best = kernels().fit_polynomials(places, values, *room.sizes, most_leverage, *room.scratch, *room.results)
         return cls._of(room, best)
 
     @classmethod
@@ -168,9 +165,8 @@ class Polynomials:
         """Return the `perspective` that takes `places` (N, 2) nearest to `pixels` (N, 2), and polynomials through what
         it leaves; None where a place is nearer than `nearest` in it."""
         room, homography = _Room(len(places), most), np.empty((3, 3))
-        known = (np.ascontiguousarray(part, np.float64) for part in (places, pixels))
         best = kernels().fit_map(
-            *(*known, *room.sizes, most_leverage, nearest, np.empty((len(places), 2))),
+            *(places, pixels, *room.sizes, most_leverage, nearest, np.empty((len(places), 2))),
             *(*room.scratch, homography, *room.results),
         )
         return None if best < 0 else (homography, cls._of(room, best))
@@ -199,7 +195,7 @@ class Polynomials:
         """
         out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
         kernels().add_polynomial(
-            *(np.ascontiguousarray(wanted, np.float64), len(wanted), self.unit, len(self.told), self.plain),
+            *(wanted, len(wanted), self.unit, len(self.told), self.plain),
             *(self.triangle, self.told, self.misses, surest, out),
         )
         return TagSurface(out)
@@ -208,7 +204,7 @@ class Polynomials:
 def maps_of_quads(quads: FloatArray) -> FloatArray:
     """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2)."""
     out = np.empty((len(quads), 3, 3))
-    kernels().maps_of_quads(np.ascontiguousarray(quads, np.float64), len(quads), out)
+    kernels().maps_of_quads(quads, len(quads), out)
     return out
 
 
@@ -220,10 +216,7 @@ def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatA
     that of the border beyond it.
     """
     spread, bright = np.empty(len(quads)), np.empty((len(quads), side * side))
-    kernels().read_modules(
-        *(*image_arguments(image), np.ascontiguousarray(quads, np.float64), len(quads), side),
-        *(bright, spread),
-    )
+    kernels().read_modules(*image_arguments(image), quads, len(quads), side, bright, spread)
     return bright, spread
 
 
@@ -234,14 +227,7 @@ def read_codes(
     (N,); 0 and 0 where their brightness has a standard deviation below `least`. Else as `read_modules`."""
     best, likeness = np.empty(len(quads), np.int64), np.empty(len(quads))
     kernels().read_codes(
-        *(*image_arguments(image), np.ascontiguousarray(quads, np.float64), len(quads), side),
-        *(
-            np.ascontiguousarray(patterns, np.float64),
-            len(patterns),
-            least,
-            np.empty((len(quads), side * side)),
-            best,
-            likeness,
-        ),
+        *(*image_arguments(image), quads, len(quads), side, patterns, len(patterns), least),
+        *(np.empty((len(quads), side * side)), best, likeness),
     )
     return best, likeness

@@ -122,7 +122,7 @@ def tag_heights(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     far the end of the other lies from it; NaN where one of the four is missing."""
     rows, columns = pixels.shape[:2]
     longer, height = np.empty((2, rows // 2, columns // 2))
-    kernels().tag_heights(np.ascontiguousarray(pixels, np.float64), rows, columns, longer, height)
+    kernels().tag_heights(pixels, rows, columns, longer, height)
     return longer, height
 
 
@@ -131,13 +131,12 @@ def squares_of_lattice(pixels: FloatArray, odd: bool) -> tuple[FloatArray, IntAr
     order of growing angle from u to v, and the (column, row) (N, 2) of their first."""
     rows, columns = pixels.shape[:2]
     quads, cells = np.empty((rows * columns, 4, 2)), np.empty((rows * columns, 2), np.int64)
-    count = kernels().squares_of_lattice(np.ascontiguousarray(pixels, np.float64), rows, columns, odd, quads, cells)
+    count = kernels().squares_of_lattice(pixels, rows, columns, odd, quads, cells)
     return quads[:count], cells[:count]
 
 
 def vote_place(cells: IntArray, turns: IntArray, places: IntArray, size: tuple[int, int]) -> tuple[int, int, IntArray]:
     """Return what `detection.tags.placing.voted_place` does of a lattice of `size` (columns, rows)."""
-    known = (np.ascontiguousarray(part, np.int64) for part in (cells, turns, places))
     place = np.zeros(3, np.int64)
-    votes = kernels().vote_place(*known, len(cells), *size, np.empty((len(cells), 3), np.int64), place)
+    votes = kernels().vote_place(cells, turns, places, len(cells), *size, np.empty((len(cells), 3), np.int64), place)
     return int(votes), int(place[0]), place[1:]

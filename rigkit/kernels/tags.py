@@ -41,15 +41,10 @@ def fit_tags(
     blur, contrast : (N,) where to start.
     bend_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
     """
-    known = [np.ascontiguousarray(part, np.float64) for part in (maps, centres, scales)]
-    starts = [np.ascontiguousarray(part, np.float64) for part in (blur, contrast, bend_sigma)]
     most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
     out = np.empty((len(maps), TAG_OUTCOMES))
     kernels().fit_tags(
-        *image_arguments(image),
-        len(maps),
-        *known,
-        *(np.ascontiguousarray(ink, np.bool_), ink.shape[1], np.ascontiguousarray(breaks, np.float64), reach),
-        *(*starts, rules, most, np.empty((most, TAG_BLOCK)), out),
+        *(*image_arguments(image), len(maps), maps, centres, scales, ink, ink.shape[1], breaks, reach),
+        *(blur, contrast, bend_sigma, rules, most, np.empty((most, TAG_BLOCK)), out),
     )
     return out
