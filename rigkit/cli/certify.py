@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note_written, print_json, print_statement
+    from rigkit.cli.console import note_written, options_of, print_json, print_statement
     from rigkit.core.errors import ExitCode, InputError
     from rigkit.report.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
@@ -50,15 +50,7 @@ def run(args: argparse.Namespace) -> int:
         distance_sigma_mm=args.distance_sigma,
         confidence=args.confidence / 100.0,
     )
-    options = CertifyOptions(
-        limit=args.limit,
-        sigma_px=args.sigma_px,
-        cameras=None if args.cameras is None else tuple(args.cameras),
-        report=args.report,
-        pdf=args.pdf,
-        force=args.force,
-    )
-    done = certify_file(args.calibration, task, options)
+    done = certify_file(args.calibration, task, options_of(CertifyOptions, args))
     certificate, words = done.certificate, done.words
     if args.json:
         told = {"passed": words.passed, "statement": words.headline, "basis": basis(certificate)}

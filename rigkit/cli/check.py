@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, note_written, print_json, print_statement, progress_on_stderr
+    from rigkit.cli.console import note, note_written, options_of, print_json, print_statement, progress_on_stderr
     from rigkit.io.board_words import board_files, board_of_words
     from rigkit.io.files import ensure_writable
     from rigkit.report.check_page import check_table, check_to_dict
@@ -43,16 +43,9 @@ def run(args: argparse.Namespace) -> int:
     if args.temperature is not None and args.register is None:
         raise InputError("check: --temperature goes into a register; give --register, too")
     ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
-    options = CheckOptions(
-        boards=tuple(board_of_words(words) for words in args.board),
-        scene=args.scene,
-        length=length,
-        fix=args.fix,
-        report=args.report,
-        history=args.register,
-        temperature_c=args.temperature,
-        force=args.force,
-    )
+    boards = tuple(board_of_words(words) for words in args.board)
+    told = {"boards": boards, "length": length, "history": args.register, "temperature_c": args.temperature}
+    options = options_of(CheckOptions, args, **told)
     done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
     check = done.check
     if args.json:

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import progress_on_stderr
+    from rigkit.cli.console import options_of, progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.board_words import board_of_words
     from rigkit.workflows.coach import CoachOptions, run_coach
@@ -65,17 +65,7 @@ def run(args: argparse.Namespace) -> int:
         goal_mm=args.goal_mm,
         reach=reach_of(args),
     )
-    options = CoachOptions(
-        folder=args.folder,
-        boards=tuple(args.board),
-        guide=guide,
-        length=length_of(args, "coach"),
-        cameras=args.cameras,
-        watch=tuple(args.watch),
-        video=tuple(args.video),
-        device=tuple(args.device),
-        port=args.port,
-        lan=args.lan,
-    )
+    known = {"boards": tuple(args.board), "guide": guide, "length": length_of(args, "coach")}
+    options = options_of(CoachOptions, args, **known)
     run_coach(options, lambda words: print(words, flush=True), progress_on_stderr())
     return ExitCode.WELL

@@ -7,12 +7,13 @@ import logging
 import sys
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rigkit.core.errors import printable
 from rigkit.core.progress import Progress
 
 if TYPE_CHECKING:
+    from argparse import Namespace
     from collections.abc import Iterable
     from pathlib import Path
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rigkit.geometry.rigid3 import Rigid3
     from rigkit.report.page_facts import PageFacts
 
+Options = TypeVar("Options")
 REDRAW_S = 0.1
 BAR_WIDTH = 24
 
@@ -60,6 +62,15 @@ def note_written(paths: Iterable[Path]) -> None:
     """Tell which files were written."""
     for path in paths:
         note(f"{path} written")
+
+
+def options_of(kind: type[Options], args: Namespace, /, **others: Any) -> Options:
+    """Return a workflow's options: `others`, and of its further fields those of which arguments have the names."""
+    from dataclasses import fields
+
+    own = {f.name for f in fields(kind) if f.name not in others}  # type: ignore[arg-type]
+    told = {name: tuple(v) if isinstance(v, list) else v for name, v in vars(args).items() if name in own}
+    return kind(**told, **others)
 
 
 def print_statement(facts: PageFacts) -> None:

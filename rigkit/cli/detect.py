@@ -41,18 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
     from rigkit.workflows.detect import DetectOptions, detect_in_images
 
-    options = DetectOptions(
-        boards=tuple(map(Path, args.board)),
-        camera=Path(args.camera) if args.camera else None,
-        min_corners=args.min_corners,
-        output=Path(args.output) if args.output else None,
-        overlay=Path(args.overlay) if args.overlay else None,
-        force=args.force,
-        jobs=args.jobs,
-    )
+    places = {name: Path(given) if (given := getattr(args, name)) else None for name in ("camera", "output", "overlay")}
+    options = options_of(DetectOptions, args, boards=tuple(map(Path, args.board)), **places)
     done = detect_in_images(args.images, options, progress=progress_on_stderr())
     for error in done.failures.values():
         note(f"left out: {error}")

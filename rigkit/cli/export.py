@@ -38,17 +38,14 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("export: --float is of clouds; leave it out")
     import numpy as np
 
+    from rigkit.cli.console import options_of
     from rigkit.rectification.targets import field_across
     from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, export_rig
     from rigkit.workflows.inputs.camera_files import is_rig
 
-    options = ExportCameraOptions(
-        output=args.output,
-        kind=args.to,
-        source_kind=args.source_format,
-        size_px=None if args.size is None else size_of_words(args.size),
-        force=args.force,
-    )
+    size_px = None if args.size is None else size_of_words(args.size)
+    told = {"kind": args.to, "source_kind": args.source_format, "size_px": size_px}
+    options = options_of(ExportCameraOptions, args, **told)
     if args.source_format is None and is_rig(args.source):
         rig = export_rig(args.source, options, tuple(args.names or ()))
         print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the rig given")
@@ -64,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _export_cloud(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import progress_on_stderr
+    from rigkit.cli.console import options_of, progress_on_stderr
     from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud, export_ply
 
     kind = args.to or args.output.suffix.lstrip(".") or "colmap"
@@ -78,15 +75,7 @@ def _export_cloud(args: argparse.Namespace) -> int:
     unused |= {"--pair": is_ply and args.pair, "--planes": is_ply and args.planes}
     if (option := next((name for name, given in unused.items() if given), None)) is not None:
         raise InputError(f"export: {option} says nothing of {'a PLY' if is_ply else 'a cloud'}; leave it out")
-    options = ExportCloudOptions(
-        output=args.output,
-        kind=kind,
-        pair=args.pair,
-        method=args.method,
-        planes=args.planes,
-        force=args.force,
-        single_precision=args.float,
-    )
+    options = options_of(ExportCloudOptions, args, kind=kind, single_precision=args.float)
     if is_ply:
         print(f"{args.output}: {len(export_ply(args.source, options))} points")
         return 0

@@ -25,17 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from rigkit.cli.console import note, pose_in_words, progress_on_stderr
+    from rigkit.cli.console import note, options_of, pose_in_words, progress_on_stderr
     from rigkit.workflows.handeye import POSE_NAMES, HandEyeOptions, calibrate_hand_eye, hand_eye_text
 
-    options = HandEyeOptions(
-        camera=args.camera,
-        board=args.board,
-        board_on_hand=args.board_on_hand,
-        inverse=args.inverse,
-        output=args.output,
-        force=args.force,
-    )
+    options = options_of(HandEyeOptions, args)
     done = calibrate_hand_eye(args.poses, args.images, options, progress=progress_on_stderr())
     result = done.result
     for error in done.unreadable:

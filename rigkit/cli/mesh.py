@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import print_json, progress_on_stderr
+from rigkit.cli.console import options_of, print_json, progress_on_stderr
 from rigkit.core.errors import ExitCode
 
 
@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.mesh import MeshOptions, mesh_cloud
 
     output = args.output or args.cloud.with_name(f"{args.cloud.stem}-mesh.ply")
-    options = MeshOptions(output=output, depth=args.depth, cut=args.cut, one_view=args.one_view, force=args.force)
+    options = options_of(MeshOptions, args, output=output)
     mesh = mesh_cloud(args.cloud, options, progress=progress_on_stderr())
     if args.json:
         print_json({"mesh": str(output), "vertices": len(mesh.points), "triangles": len(mesh.triangles)})

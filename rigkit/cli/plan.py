@@ -100,15 +100,10 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
 
 
 def _options(args: argparse.Namespace, count: int) -> PlanOptions:
+    from rigkit.cli.console import options_of
     from rigkit.workflows.plan import PlanOptions
 
     if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
         raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")
-    return PlanOptions(
-        count=args.views or count,
-        check=args.check,
-        length=length_of(args, "plan"),
-        reach=reach_of(args),
-        report=args.report,
-        force=args.force,
-    )
+    told = {"count": args.views or count, "length": length_of(args, "plan"), "reach": reach_of(args)}
+    return options_of(PlanOptions, args, **told)

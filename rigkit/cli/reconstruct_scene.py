@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from rigkit.cli.console import note, print_json, progress_on_stderr
+from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
 from rigkit.cli.dataset_arguments import results_folder
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.core.posetype import PoseType
@@ -69,24 +69,8 @@ def run_scene(args: argparse.Namespace) -> int:
             raise InputError(f"reconstruct: {option} names two, or with --rig three and more; got {len(given)}")
     name = (args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
-    options = SceneOptions(
-        camera=args.camera,
-        rig=args.rig,
-        rig_names=tuple(args.names) if args.names else None,
-        pose=args.pose,
-        camera2=args.camera2,
-        images=(args.images[0], args.images[1]) if args.images else None,
-        correspondences=args.correspondences,
-        baseline_mm=args.baseline_mm,
-        pose_type=args.pose_type,
-        level_sigma_deg=args.level_sigma_deg,
-        output=out,
-        force=args.force,
-        pictures=not args.no_pictures,
-        grow=not args.sparse,
-        single_precision=args.float,
-        confidence=args.confidence,
-    )
+    told = {"output": out, "rig_names": tuple(args.names) if args.names else None, "grow": not args.sparse}
+    options = options_of(SceneOptions, args, **told, **_written(args))
     done = reconstruct_views(options, progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction
     for words in r.notes:
@@ -99,6 +83,10 @@ def run_scene(args: argparse.Namespace) -> int:
             f"{scene.inliers.sum()} of which agree, Sampson rms {r.sampson_rms_px:.3f} px, {r.pose_type}"
         )
     return ExitCode.WELL
+
+
+def _written(args: argparse.Namespace) -> dict[str, bool]:
+    return {"pictures": not args.no_pictures, "single_precision": args.float}
 
 
 def _run_rig(args: argparse.Namespace) -> int:
@@ -116,16 +104,7 @@ def _run_rig(args: argparse.Namespace) -> int:
             raise InputError(f"reconstruct: --{word} is for two images; with three and more the rig's file says it all")
     name = args.rig.stem
     out = results_folder(args, name)
-    options = RigSceneOptions(
-        rig=args.rig,
-        images=tuple(args.images),
-        names=tuple(args.names) if args.names else None,
-        output=out,
-        force=args.force,
-        single_precision=args.float,
-        confidence=args.confidence,
-        pictures=not args.no_pictures,
-    )
+    options = options_of(RigSceneOptions, args, output=out, **_written(args))
     done = reconstruct_rig_views(options, progress=progress_on_stderr())
     for words in done.notes:
         note(f"{name}: {words}")

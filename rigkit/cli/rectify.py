@@ -55,19 +55,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
     from rigkit.workflows.rectify import RectifyOptions, holds_several, rectify_image, rectify_stereo_images
 
-    options = RectifyOptions(
+    options = options_of(
+        RectifyOptions,
+        args,
         output=Path(args.output),
-        projection=args.projection,
-        hfov_deg=args.hfov_deg,
         angles_deg=(args.yaw_deg, args.pitch_deg, args.roll_deg),
         size_px=None if args.size is None else size_of_words(args.size),
-        interpolation=args.interpolation,
-        crop=args.crop,
-        maps=args.maps,
-        force=args.force,
     )
     if args.image2 is None and args.rig is None:
         if args.camera is None:

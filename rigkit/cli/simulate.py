@@ -18,20 +18,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.cli.console import note, print_json, progress_on_stderr
+    from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
     from rigkit.core.errors import ExitCode
     from rigkit.report.study_page import study_tables
     from rigkit.report.tables import tables_to_markdown
     from rigkit.workflows.study import StudyOptions, run_studies
 
-    options = StudyOptions(
-        output=Path(args.output),
-        trials=args.trials,
-        jobs=args.jobs,
-        dask=args.dask,
-        figure=args.format,
-        force=args.force,
-    )
+    options = options_of(StudyOptions, args, output=Path(args.output), figure=args.format)
     results = []
     for done in run_studies(args.studies, options, progress=progress_on_stderr()):
         results.append(done.table.to_dict())
