@@ -145,6 +145,6 @@ def _check(what: str, value: float, sigma: float, unit: str, *, near_zero: bool 
     if sigma >= value and not near_zero:
         # Any result would agree with it: a check that cannot fail. Angles across faces are never near 0.
         raise InputError(
-            f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement: were both exchanged, or is "
-            "one in another unit?"
+            f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement; give the value, then "
+            "its sigma, in one unit: were both exchanged?"
         )
