@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
     """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
     from rigkit.report.calibration_facts import camera_facts
-    from rigkit.workflows.next_views import next_views
+    from rigkit.workflows.next_pictures import next_views
 
     try:
         return camera_facts(calibration, next_views(calibration, boards))

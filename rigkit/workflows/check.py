@@ -35,8 +35,6 @@ from rigkit.io.images import read_image_of
 from rigkit.io.json_reader import json_text
 from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
-from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal
 from rigkit.report.check_page import check_facts, check_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
@@ -48,7 +46,7 @@ from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
-from rigkit.workflows.next_views import goal_of, length_goal
+from rigkit.workflows.next_pictures import length_goals
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
 
 
@@ -107,7 +105,7 @@ def check_pictures(
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
         ensure_register(options.history, inputs, options.temperature_c)
-    cost = [] if options.length is None else length_costs(watched, options.length)
+    goals = [] if options.length is None else length_goals(watched.cameras, watched.cam_from_rig, options.length)
     left_out: list[tuple[str, str]] = []
     unreadable: list[str] = []
     if options.scene:
@@ -115,7 +113,7 @@ def check_pictures(
             raise InputError("check: a scene without boards tells of a rig only; one camera needs pictures of a board")
         read = [_read(watched, source, frame, unreadable) for frame in frames]
         with about(source):
-            check = check_scene(watched, [images for images in read if images], cost, progress=progress)
+            check = check_scene(watched, [images for images in read if images], goals, progress=progress)
     else:
         boards = options.boards or known
         if not boards:
@@ -128,7 +126,7 @@ def check_pictures(
             views = _views(watched, frames, seen, boards, left_out)
             if not views:
                 raise InputError(f"check: {_nothing_to_check(left_out, unreadable, boards)}")
-            check = check_views(watched, views, cost)
+            check = check_views(watched, views, goals)
             if not check.holds:
                 check = replace(check, flipped=flipped_pictures(watched, views))
                 _require_right_order(check, views)
@@ -301,33 +299,6 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
                 f"check: the images of '{names[i]}' and '{names[j]}' are {how}: put right, they fit; give them in the "
                 f"rig's order, {', '.join(names)}"
             )
-
-
-def length_costs(watched: Watched, task: Task) -> list[Goal]:
-    """Return what a change does to a length: that one camera sees, or the first of a rig with each of the others that
-    see it, too.
-
-    Raises DegenerateError where none does.
-    """
-    if len(watched.cameras) == 1:
-        return [goal_of(watched.cameras[0], Reach(), task)]
-    layout, found, unseen = watched.layout, [], None
-    for c in range(1, len(watched.cameras)):
-        cameras, mounts = watched.cameras, watched.cam_from_rig
-        try:
-            goal = length_goal((cameras[0], cameras[c]), (mounts[0], mounts[c]), task)
-        except DegenerateError as error:
-            unseen = error
-            continue
-        # The first camera is the rig's frame: its mount does not change.
-        lenses = np.r_[layout.cameras[0], layout.cameras[c]]
-        own, kept = np.r_[lenses, layout.mount(c)], np.r_[0 : len(lenses), len(lenses) + 6 : len(lenses) + 12]
-        weight = np.zeros((layout.count, layout.count))
-        weight[np.ix_(own, own)] = goal.weight[np.ix_(kept, kept)]
-        found.append(replace(goal, weight=weight))
-    if not found and unseen is not None:
-        raise DegenerateError(f"of no two cameras: {unseen}")
-    return found
 
 
 def fixed_text(source: Path, check: SentinelCheck) -> str:

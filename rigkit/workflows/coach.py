@@ -41,7 +41,7 @@ from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_to_come
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_beside
-from rigkit.workflows.next_frames import length_goals
+from rigkit.workflows.next_pictures import length_goals
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (

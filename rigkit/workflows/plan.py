@@ -32,8 +32,7 @@ from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, sess
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.next_frames import next_frames
-from rigkit.workflows.next_views import NEXT_VIEWS, goal_of, next_views
+from rigkit.workflows.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.provenance import digest_line, software_facts
 
 USUAL_SIGMA_PX = 0.15

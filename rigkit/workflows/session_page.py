@@ -16,7 +16,7 @@ from rigkit.io.session import Session
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
 from rigkit.workflows.inputs.corners import SessionCorners, named_images
-from rigkit.workflows.next_views import next_views
+from rigkit.workflows.next_pictures import next_views
 from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
 
 

@@ -29,7 +29,7 @@ from rigkit.planning.information import Knowledge
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.workflows.calibrate_rig import RigSessionCalibration
 from rigkit.workflows.coach import finished_words
-from rigkit.workflows.next_frames import length_goals
+from rigkit.workflows.next_pictures import length_goals
 
 NAMES, OTHER = ("left", "right"), "right"
 FRAMES = 10

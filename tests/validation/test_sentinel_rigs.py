@@ -23,8 +23,7 @@ from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
-from rigkit.workflows.check import length_costs
-from rigkit.workflows.next_views import TASK_CELLS
+from rigkit.workflows.next_pictures import TASK_CELLS, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
 
@@ -159,7 +158,7 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     step = np.zeros(watched.layout.count)
     step[watched.layout.cameras[0]][:2] = 0.3
     step[watched.layout.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
-    now, (goal,) = watched.changed(step), length_costs(watched, task)
+    now, (goal,) = watched.changed(step), length_goals(watched.cameras, watched.cam_from_rig, task)
     rays, valid = watched.cameras[0].unproject(grid_pixels(watched.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
     points = measured_points(rays[valid], task, is_rig=True)[0]
     seen, shown = np.ones(len(points), dtype=bool), []
@@ -182,7 +181,7 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     assert goal.unit == "mm" and np.sqrt(step @ goal.weight @ step) == pytest.approx(wrong, rel=0.02)
     far = Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=700.0)
     with pytest.raises(DegenerateError, match="of no two cameras"):
-        length_costs(watched, far)
+        length_goals(watched.cameras, watched.cam_from_rig, far)
 
 
 def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:

@@ -1,0 +1,133 @@
+"""The views that would improve a calibration most, and the frames that would improve a rig, for what it is used for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.layout import Layout
+from rigkit.cameras.base import Camera
+from rigkit.cameras.compare import grid_pixels
+from rigkit.core.boards import Board
+from rigkit.core.errors import DegenerateError, InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.planning.candidates import Reach
+from rigkit.planning.goal import Goal, projection_goal
+from rigkit.planning.information import Knowledge
+from rigkit.planning.plan import Plan, plan_views
+from rigkit.planning.rig_goal import rig_goal
+from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
+from rigkit.validation.certificate.propagation import gradients, measured_points
+from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.frames import Frames
+
+NEXT_VIEWS = 3
+TASK_CELLS = (13, 10)
+"""Columns and rows of the places at which a length is measured."""
+
+
+def next_views(
+    calibration: Calibration,
+    boards: Sequence[Board],
+    count: int = NEXT_VIEWS,
+    *,
+    length: Task | None = None,
+    reach: Reach | None = None,
+) -> Plan:
+    """Return the views of `boards` that would improve a calibration most, the first near the last one taken; the error
+    before them is what the calibration states.
+
+    Raises as `plan_views` and `goal_of`.
+    """
+    reach = reach or Reach()
+    known = Knowledge.beyond_model(calibration)
+    last = calibration.views[-1].cam_from_board
+    goal, stated = goal_of(known.camera, reach, length), uncertain_camera(calibration).covariance
+    return plan_views(known, boards, goal, count, reach=reach, last=last).stated(float(goal.error(stated)))
+
+
+def next_frames(
+    watched: Watched, boards: Sequence[Board], count: int, *, length: Task | None = None, reach: Reach | None = None
+) -> Plan:
+    """Return the frames that would improve a rig most: of every camera at one moment, of one board. Boards are taken
+    for flat, and images to disagree as those of the calibration do.
+
+    Raises InputError: no board, no frame asked for, or a length of a rig that is not a pair; DegenerateError: no board
+    fits into any image at the distances allowed, or the length is nowhere in view.
+    """
+    if not boards or count < 1:
+        raise InputError("plan: at least one board and one picture are needed")
+    reach = reach or Reach()
+    frames = Frames.of(watched, boards, reach)
+    if length is None:
+        away = float(np.median(np.linalg.norm(frames.translation_mm, axis=-1)))
+        goal = rig_goal(watched.cameras, watched.cam_from_rig, away, reach.field_deg)
+    elif len(watched.cameras) != 2:
+        raise InputError("plan: --length is for one camera or a rig of two; leave it away")
+    else:
+        (goal,) = length_goals(watched.cameras, watched.cam_from_rig, length)
+    return frames.plan(watched, boards, goal, count)
+
+
+def goal_of(camera: Camera, reach: Reach, task: Task | None) -> Goal:
+    """Return what the views are to improve: a length at a distance, or the projection; raises as `length_goal`."""
+    if task is None:
+        return projection_goal(camera, reach.field_deg)
+    return length_goal((camera,), (Rigid3.identity(),), task)
+
+
+def length_goal(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], task: Task) -> Goal:
+    """Return the error of a length seen by a camera, or by two, over the image of the first: its weight is on their
+    parameters, and of two then on both mounts (rad, mm).
+
+    Raises InputError for a task of one camera that is no length, DegenerateError where the length is nowhere in view.
+    """
+    if len(cameras) == 1 and task.quantity is not Quantity.LENGTH:
+        raise InputError(f"plan: one camera measures no {task.quantity}; give a length at a distance")
+    count = sum(camera.parameters.size for camera in cameras) + (12 if len(cameras) == 2 else 0)
+    instrument = Instrument(
+        names=tuple(f"{k}" for k in range(len(cameras))),
+        cameras=tuple(cameras),
+        cam_from_rig=tuple(cam_from_rig),
+        covariance=np.zeros((count, count)),
+        sigma_px=1.0,
+    )
+    rays, valid = cameras[0].unproject(grid_pixels(cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
+    _, by_calibration, _, seen = gradients(instrument, *measured_points(rays[valid], task, is_rig=instrument.is_rig))
+    if not seen.any():
+        raise DegenerateError(
+            f"nowhere is a length of {task.size_mm:g} mm at {task.distance_mm:g} mm in view; give a shorter "
+            "length or another distance"
+        )
+    rows = by_calibration[seen].reshape(-1, count)
+    what = f"standard error of a length of {task.size_mm:g} mm at {task.distance_mm:g} mm"
+    return Goal(rows.T @ rows / len(rows), "mm", what)
+
+
+def length_goals(cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3], length: Task) -> list[Goal]:
+    """Return the errors of a length that the first camera sees with each of the others, where two see it, or alone;
+    the weights are on what `Layout.of_cameras` has.
+
+    Raises DegenerateError where the length is nowhere in view.
+    """
+    if len(cameras) == 1:
+        return [length_goal(cameras, cam_from_rig, length)]
+    layout, goals, last = Layout.of_cameras(cameras), list[Goal](), None
+    for k in range(1, len(cameras)):
+        try:
+            pair = length_goal((cameras[0], cameras[k]), (cam_from_rig[0], cam_from_rig[k]), length)
+        except DegenerateError as error:
+            last = error
+            continue
+        # The first mount is the rig's frame.
+        first = len(pair.weight) - 12
+        kept = np.r_[:first, first + 6 : first + 12]
+        own = replace(pair, weight=pair.weight[np.ix_(kept, kept)])
+        goals.append(own.among(np.r_[layout.cameras[0], layout.cameras[k], layout.mount(k)], layout.count))
+    if last is not None and not goals:
+        raise DegenerateError(f"of no two cameras: {last}") from last
+    return goals
