@@ -35,7 +35,7 @@ from rigkit.core.matches import DirectionPairs, Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, rotation_angle
 from rigkit.geometry.triangulation import correct_lindstrom, triangulate_rays
-from rigkit.kernels.minimal import five_rows, six_rows
+from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.relative_pose.refinement.refine import estimate_pose, refine_pose
 from rigkit.relative_pose.robust.robust import robust_pose
 from rigkit.relative_pose.solvers.planar import solve_planar_batch

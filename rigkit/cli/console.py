@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rigkit.core.errors import printable
+from rigkit.core.errors import InputError, printable
 from rigkit.core.progress import Progress
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 Options = TypeVar("Options")
 REDRAW_S = 0.1
 BAR_WIDTH = 24
+IMAGE_SIZE = re.compile(r"([0-9]{1,6})[xX]([0-9]{1,6})")
 
 
 def progress_on_stderr() -> Progress:
@@ -95,3 +97,11 @@ def pose_in_words(name: str, pose: Rigid3, turn_sigma_rad: FloatArray, move_sigm
 def print_json(value: Any) -> None:
     """Print a result for programs."""
     print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def size_of_words(text: str) -> tuple[int, int]:
+    """Return (width, height) of "1280x960"; raises InputError for anything else."""
+    match = IMAGE_SIZE.fullmatch(text)
+    if match is None:
+        raise InputError(f"--size {text}: give width and height in px, such as 1280x960")
+    return int(match[1]), int(match[2])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.console import size_of_words
 from rigkit.cli.dataset_arguments import add_planes_argument
-from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, CLOUD_FORMATS, PLY_FORMATS, READ_FORMATS
 

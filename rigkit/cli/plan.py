@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigkit.cli.aim_arguments import add_reach_arguments, length_of, reach_of
-from rigkit.cli.sizes import size_of_words
+from rigkit.cli.console import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
@@ -27,9 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-n", "--views", type=int, metavar="N", help="pictures to plan (default: 3; with --lens 12)")
     parser.add_argument(
-        "--check",
-        action="store_true",
-        help="pictures to check it with: those that would tell changes best",
+        "--check", action="store_true", help="pictures to check it with: those that would tell changes best"
     )
     parser.add_argument("--length", type=float, metavar="MM", help="what matters is a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance (default: the whole projection)")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from rigkit.cli.console import size_of_words
 from rigkit.cli.rectification_words import alike, image_to_dict
-from rigkit.cli.sizes import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
 

@@ -1,14 +1,23 @@
-"""Work on all cores: in threads where it is mostly in C, else in processes, none of which outlives the program."""
+"""Work on all cores: in threads where it is mostly in C, else in processes, none of which outlives the program; or on a
+Dask cluster through joblib."""
 
 from __future__ import annotations
 
 import functools
+import importlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, InvalidStateError, ProcessPoolExecutor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    Executor,
+    Future,
+    InvalidStateError,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    as_completed,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from typing import Any, ParamSpec, TypeVar
@@ -137,3 +146,42 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def over_items(
+    function: Callable[[Item], Result], items: Sequence[Item], *, jobs: int = 1, cluster: str | None = None
+) -> Iterator[tuple[int, Result]]:
+    """Yield (place, function(item)) of every item, in any order.
+
+    Raises InputError: a cluster is asked for but joblib or distributed are not installed, or it cannot be reached.
+
+    Parameters
+    ----------
+    jobs : processes on this machine.
+    cluster : address of a Dask scheduler to use instead, such as "tcp://host:8786".
+    """
+    if not items:
+        return
+    if cluster is not None:
+        yield from enumerate(_on_cluster(function, items, cluster))
+    elif jobs == 1 or len(items) == 1:
+        for place, item in enumerate(items):
+            yield place, function(item)
+    else:
+        with worker_pool(min(jobs, len(items), available_cores())) as pool:
+            waiting = {pool.submit(function, item): place for place, item in enumerate(items)}
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+
+
+def _on_cluster(function: Callable[[Item], Result], items: Sequence[Item], address: str) -> list[Result]:
+    try:
+        distributed, joblib = (importlib.import_module(name) for name in ("distributed", "joblib"))
+    except ImportError as error:
+        raise InputError(f"a cluster needs {error.name}; pip install joblib distributed") from error
+    try:
+        client: Any = distributed.Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Dask scheduler answers at '{address}'; check the address") from error
+    with client, joblib.parallel_config(backend="dask"):
+        return list(joblib.Parallel(return_as="list")(joblib.delayed(function)(item) for item in items))

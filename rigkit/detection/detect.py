@@ -14,10 +14,10 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
-from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.targets.base import Search
 from rigkit.detection.targets.registry import FINDERS
+from rigkit.kernels.front import near_any
 
 SAME_CORNER_PX = 2.0
 """Corners of two detections nearer than this are one corner."""

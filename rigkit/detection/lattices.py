@@ -30,7 +30,6 @@ from rigkit.detection.lattice.grow import MAX_FRUITLESS, grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
-from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
 from rigkit.detection.subpixel.evened import LOOKED_AT_PX, evened
@@ -38,6 +37,7 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
 from rigkit.detection.subpixel.subpixel import Promise, refine
 from rigkit.detection.subpixel.whole_board import placed_together
+from rigkit.kernels.front import near_any
 
 Promising = Callable[[GreyImage, Level, Lattice], bool]
 

@@ -1,19 +1,25 @@
-"""OpenCV's calibration files: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir).
+"""OpenCV's calibration files: pinhole and Brown (calib3d), Kannala-Brandt (fisheye), unified (omnidir); and pairs,
+rectified by OpenCV.
 
-The keys are those that OpenCV's own calibration samples write. Pixels as ours.
+The keys are those that OpenCV's own samples write: calibration, and stereo_calib (M1, D1, M2, D2, R, T, R1, R2, P1, P2,
+Q) with E, F and the image's size. Pixels as ours, lengths in mm.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.arrays import FloatArray, Mat3, Pixels
 from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import skew
 from rigkit.interop.exchange import (
     PERSPECTIVE,
     Accepted,
@@ -29,6 +35,9 @@ from rigkit.interop.exchange import (
 from rigkit.interop.opencv_storage import parse_storage
 
 OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
+FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
+"""The models that one call of OpenCV takes together: of calib3d, and of fisheye."""
+KEYS = ("M1", "D1", "M2", "D2", "R", "T")
 
 
 def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
@@ -118,3 +127,106 @@ def _core(K: FloatArray, name: str) -> FloatArray:
 
 def _is_matrix(value: Any) -> bool:
     return isinstance(value, dict) and "data" in value
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class OpenCVStereo:
+    """A pair as OpenCV describes it.
+
+    Attributes
+    ----------
+    cameras : the two as OpenCV has them, with what was lost.
+    R1, R2, P1, P2 : OpenCV's rectification; columns of P that are lengths are in mm.
+    text : the file.
+    """
+
+    cameras: tuple[Written, Written]
+    R1: Mat3
+    R2: Mat3
+    P1: FloatArray
+    P2: FloatArray
+    text: str
+
+
+def opencv_stereo(
+    camera1: Camera, camera2: Camera, cam2_from_cam1: Rigid3, outlines: Sequence[Pixels | None] = (None, None)
+) -> OpenCVStereo:
+    """Return the pair with OpenCV's own rectification (cv2.stereoRectify, cv2.fisheye.stereoRectify).
+
+    `outlines`: one a camera, as for `best_accepted`.
+    Raises InputError where the images differ in size, which OpenCV's rectification does not take, or no family of
+    OpenCV's models follows both lenses.
+    """
+    if camera1.size_px != camera2.size_px:
+        sizes = " and ".join(f"{width}x{height}" for width, height in (camera1.size_px, camera2.size_px))
+        raise InputError(f"OpenCV stereo: images of {sizes} px are not rectified together; take another format")
+    chosen, fisheye = _family(camera1, camera2, outlines)
+    (K1, D1), (K2, D2) = (opencv_arrays(one.camera) for one in chosen)
+    R, T = cam2_from_cam1.rotation, cam2_from_cam1.translation_mm
+    R1, R2, P1, P2, Q = _rectified((K1, D1, K2, D2), camera1.size_px, R, T.reshape(3, 1), fisheye=fisheye)
+    E = skew(T) @ R
+    F = np.linalg.inv(K2).T @ E @ np.linalg.inv(K1)
+    arrays = {
+        "M1": K1, "D1": D1, "M2": K2, "D2": D2, "R": R, "T": T.reshape(3, 1), "R1": R1, "R2": R2, "P1": P1, "P2": P2,
+        "Q": Q, "E": E, "F": F,
+    }  # fmt: skip
+    width, height = camera1.size_px
+    head = f"%YAML:1.0\n---\nimage_width: {width}\nimage_height: {height}\n" + ("fisheye_model: 1\n" if fisheye else "")
+    text = head + "".join(f"{key}: {opencv_matrix(array)}" for key, array in arrays.items())
+    return OpenCVStereo(cameras=chosen, R1=R1, R2=R2, P1=P1, P2=P2, text=text)
+
+
+def read_opencv_stereo(text: str, name: str = "OpenCV stereo") -> tuple[tuple[Camera, Camera], Rigid3]:
+    """Return both cameras and cam2_from_cam1 (mm) of a pair's file; raises InputError for one without the keys."""
+    data = parse_storage(text, name)
+    size = written_size(data, name)
+    found = {key: read_opencv_matrix(data, key, name) for key in KEYS}
+    for key, count in (("R", 9), ("T", 3)):
+        if found[key].size != count:
+            raise InputError(f"'{name}': '{key}' has {found[key].size} numbers instead of {count}; is the file whole?")
+    fisheye = bool(data.get("fisheye_model"))
+    camera1, camera2 = (
+        camera_from_arrays(size, found[f"M{k}"], found[f"D{k}"], fisheye=fisheye, name=name) for k in (1, 2)
+    )
+    try:
+        return (camera1, camera2), Rigid3(found["R"].reshape(3, 3), found["T"])
+    except InputError as error:
+        raise InputError(f"'{name}': R is no rotation; is the file whole?") from error
+
+
+def _family(
+    camera1: Camera, camera2: Camera, outlines: Sequence[Pixels | None]
+) -> tuple[tuple[Written, Written], bool]:
+    """Return both cameras in that family of models that covers more of them, then follows them better."""
+    found = []
+    for fisheye, accepted in enumerate(FAMILIES):
+        try:
+            pair = (
+                best_accepted(camera1, accepted, "OpenCV", outlines[0]),
+                best_accepted(camera2, accepted, "OpenCV", outlines[1]),
+            )
+        except InputError:
+            continue
+        missed = 1.0 - min(one.covered for one in pair)
+        found.append((missed, max(one.max_error_px for one in pair), fisheye, pair))
+    if not found:
+        raise InputError("OpenCV stereo: no family of OpenCV's models follows both lenses; take another format")
+    _, _, fisheye, pair = min(found, key=lambda f: f[:3])
+    return pair, bool(fisheye)
+
+
+def _rectified(
+    intrinsics: tuple[Mat3, FloatArray, Mat3, FloatArray],
+    size_px: tuple[int, int],
+    R: Mat3,
+    T: FloatArray,
+    *,
+    fisheye: bool,
+) -> tuple[FloatArray, ...]:
+    """Return R1, R2, P1, P2, Q of OpenCV, where all pixels of the rectified images are seen (alpha or balance 0)."""
+    found: Sequence[Any]
+    if fisheye:
+        found = cv2.fisheye.stereoRectify(*intrinsics, size_px, R, T, cv2.CALIB_ZERO_DISPARITY, balance=0.0)
+    else:
+        found = cv2.stereoRectify(*intrinsics, size_px, R, T, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0)
+    return tuple(np.asarray(array, dtype=np.float64) for array in found[:5])

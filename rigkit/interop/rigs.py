@@ -16,7 +16,7 @@ from rigkit.interop.colmap_model import quaternion_wxyz
 from rigkit.interop.exchange import MM_PER_M, Written
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
-from rigkit.interop.opencv_stereo import OpenCVStereo, opencv_stereo
+from rigkit.interop.opencv import OpenCVStereo, opencv_stereo
 from rigkit.interop.ros import write_camera_info
 
 Rig = Mapping[str, tuple[Camera, Rigid3]]

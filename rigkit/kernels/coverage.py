@@ -1,11 +1,14 @@
-"""The call of the kernel in coverage.c: which pixels of an image boards covered."""
+"""The kernels in coverage.c and close_pairs.c: which pixels boards covered, and which points lie close together."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, IntArray, Pixels
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.kernels import kernels
+
+USUAL_PARTNERS = 2
+"""Room for so many pairs a point at first; where there are more of them, they are sought again."""
 
 
 def covered_pixels(grid: IntArray, corners: Pixels, counts: IntArray, squares: float, pixels: Pixels) -> BoolArray:
@@ -17,3 +20,14 @@ def covered_pixels(grid: IntArray, corners: Pixels, counts: IntArray, squares: f
     covered = np.empty(len(pixels), dtype=bool)
     kernels().cover_pixels(grid, corners, len(corners), counts, len(counts), squares, pixels, len(pixels), covered)
     return covered
+
+
+def pairs_within(points: FloatArray, reach: float, ends: IntArray) -> IntArray:
+    """Return the pairs (P, 2) of points (N, D) that are within `reach` of each other along every axis; the partners of
+    each are sought between the first and the second, and the third and the fourth of its `ends` (N, 4)."""
+    pairs = np.empty((USUAL_PARTNERS * len(points), 2), np.int64)
+    found = kernels().close_pairs(points, *points.shape, reach, ends, pairs, len(pairs))
+    if found > len(pairs):
+        pairs = np.empty((found, 2), np.int64)
+        kernels().close_pairs(points, *points.shape, reach, ends, pairs, len(pairs))
+    return pairs[:found]

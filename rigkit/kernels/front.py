@@ -171,7 +171,9 @@ def corners(
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
-    """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2), M > 0."""
+    """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2)."""
+    if not len(fresh) or not len(known):
+        return np.zeros(len(fresh), np.bool_)
     mark = np.empty(len(fresh), np.bool_)
     if not kernels().mark_known(fresh, len(fresh), known, len(known), reach, mark):
         raise MemoryError

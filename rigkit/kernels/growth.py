@@ -25,13 +25,7 @@ class GrowthRules(Struct):
     """How lattices grow."""
 
     @classmethod
-    def make(
-        cls,
-        predictions: Sequence[FitRules],
-        ring: RingRules,
-        along: np.ndarray,
-        **numbers: float,
-    ) -> GrowthRules:
+    def make(cls, predictions: Sequence[FitRules], ring: RingRules, along: np.ndarray, **numbers: float) -> GrowthRules:
         """Return the rules; `along` are the places of an edge that are looked at."""
         places = np.ascontiguousarray(along, np.float64)
         both = (FitRules * 2)(*predictions)

@@ -48,10 +48,7 @@ def line_gaps(sides: FloatArray, bends: FloatArray) -> FloatArray:
 
 
 def excess_scatter(
-    pixels: FloatArray,
-    sigma_px: FloatArray,
-    parts: Sequence[tuple[slice, slice]],
-    rules: ScatterRules,
+    pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tuple[slice, slice]], rules: ScatterRules
 ) -> FloatArray:
     """Return what `subpixel.scatter.excess_scatter` does of `pixels` (R, C, 2) and `sigma_px` (R, C), (P,)."""
     where = np.array(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels import kernels
@@ -51,32 +53,16 @@ class ViewSums:
     def of(cls, seen: BoardViews, across: int) -> ViewSums:
         """Return the sums of K = `across` rows, with no view added yet."""
         v, c, r = seen.views, seen.corners, seen.released
-        residuals, valid, costs = np.empty((2, v, c)), np.empty((v, c), dtype=bool), np.empty(v)
-        products, own, poses = np.empty((v, across, across)), np.zeros((r, 3, across + 3)), np.zeros((v, r, 3, 6))
-        struct = _ViewSumsStruct.of(
-            residuals=residuals,
-            valid=valid,
-            costs=costs,
-            products=products,
-            own=own,
-            poses=poses,
-            views=v,
-            corners=c,
-            across=across,
-            released=r,
-        )
-        memory = np.empty(kernels().rows_memory(across))
-        return cls(
-            seen=seen,
-            residuals=residuals,
-            valid=valid,
-            costs=costs,
-            products=products,
-            own=own,
-            poses=poses,
-            _memory=memory,
-            _struct=struct,
-        )
+        arrays: dict[str, NDArray[Any]] = {
+            "residuals": np.empty((2, v, c)),
+            "valid": np.empty((v, c), dtype=bool),
+            "costs": np.empty(v),
+            "products": np.empty((v, across, across)),
+            "own": np.zeros((r, 3, across + 3)),
+            "poses": np.zeros((v, r, 3, 6)),
+        }
+        struct = _ViewSumsStruct.of(**arrays, views=v, corners=c, across=across, released=r)
+        return cls(seen=seen, **arrays, _memory=np.empty(kernels().rows_memory(across)), _struct=struct)
 
     def add(
         self,

@@ -1,4 +1,11 @@
-"""Calls of the kernels in pose_quality.c and pose_minimum.c: hypotheses of the relative pose against many matches."""
+"""Calls of the kernels in five_point.c and six_point.c, which give hypotheses of the relative pose from many minimal
+samples, and of those in pose_quality.c and pose_minimum.c, which hold these against many matches.
+
+Five equations (five points, or one affine correspondence and two points): ten cubics in three unknowns, solved by a
+polynomial in one of them (Nister, "An efficient solution to the five-point relative pose problem", 2004). Six (two
+affine correspondences): ten cubics in two unknowns, linear in their ten monomials (Eichhardt and Barath; Raposo and
+Barreto).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +16,7 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-NO_MEMORY = header().constants["NO_MEMORY"]
+NO_MEMORY, MAX_ROOTS = (header().constants[name] for name in ("NO_MEMORY", "MAX_ROOTS"))
 
 
 @structure("pose_problem_t")
@@ -39,13 +46,7 @@ def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: flo
 
 
 def improve(
-    packed: FloatArray,
-    R: FloatArray,
-    t: FloatArray,
-    noise: float,
-    free: IntArray,
-    most_steps: int,
-    settled_rad: float,
+    packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, free: IntArray, most_steps: int, settled_rad: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
@@ -91,3 +92,22 @@ def minimise(
     if iterations == NO_MEMORY:
         raise MemoryError
     return R, t, r, jacobian, weights, abs(iterations), iterations > 0 or not len(free)
+
+
+def five_rows(rows: FloatArray) -> Mat3:
+    """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
+    out = np.empty((len(rows), MAX_ROOTS, 3, 3))
+    kernels().five_rows(rows, len(rows), out)
+    return out
+
+
+def six_rows(rows: FloatArray) -> Mat3:
+    """Return the E (B, 1, 3, 3) of `rows` (B, 6, 9): nearest to the matrix whose monomials violate the ten cubics
+    least.
+
+    The monomials are scaled so that the answer does not depend on the choice of the basis: all 27 products of three of
+    the unknowns, of which ten differ, have the length one together.
+    """
+    out = np.empty((len(rows), 1, 3, 3))
+    kernels().six_rows(rows, len(rows), out)
+    return out

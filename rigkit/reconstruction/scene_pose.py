@@ -167,11 +167,7 @@ def fit_scene_pose(
 
 
 def _fitted(
-    matches: Matches,
-    declared: PoseType,
-    level_sigma_rad: float | None,
-    rng: np.random.Generator,
-    start: Rigid3 | None,
+    matches: Matches, declared: PoseType, level_sigma_rad: float | None, rng: np.random.Generator, start: Rigid3 | None
 ) -> ScenePose:
     pose, pose_type = start, declared
     if pose is None:

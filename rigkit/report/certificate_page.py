@@ -58,11 +58,7 @@ def certificate_facts(certificate: Certificate, limit: float | None = None) -> P
         passed, badge = False, "not to be trusted"
     sentences = [*map(_sentence, bad), *sentences, *map(_sentence, others)]
     return PageFacts(
-        headline=headline,
-        badge=badge,
-        passed=passed,
-        sentences=tuple(sentences),
-        tables=(causes_table(certificate),),
+        headline=headline, badge=badge, passed=passed, sentences=tuple(sentences), tables=(causes_table(certificate),)
     )
 
 

@@ -207,11 +207,7 @@ def run_coach(options: CoachOptions, told: Callable[[str], None], progress: Prog
 
 
 def _run(
-    options: CoachOptions,
-    coach: Coach,
-    frames: Iterator[Frame] | None,
-    told: Callable[[str], None],
-    progress: Progress,
+    options: CoachOptions, coach: Coach, frames: Iterator[Frame] | None, told: Callable[[str], None], progress: Progress
 ) -> None:
     token = new_token()
     host = own_address() if options.lan else LOCALHOST

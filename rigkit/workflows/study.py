@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.core.processes import process_count
+from rigkit.core.processes import over_items, process_count
 from rigkit.core.progress import Progress, silent
 from rigkit.io.corner_cache import source_hash
 from rigkit.io.files import ensure_writable, write_atomic, write_together
@@ -30,7 +30,6 @@ from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
 from rigkit.workflows.provenance import software_facts
-from rigkit.workflows.spread import over_items
 
 Errors = NDArray[np.float32]
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.core.errors import DegenerateError, ExitCode, InputError, RigkitError
+from rigkit.core.processes import over_items
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.manifest import load_dataset
@@ -18,7 +19,6 @@ from rigkit.report.tables import table_files
 from rigkit.validation.tables import mean_normal_error
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
-from rigkit.workflows.spread import over_items
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
 
 

@@ -19,8 +19,7 @@ from rigkit.interop.colmap_cameras import write_colmap_cameras
 from rigkit.interop.kalibr import write_kalibr
 from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.ocamcalib import write_ocamcalib
-from rigkit.interop.opencv import write_opencv
-from rigkit.interop.opencv_stereo import opencv_stereo
+from rigkit.interop.opencv import opencv_stereo, write_opencv
 from rigkit.interop.ros import write_camera_info
 from rigkit.io import corner_cache
 from rigkit.io.corners_file import corners_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import rigkit.kernels.close_pairs as kernel
+import rigkit.kernels.coverage as kernel
 from rigkit.calibration.views.repeats import close_pairs
 from rigkit.core.arrays import FloatArray
 

@@ -15,7 +15,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.matches import Matches
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.kernels.minimal import five_rows, six_rows
+from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import MarginalLoss
 from rigkit.relative_pose.refinement.pose_problem import PoseProblem, RobustWeights, cauchy_weights

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.epipolar_scenes import FISHEYE, REGULAR, pair
 
-from rigkit.kernels.minimal import five_rows, six_rows
+from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.relative_pose.solvers.planar import planar_from_two_rows
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, point_rows

@@ -77,20 +77,14 @@ WAYS = {
         "boards are sheared as if they moved while the image was read row by row (rolling shutter)",
         "hold camera and board still while an image is taken, on a stand, or expose for a shorter time",
     ),
-    "bend": _Way(
-        "the board is bent otherwise in every image",
-        "glue it to something stiff, and retake all",
-    ),
+    "bend": _Way("the board is bent otherwise in every image", "glue it to something stiff, and retake all"),
 }
 
 
 OF_LENS = ("focus", "shift", "lens")
 """The last is both of the others, for a zoom whose centre is not the lens's."""
 MOTION = ("rows", NO_CHANGE)
-MOVED = _Way(
-    "boards or the camera moved while the image was read (rolling shutter)",
-    WAYS["rows"].remedy,
-)
+MOVED = _Way("boards or the camera moved while the image was read (rolling shutter)", WAYS["rows"].remedy)
 """A pose that follows a sheared board leaves nearly the same of a motion over rows as of one over columns. Where rows
 are best, and both explain nearly all, far better than all else, it was a motion, unless a bend of each board is the
 main part, too: a lens or board unlike its model shows as that."""

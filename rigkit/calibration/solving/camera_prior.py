@@ -41,12 +41,7 @@ def _expected(names: tuple[str, ...], size_px: tuple[int, int]) -> tuple[FloatAr
     """Return d r / d parameters (m, P), and the parameters (P,) of which r = 0; the last row, where there are two focal
     lengths, is theirs, and empty: it depends on them."""
     middle, reach = image_center(size_px).tolist(), CENTRE_SIGMA * max(size_px)
-    expected = {
-        "cx": (middle[0], reach),
-        "cy": (middle[1], reach),
-        "c": (1.0, SQUARE_SIGMA),
-        "d": (0.0, SQUARE_SIGMA),
-    }
+    expected = {"cx": (middle[0], reach), "cy": (middle[1], reach), "c": (1.0, SQUARE_SIGMA), "d": (0.0, SQUARE_SIGMA)}
     if "k6" in names:
         expected |= dict.fromkeys(("k4", "k5", "k6"), (0.0, DENOMINATOR_SIGMA))
     known = [name for name in expected if name in names]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
-from rigkit.kernels.close_pairs import pairs_within
+from rigkit.kernels.coverage import pairs_within
 
 REPEATED_PX = 0.5
 """Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""

@@ -11,10 +11,10 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.checks.evidence import Evidence
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.local_fit import STIFF, fit_cells
-from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.kernels import lattice as native
+from rigkit.kernels.front import near_any
 
 STRAY_ROW = 2
 """An outer row of so many corners or fewer, most of whose other corners should be in view too, is not of the board."""

@@ -62,13 +62,7 @@ def plane_basis(hexagonal: bool) -> FloatArray:
 
 
 def local_maps(
-    label: IntArray,
-    pixels: FloatArray,
-    places: IntArray,
-    *,
-    hexagonal: bool,
-    sigma_px: float,
-    leave_out: bool = False,
+    label: IntArray, pixels: FloatArray, places: IntArray, *, hexagonal: bool, sigma_px: float, leave_out: bool = False
 ) -> PlaneMap:
     """Return the maps around the `places` (M, 2) of a lattice, from its circles at `label` (N, 2) and `pixels` (N, 2).
 

@@ -22,10 +22,10 @@ from rigkit.detection.lattice.links import (
     MIN_EDGE_PLACES,
 )
 from rigkit.detection.lattice.local_fit import PLIANT, STIFF
-from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.detection.saddles.saddle import Saddles
+from rigkit.kernels.front import near_any
 from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules, grown
 
 MAX_RINGS = 60

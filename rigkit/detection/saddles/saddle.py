@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.saddles.nearby import near_any
 from rigkit.detection.saddles.response import Level, peaks
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.kernels import front
+from rigkit.kernels.front import near_any
 
 RING_RADIUS = 2.6
 """Of the ring, in pixels of the level: fits squares of 6 px, and 5 where they are seen straight on."""

@@ -18,7 +18,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray, upper_median
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry
-from rigkit.kernels.paper import PaperRules, find_paper
+from rigkit.kernels.light import PaperRules, find_paper
 
 MIN_PAPER_BLUR = 1.0
 """In a sharper image, px, what lies beyond the outermost squares moves corners by less than half their sigma, even of

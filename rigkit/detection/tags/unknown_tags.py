@@ -152,11 +152,7 @@ class TagSightings:
         cells = grid_turned(squares[own], (columns - 1, rows - 1), -turn)
         upright, places = np.roll(quads[own], -turn, axis=1), cells // 2
         seen = _SeenTags(
-            image=index,
-            kind=(*family, False),
-            numbers=codes.number[own],
-            places=places,
-            steps=_steps(upright, places),
+            image=index, kind=(*family, False), numbers=codes.number[own], places=places, steps=_steps(upright, places)
         )
         counted = seen.counted()
         # Small families read something in most squares, but do not count with it.

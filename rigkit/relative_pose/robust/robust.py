@@ -19,7 +19,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType, axis_of
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.kernels.minimal import five_rows, six_rows
+from rigkit.kernels.pose import five_rows, six_rows
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 from rigkit.relative_pose.refinement.local import SampsonRows
 from rigkit.relative_pose.refinement.marginal import QUANTILE, MarginalLoss, marginal_quality
