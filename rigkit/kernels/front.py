@@ -86,7 +86,7 @@ def shrunk(image: GreyImage, factor: int) -> Image:
     sums = np.empty(2 * width, np.uint16) if bytewise else np.empty(width, np.float32)
     out = np.empty((height // factor, width // factor), np.float32)
     shrink = kernels().shrink_bytes if bytewise else kernels().shrink_floats
-    shrink(image, height, width, factor, sums, out)
+    shrink(np.ascontiguousarray(image), height, width, factor, sums, out)
     return out
 
 
@@ -100,10 +100,10 @@ def smoothed(image: GreyImage, kernel: Image) -> tuple[Image, Image]:
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
     if image.dtype == np.uint8:
         column = np.empty(width + 4, np.uint16)
-        kernels().smooth_bytes(image, height, width, kernel, WHOLE, column, smooth, half)
+        kernels().smooth_bytes(np.ascontiguousarray(image), height, width, kernel, WHOLE, column, smooth, half)
     else:
         sums = np.empty(width + 4, np.float32)
-        kernels().smooth_floats(image, height, width, kernel, sums, smooth, half)
+        kernels().smooth_floats(np.ascontiguousarray(image), height, width, kernel, sums, smooth, half)
     return smooth, half
 
 
