@@ -111,7 +111,8 @@ def test_what_is_only_read_may_be_of_another_type_or_order_and_empty() -> None:
     E21 = np.random.default_rng(4).normal(size=(2, 3, 3))
     wanted = qualities(packed, E21, 2.0)
     doubled = np.repeat(packed, 2, axis=1)
-    for same in (packed.astype(np.float32), packed.astype(np.int32), packed.T.copy().T, doubled[:, ::2]):
+    others: list[np.ndarray] = [packed.astype(np.float32), packed.astype(np.int32), packed.T.copy().T, doubled[:, ::2]]
+    for same in others:
         np.testing.assert_array_equal(qualities(same, E21, 2.0), wanted)
         same.flags.writeable = False
         np.testing.assert_array_equal(qualities(same, E21, 2.0), wanted)
