@@ -111,7 +111,8 @@ typedef struct {
 
 EXPORT void fit_planes(
     const plane_grid_t *grid, ARRAY(double, planes, grid.rows, grid.columns, 3),
-    ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns));
+    ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns),
+    ARRAY(double, squares, grid.rows, grid.columns));
 
 /* sweep.c */
 

@@ -92,7 +92,7 @@ INLINE void add_neighbours(const sums_t *sums, const double *there, const int fi
         }
         square = square < 0.0 ? 0.0 : square;
         const double part = 1.0 / (1.0 + square * loss), weight = at[TERM_SEEN * sums->size] * part * part;
-        for (int64_t k = 0; k < TERM_C; k++)
+        for (int64_t k = 0; k < TERM_SEEN; k++)
             fits->sum[k][l] += weight * at[k * sums->size];
         fits->sum[TERM_SEEN][l] += weight;
     }
@@ -114,13 +114,14 @@ INLINE void solve_planes(fits_t *fits)
     }
 }
 
-/* Fill planes, the normal matrices of their fits, and the sums of weights; NaN where there is no plane. */
-FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double *normals, double *support)
+/* Fill planes, the normal matrices of their fits, the sums of weights, and those of weighted squares of the distances from
+ * the planes; NaN where there is no plane. */
+FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double *normals, double *support, double *squares)
 {
     static const int entry[9] = {XX, XY, XZ, XY, YY, YZ, XZ, YZ, ZZ};
     const double loss = 1.0 / (3.0 * g->turn * g->turn);
     for (int64_t k = 0; k < g->rows * g->columns; k++) {
-        support[k] = NAN;
+        support[k] = squares[k] = NAN;
         for (int64_t n = 0; n < 3; n++)
             planes[3 * k + n] = NAN;
         for (int64_t n = 0; n < 9; n++)
@@ -159,8 +160,13 @@ FOR_EACH_PROCESSOR void fit_planes(const plane_grid_t *g, double *planes, double
                 if (!(here[TERM_SEEN * sums.size + l] > 0.0 && isfinite(fits.plane[0][l])))
                     continue;
                 support[at] = fits.sum[TERM_SEEN][l];
-                for (int64_t k = 0; k < 3; k++)
+                /* At the minimum b'm is m'N m. */
+                squares[at] = fits.sum[TERM_C][l];
+                for (int64_t k = 0; k < 3; k++) {
                     planes[3 * at + k] = fits.plane[k][l];
+                    squares[at] -= fits.sum[TERM_B + k][l] * fits.plane[k][l];
+                }
+                squares[at] = squares[at] > 0.0 ? squares[at] : 0.0;
                 for (int64_t k = 0; k < 9; k++)
                     normals[9 * at + k] = fits.sum[TERM_N + entry[k]][l];
             }

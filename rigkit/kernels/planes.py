@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from rigkit.core.arrays import FloatArray
@@ -14,10 +16,20 @@ class _PlaneGrid(Struct):
     """What the nodes say, and how planes are fitted."""
 
 
+class FittedPlanes(NamedTuple):
+    """Planes (R, C, 3), the normal matrices of their fits (R, C, 3, 3), the sums of weights (R, C), and those of
+    weighted squares (R, C) of Mahalanobis' distances from them. NaN where there is none."""
+
+    planes: FloatArray
+    normals: FloatArray
+    support: FloatArray
+    squares: FloatArray
+
+
 def fitted_planes(
     values: FloatArray, information: FloatArray, frames: FloatArray, *, reach: int, rounds: int, turn: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the planes (R, C, 3), the normal matrices of their fits (R, C, 3, 3) and the sums of weights (R, C).
+) -> FittedPlanes:
+    """Return the planes through what nodes say.
 
     `values` (R, C, 3), NaN where there are none, their `information` (R, C, 3, 3) and `frames` (R, C, 3, 3), by which
     a plane predicts them. Of a neighbour at the Mahalanobis distance s from a plane the weight is
@@ -34,6 +46,7 @@ def fitted_planes(
         rounds=rounds,
         turn=turn,
     )
-    planes, normals, support = np.empty((rows, columns, 3)), np.empty((rows, columns, 3, 3)), np.empty((rows, columns))
-    kernels().fit_planes(grid, planes, normals, support)
-    return planes, normals, support
+    planes, normals = np.empty((rows, columns, 3)), np.empty((rows, columns, 3, 3))
+    support, squares = np.empty((2, rows, columns))
+    kernels().fit_planes(grid, planes, normals, support, squares)
+    return FittedPlanes(planes, normals, support, squares)

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from rigkit.affine.refine_patches import WINDOW_OF_PATCH
 from rigkit.affine.surface import linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
@@ -23,6 +24,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.kernels.planes import fitted_planes
+from rigkit.optim.local_variances import of_redescending, shrunk_variances
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 from rigkit.reconstruction.growing.grow import HALF_WIDTH, GrownPatches, only
 
@@ -35,8 +37,12 @@ MIN_NODE_SUPPORT = 0.2
 """Share of the nodes around, in sum of weights, that a plane needs: fewer agree by chance, or across an edge."""
 MAX_STEP_PX = 1.0
 """By which planes differ from node to node on one surface."""
-MIN_COMPARED = 50
-"""Nodes whose median says how well nodes agree with their planes."""
+MIN_COMPARED = 200
+"""Pairs of planes whose median says by how much they disagree: to a tenth."""
+GROUPS_A_DOUBLING = 2
+"""Of such pairs, by the variance around them."""
+WINDOW_AREA_PX = 4.0 * np.pi * (WINDOW_OF_PATCH * HALF_WIDTH) ** 2
+"""px^2 of an image to which a Gaussian window adds one independent number."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -176,10 +182,11 @@ class PairRays:
 def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -> GrownSurface:
     """Return the planes around all nodes, which are `step` px apart.
 
-    Their covariance is scaled by what planes disagree by that share no node: neighbouring patches share their pixels,
-    and surfaces are not flat. Those of a sweep are scaled apart: its errors are alike further around. Where a surface
-    ends windows see another one too, and nodes miss their planes by more: so much more their errors are. `shared_px` is
-    what all places around err by together along their epipolar lines.
+    Their covariance is scaled by what the nodes around miss them by, as far as that differs from place to place by more
+    than chance: windows that show another surface, a highlight or a bend err by more than their noise. Then by what
+    planes disagree by that share no node, where as many miss: neighbouring patches share their pixels, and surfaces are
+    not flat. Those of a sweep are scaled apart: its errors are alike further around. `shared_px` is what all places
+    around err by together along their epipolar lines.
 
     Notes
     -----
@@ -190,27 +197,33 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     reach = max(2, round(PLANE_REACH_PX / step))
     valid = np.isfinite(measured.z[..., 0])
     covariance = np.where(valid[..., None, None], measured.covariance, np.eye(3))
-    plane, normal, support = fitted_planes(
+    fits = fitted_planes(
         measured.z, np.linalg.inv(covariance), measured.frame, reach=reach, rounds=SMOOTHING_ROUNDS, turn=TURN_OF_LOSS
     )
+    plane = fits.planes
     with np.errstate(divide="ignore", invalid="ignore"):
         ray = measured.frame[..., 0, :]
         inverse = np.sum(plane * ray, axis=-1)
-        keep = (inverse > 0.0) & (support >= MIN_NODE_SUPPORT * (2 * reach + 1) ** 2)
+        keep = (inverse > 0.0) & (fits.support >= MIN_NODE_SUPPORT * (2 * reach + 1) ** 2)
         points = ray / inverse[..., None]
         normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
-        # How far the own range of a node is from the plane, px along the epipolar line.
-        misfit = (measured.z[..., 0] - inverse) * measured.slope
-    spread = np.full(normal.shape, np.nan)
-    spread[keep] = _inverse(normal[keep])
+    spread = np.full(fits.normals.shape, np.nan)
+    spread[keep] = _inverse(fits.normals[keep])
+    missed = of_redescending(fits.squares / (3.0 * fits.support), TURN_OF_LOSS)
+    # Of numbers whose correlation falls as a Gaussian half as many are one to their squares as to themselves.
+    around = cv2.boxFilter(
+        valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
+    freedom = np.maximum(3.0 * around * step**2 / (0.5 * WINDOW_AREA_PX), 1.0)
     at_end = _at_ends(only(keep, plane), measured, step)
-    missed = np.abs(misfit) / (measured.slope * np.sqrt(measured.covariance[..., 0, 0]))
     for alike in (keep & measured.swept, keep & ~measured.swept):
-        scale = _disagreement(only(alike, normals), only(alike, plane), only(alike, spread), 2 * reach)
-        spread[alike] *= max(scale, 1.0) ** 2
-        ends, inner = missed[alike & at_end], missed[alike & ~at_end]
-        if min(ends.size, inner.size) >= MIN_COMPARED:
-            spread[alike & at_end] *= max(float(np.median(ends) / np.median(inner)), 1.0) ** 2
+        local = np.full(valid.shape, np.nan)
+        local[alike] = shrunk_variances(missed[alike], freedom[alike])
+        scale = _disagreement(
+            only(alike, normals), only(alike, plane), local[..., None, None] * spread, local, 2 * reach
+        )
+        # No less than what patches state of their noise.
+        spread[alike] *= np.maximum(local * np.maximum(scale, 1.0) ** 2, 1.0)[alike][:, None, None]
     spread += ((shared_px / measured.slope) ** 2)[..., None, None] * ray[..., :, None] * ray[..., None, :]
     return GrownSurface(
         points=only(keep, points),
@@ -237,18 +250,34 @@ def _at_ends(plane: FloatArray, measured: NodeMeasurements, step: int) -> BoolAr
     return np.asarray(far * step <= HALF_WIDTH + step)
 
 
-def _disagreement(normals: Normals, plane: FloatArray, covariance: FloatArray, lag: int) -> float:
-    """Return by how many of their standard deviations the normals of nodes `lag` apart differ; 1 where none do."""
+def _disagreement(
+    normals: Normals, plane: FloatArray, covariance: FloatArray, scatter: FloatArray, lag: int
+) -> FloatArray:
+    """Return by how many of their standard deviations the normals of nodes `lag` apart differ, (R, C); 1 where none do.
+
+    It is a function of `scatter` (R, C), by what nodes around miss the planes: errors that neighbours share, as all
+    windows see the same highlight or edge, are where they scatter, too, and do not show in that.
+    """
     across = np.eye(3) - normals[..., :, None] * normals[..., None, :]
     variance = np.einsum("...ij,...jk,...ik->...", across, covariance, across) / np.sum(plane**2, axis=-1)
-    ratios = []
+    ratios, scatters = [], []
     for one, other in ((np.s_[:, :-lag], np.s_[:, lag:]), (np.s_[:-lag], np.s_[lag:])):
         angle = angle_between(normals[one], normals[other])
-        ratios.append((angle / np.sqrt(variance[one] + variance[other])).ravel())
-    ratio = np.concatenate(ratios)
-    ratio = ratio[np.isfinite(ratio)]
+        both = variance[one] + variance[other]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios.append((angle / np.sqrt(both)).ravel())
+            scatters.append(((variance[one] * scatter[one] + variance[other] * scatter[other]) / both).ravel())
+    ratio, at = np.concatenate(ratios), np.concatenate(scatters)
+    known = np.isfinite(ratio) & (at > 0.0)
+    if not known.any():
+        return np.ones(scatter.shape)
+    ratio, at = ratio[known], at[known]
+    group = np.rint(np.log2(at) * GROUPS_A_DOUBLING)
+    groups = [group == g for g in np.unique(group)]
+    enough = [g for g in groups if g.sum() >= MIN_COMPARED] or [group == group]
     # The angle has two components.
-    return float(np.median(ratio)) * np.sqrt(2.0) / MEDIAN_OF_RAYLEIGH if ratio.size else 1.0
+    scale = [float(np.median(ratio[g])) * np.sqrt(2.0) / MEDIAN_OF_RAYLEIGH for g in enough]
+    return np.asarray(np.interp(scatter, [float(np.median(at[g])) for g in enough], scale))
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

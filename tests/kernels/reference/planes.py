@@ -7,17 +7,19 @@ import numpy as np
 
 def fitted_planes(
     values: np.ndarray, information: np.ndarray, frames: np.ndarray, *, reach: int, rounds: int, turn: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return planes (R, C, 3), normal matrices (R, C, 3, 3) and sums of weights (R, C)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return planes (R, C, 3), normal matrices (R, C, 3, 3), sums of weights and of weighted squares (R, C)."""
     valid = np.isfinite(values[..., 0])
     F, z = np.nan_to_num(frames), np.nan_to_num(values)
     W = np.where(valid[..., None, None], information, np.eye(3))
     weighted = np.swapaxes(F, -1, -2) @ W
     own, own_right = weighted @ F, (weighted @ z[..., None])[..., 0]
     plane, spread = solved(own, own_right, valid)
-    normal, support = own, np.zeros(valid.shape)
+    size = np.einsum("...i,...ij,...j->...", z, W, z)
+    normal, support, squares = own, np.zeros(valid.shape), np.zeros(valid.shape)
     for k in range(rounds):
-        normal, right, support = np.zeros_like(own), np.zeros_like(own_right), np.zeros(valid.shape)
+        normal, right = np.zeros_like(own), np.zeros_like(own_right)
+        support, squares = np.zeros(valid.shape), np.zeros(valid.shape)
         for dv in range(-reach, reach + 1):
             for du in range(-reach, reach + 1):
                 here, there = shifted(valid.shape, dv, du)
@@ -31,8 +33,14 @@ def fitted_planes(
                 normal[here] += weight[..., None, None] * own[there]
                 right[here] += weight[..., None] * own_right[there]
                 support[here] += weight
+                squares[here] += weight * size[there]
         plane, spread = solved(normal, right, valid)
-    return plane, np.where(valid[..., None, None], normal, np.nan), np.where(valid, support, np.nan)
+    squares -= np.sum(right * plane, axis=-1)
+    return (
+        plane,
+        np.where(valid[..., None, None], normal, np.nan),
+        *(np.where(valid, v, np.nan) for v in (support, squares)),
+    )
 
 
 def solved(normal: np.ndarray, right: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
