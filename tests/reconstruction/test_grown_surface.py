@@ -76,6 +76,6 @@ def test_sigmas_hold_where_nodes_err_by_more_than_they_state(where: BoolArray, t
     both = [range_errors(fitted(np.where(where, times, 1.0), np.random.default_rng(k))) for k in range(8)]
     for part in (where, ~where):
         within = np.concatenate([(off / sigma)[part & np.isfinite(off)] for off, sigma in both])
-        # Some 15 planes of a part share no node, eight times: of the normal one's 68 and 95 % a share is known to 4 and 2.
+        # Some 15 planes of a part share no node, eight times: of 68 and 95 % a share is known to 4 and 2.
         assert 0.54 < np.mean(within < 1.0) < 0.82
         assert np.mean(within < 2.0) > 0.88

@@ -124,3 +124,14 @@ def test_the_field_of_a_known_pose_is_measured(rng: np.random.Generator) -> None
         found = pose_with_lens_errors(m, BOTH, pose, PoseType.STANDARD, None, 1.0)
         # One draw of four waves, of which the part across the epipolar lines is seen.
         assert found.misfit_px < 0.06 if amplitude_px == 0.0 else 0.1 < found.misfit_px < 0.6
+
+
+def test_pairs_that_a_known_pose_is_turned_away_from_err_by_that(rng: np.random.Generator) -> None:
+    """Of rectified images whose rows are a tenth of a pixel apart, columns may be as well."""
+    m, pose, _ = pair(rng, 1500, "standard", noise_px=NOISE_PX)
+    sigma = np.full(len(m), NOISE_PX)
+    shifted = np.array(m.pixels2) + np.array([0.0, 0.1])
+    m = Matches.from_cameras(REGULAR, REGULAR, m.pixels1, shifted, sigma1_px=sigma, sigma2_px=sigma)
+    assert 0.08 < pose_with_lens_errors(m, BOTH, pose, PoseType.STANDARD, None, 1.0).misfit_px < 0.13
+    # A pose that is estimated follows, and nothing is left.
+    assert pose_with_lens_errors(m, BOTH, pose, PoseType.GENERAL, None, 1.0).misfit_px < 0.06

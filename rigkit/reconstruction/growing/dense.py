@@ -23,7 +23,7 @@ from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
-from rigkit.reconstruction.growing.surface import GrownSurface, PairRays, fit_surface
+from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs, seen_by_all
@@ -50,8 +50,8 @@ POSE_STEP_RAD = 1e-5
 """For differences of planes: far above rounding, far below where they bend."""
 SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
-WINDOW_OVERLAP = 3.5
-"""Pairs on the nodes of a pose whose windows share their pixels: 4 pi 4.2^2 px^2 of a window to 64 px^2 of a node."""
+WINDOW_OVERLAP = WINDOW_AREA_PX / POSE_STEP**2
+"""Pairs on the nodes of a pose whose windows share their pixels."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

@@ -2,7 +2,8 @@
 
 What a calibration leaves is mostly along the radius and alike all around (a curve too stiff, a focal length), then of a
 lens whose axis or plane is tilted (of first order in the azimuth; D. C. Brown, "Decentering Distortion of Lenses",
-1966), then anything smooth. The part that is a rotation of the camera is kept apart: no pair of images shows it.
+1966), then anything smooth. The part that is a rotation of the camera is kept apart where the pose is free to follow
+it: no pair of images shows it then. A pose that is told does not follow, and pairs are off by that part too.
 
 These are not the displacements with which calibrations count (`kernels.departures`), though they were tried: alone they
 leave poses twice as far off, for pairs show ripples that no such polynomial is. Beside the waves over the image they do
@@ -35,7 +36,8 @@ class ErrorModes(NamedTuple):
     Attributes
     ----------
     displacements : (N, 2, K) px at the pixels that were asked for.
-    turns : (3, K) rad by which the camera turns with each mode; the displacements are without it.
+    turns : (3, K) rad by which the camera turns with each mode; the displacements are without it. Zero where they are
+        with it.
     families : (K,) 0 along the radius, 1 of a tilt, 2 anything smooth.
     """
 
@@ -44,8 +46,11 @@ class ErrorModes(NamedTuple):
     families: IntArray
 
 
-def error_modes(camera: Camera, pixels: Pixels) -> ErrorModes:
-    """Return the modes at pixels (N, 2), which all have rays and tell how much of the image is used."""
+def error_modes(camera: Camera, pixels: Pixels, *, free_to_turn: bool) -> ErrorModes:
+    """Return the modes at pixels (N, 2), which all have rays and tell how much of the image is used.
+
+    Of a camera that is not `free_to_turn` they are with what a turn of it does to the image.
+    """
     axis, valid = camera.project(np.array([0.0, 0.0, 1.0]))
     centre = axis if valid else image_center(camera.size_px)
     radius = float(np.linalg.norm(pixels - centre, axis=1).max())
@@ -60,7 +65,9 @@ def error_modes(camera: Camera, pixels: Pixels) -> ErrorModes:
     modes, families = _modes(everywhere, centre, radius, camera.size_px)
     by_turn = _by_turn(camera, everywhere)
     flat = modes[:count].reshape(2 * count, -1)
-    turns = np.linalg.lstsq(by_turn[:count].reshape(2 * count, 3), flat, rcond=None)[0]
+    turns: FloatArray = np.zeros((3, len(families)))
+    if free_to_turn:
+        turns = np.linalg.lstsq(by_turn[:count].reshape(2 * count, 3), flat, rcond=None)[0]
     modes -= by_turn @ turns
     size = np.sqrt(np.bincount(families, weights=np.mean(np.sum(modes[:count] ** 2, axis=1), axis=0)))[families]
     return ErrorModes(modes[count:] / size, turns / size, families)
