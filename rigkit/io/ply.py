@@ -1,7 +1,7 @@
 """Oriented clouds and triangle meshes as PLY files that Open3D, CloudCompare and MeshLab read as they are.
 
 Binary, little endian. Names of the properties are those that these programs know (x y z nx ny nz red green blue); what
-they do not know (board, column, row, sigma_mm, normal_sigma_deg) they show as scalar fields.
+they do not know (sigma_mm, normal_sigma_deg; of clouds with boards also board, column, row) they show as scalar fields.
 """
 
 from __future__ import annotations
@@ -95,13 +95,13 @@ def ply_bytes(
         known = np.isfinite(sigma) & (sigma > 0.0)
         usual = float(np.median(sigma[known])) if known.any() else 1.0
         normals = normals * (usual / np.where(known, sigma, usual))[:, None]
+    # A scene without boards has no places on them.
+    on_boards = (("board", cloud.board_index), *zip(("column", "row"), cloud.grid.T, strict=True))
     columns: list[tuple[str, str, NDArray[np.generic]]] = [
         *((name, real, cloud.points_mm[:, i]) for i, name in enumerate(POINT)),
         *((name, real, normals[:, i]) for i, name in enumerate(NORMAL_COLUMNS)),
         *((name, "uchar", cloud.colours[:, i]) for i, name in enumerate(COLOUR)),
-        ("board", "int", cloud.board_index),
-        ("column", "int", cloud.grid[:, 0]),
-        ("row", "int", cloud.grid[:, 1]),
+        *((name, "int", values) for name, values in on_boards if (cloud.board_index >= 0).any()),
         ("sigma_mm", real, cloud.sigma_mm),
         ("normal_sigma_deg", real, np.rad2deg(cloud.normal_sigma_rad)),
     ]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.depth_edge import square_before_wall
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.cli.main import main
@@ -31,6 +32,15 @@ def test_open3d_reads_it_unchanged(cloud_file: Path) -> None:
     tensor = open3d.t.io.read_point_cloud(cloud_file)
     np.testing.assert_array_equal(tensor.point["board"].numpy().ravel(), cloud.board_index)
     np.testing.assert_array_equal(tensor.point["sigma_mm"].numpy().ravel(), cloud.sigma_mm)
+
+
+def test_a_scene_without_boards_has_no_places_on_them() -> None:
+    cloud = square_before_wall()
+    data = ply_bytes(cloud, single_precision=True)
+    header, rest = data.split(b"end_header\n", 1)
+    named = [line.split()[-1] for line in header.decode().splitlines() if line.startswith("property")]
+    assert named == [*"xyz", "nx", "ny", "nz", "red", "green", "blue", "sigma_mm", "normal_sigma_deg"]
+    assert len(rest) == 35 * len(cloud)
 
 
 def test_single_precision_for_programs_that_know_no_other(tmp_path: Path) -> None:
