@@ -41,6 +41,8 @@ PLANE_PX = 7
 as rigkit's planes are off (REAL)."""
 MAX_UNEVEN_PX = 0.15
 """Where truth is a plane: over so many pixels, to this part of a disparity."""
+COMPLETE_PX = (1.0, 2.0, 4.0)
+"""Errors of disparities up to which a range counts as given."""
 EDGE_REL = 0.03
 """By which the inverse range jumps from pixel to pixel at an edge; twice what it does beside it."""
 BESIDE_PX = (0.0, 2.5, 5.0, 10.0, np.inf)
@@ -212,6 +214,8 @@ def errors_in_sigmas(dense: DenseScene, distance: np.ndarray) -> list[str]:
                 told.append(f"{near:g}-{far:g} px {most} ({100 * flies[k].mean():.1f} % fly)")
         lines.append(f"{words}, 68/95 % within sigmas, from edges: {', '.join(told)}")
     known = np.isfinite(off)
+    one, two = (100 * np.mean(sigmas[known] < most) for most in (1.0, 2.0))
+    lines.append(f"{one:.1f} % within one sigma, {two:.1f} % within two")
     lines.append(f"{100 * flies[known].mean():.2f} % off by over {FLYING_SIGMAS:g} sigmas and {100 * NEAR_REL:.0f} %")
     return lines
 
@@ -244,6 +248,34 @@ def semi_global(case: Case) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x * depth[v, u][:, None], normals[v, u], np.stack([u, v], axis=-1).astype(np.float64)
 
 
+def beside_semi_global(case: Case, dense: DenseScene) -> None:
+    """Print how StereoSGBM does on a rectified pair, and what shares of the nodes' true ranges both give."""
+    assert case.surface is not None
+    truth, step = case.surface, dense.grown.step
+    start = time.process_time()
+    points, normals, pixels = semi_global(case)
+    spent = time.process_time() - start
+    print(f"  StereoSGBM on the rectified pair: {against_truth(points, normals, pixels, truth)}, {spent:.1f} s")
+    theirs = np.full(truth[0].shape, np.nan)
+    u, v = pixels.astype(int).T
+    theirs[v, u] = np.linalg.norm(points, axis=1)
+    f, _, cx, cy = (float(value) for value in case.cameras[0].parameters[:4])
+    true = truth[0][::step, ::step]
+    v, u = step * np.indices(true.shape)
+    known = np.isfinite(true)
+    # Of a disparity, by the inverse range.
+    px = f * np.linalg.norm(case.pose.translation_mm) * np.sqrt(1.0 + ((u - cx) / f) ** 2 + ((v - cy) / f) ** 2)
+    for name, given in (("rigkit", dense.maps()["range"]), ("StereoSGBM", theirs[::step, ::step])):
+        off = np.abs(1.0 / given - 1.0 / true)[known] * px[known]
+        shares = "/".join(f"{100 * np.mean(off <= most):.0f}" for most in COMPLETE_PX)
+        limits = "/".join(f"{most:g}" for most in COMPLETE_PX)
+        of_given = off[np.isfinite(off)]
+        print(
+            f"    {name}: {100 * of_given.size / off.size:.0f} % of true nodes given, {shares} % within {limits} px; "
+            f"of those given {100 * np.mean(of_given > 1.0):.1f} % beyond 1 px, median {np.median(of_given):.3f} px"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="with pairs.json")
@@ -273,7 +305,7 @@ def main() -> None:
             for line in errors_in_sigmas(dense, truth[0]):
                 print(f"    {line}")
             if case.kind == "middlebury":
-                print(f"  StereoSGBM on the rectified pair: {against_truth(*semi_global(case), truth)}")
+                beside_semi_global(case, dense)
             shares = [mesh_share(c, case.cameras[0], truth[0]) for c in (cloud, with_lines_of_sight(cloud))]
             print(
                 f"  Poisson within {100 * NEAR_REL:.0f} %: {100 * shares[0]:.1f} % of true pixels, "

@@ -16,7 +16,7 @@ class _PlaneGrid(Struct):
     """What the nodes say, and how planes are fitted."""
 
 
-class FittedPlanes(NamedTuple):
+class PlaneFits(NamedTuple):
     """Planes (R, C, 3), the normal matrices of their fits (R, C, 3, 3), the sums of weights (R, C), and those of
     weighted squares (R, C) of Mahalanobis' distances from them. NaN where there is none."""
 
@@ -28,7 +28,7 @@ class FittedPlanes(NamedTuple):
 
 def fitted_planes(
     values: FloatArray, information: FloatArray, frames: FloatArray, *, reach: int, rounds: int, turn: float
-) -> FittedPlanes:
+) -> PlaneFits:
     """Return the planes through what nodes say.
 
     `values` (R, C, 3), NaN where there are none, their `information` (R, C, 3, 3) and `frames` (R, C, 3, 3), by which
@@ -49,4 +49,4 @@ def fitted_planes(
     planes, normals = np.empty((rows, columns, 3)), np.empty((rows, columns, 3, 3))
     support, squares = np.empty((2, rows, columns))
     kernels().fit_planes(grid, planes, normals, support, squares)
-    return FittedPlanes(planes, normals, support, squares)
+    return PlaneFits(planes, normals, support, squares)

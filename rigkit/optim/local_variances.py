@@ -10,13 +10,12 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from scipy.special import digamma, polygamma
 
 from rigkit.core.arrays import FloatArray
 
 LARGEST_SCATTER = 100.0
 """Variance up to which `of_redescending` knows what is left of it."""
-NODES = 400
+SAMPLED_LENGTHS = 400
 """Of the integral over distances: variances come out to a thousandth."""
 
 
@@ -29,6 +28,8 @@ def shrunk_variances(variances: FloatArray, freedom: FloatArray) -> FloatArray:
     its variance beyond what `freedom` explains give d0 and s0^2 (Smyth's equations for e_g); each becomes
     (d0 s0^2 + d s^2) / (d0 + d). Zeros say nothing of themselves; they get what is common.
     """
+    from scipy.special import digamma, polygamma
+
     known = variances > 0.0
     if np.count_nonzero(known) < 2:
         return np.array(variances, dtype=np.float64)
@@ -44,6 +45,8 @@ def shrunk_variances(variances: FloatArray, freedom: FloatArray) -> FloatArray:
 
 def _inverse_trigamma(value: float) -> float:
     """Return x > 0 with trigamma(x) = value, by Newton's method for 1 / trigamma, which is nearly straight (Smyth)."""
+    from scipy.special import polygamma
+
     x = 0.5 + 1.0 / value
     for _ in range(50):
         at = float(polygamma(1, x))
@@ -69,7 +72,7 @@ def _table(turn: float) -> tuple[FloatArray, FloatArray]:
     """Return what is left (M,), rising, of variances (M,)."""
     variances = np.geomspace(1.0 / LARGEST_SCATTER, LARGEST_SCATTER, 200)
     # Maxwell's distribution, of the length of three Gaussians of variance 1.
-    length = np.linspace(0.0, 7.0, NODES)
+    length = np.linspace(0.0, 7.0, SAMPLED_LENGTHS)
     density = length**2 * np.exp(-0.5 * length**2)
     square = variances[:, None] * length**2
     weight = density / (1.0 + square / (3.0 * turn**2)) ** 2

@@ -67,7 +67,7 @@ def error_modes(camera: Camera, pixels: Pixels, *, free_to_turn: bool) -> ErrorM
     flat = modes[:count].reshape(2 * count, -1)
     turns: FloatArray = np.zeros((3, len(families)))
     if free_to_turn:
-        turns = np.linalg.lstsq(by_turn[:count].reshape(2 * count, 3), flat, rcond=None)[0]
+        turns = np.asarray(np.linalg.lstsq(by_turn[:count].reshape(2 * count, 3), flat, rcond=None)[0], np.float64)
     modes -= by_turn @ turns
     size = np.sqrt(np.bincount(families, weights=np.mean(np.sum(modes[:count] ** 2, axis=1), axis=0)))[families]
     return ErrorModes(modes[count:] / size, turns / size, families)

@@ -34,8 +34,6 @@ USUAL_PX = 0.07
 axis. What looks like another pose leaves no trace in the distances, so that none seen is not none there; with a
 heavy tail (half-Cauchy) a tilt of pixels took the pose half a degree along."""
 LENS_STEPS = 3
-TURNS = (0, 1, 2)
-"""Of a pose's five directions those that are rotations."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -75,7 +73,8 @@ def pose_with_lens_errors(
     """
     R, t = start.rotation, unit(start.translation_mm)
     free = free_directions(PoseType.GENERAL if level_sigma_rad is not None else pose_type)
-    free_to_turn = bool(np.isin(TURNS, free).all())
+    # The first three directions are rotations.
+    free_to_turn = bool(np.isin(range(3), free).all())
     lenses = (
         error_modes(cameras[0], matches.pixels1, free_to_turn=free_to_turn),
         error_modes(cameras[1], matches.pixels2, free_to_turn=free_to_turn),
