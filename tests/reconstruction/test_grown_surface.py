@@ -70,7 +70,7 @@ DULL = np.broadcast_to(np.arange(SHAPE[1]) >= 66, SHAPE)
 
 
 @pytest.mark.parametrize(
-    ("where", "times"), [(beside_the_hole(), 3.0), (DULL, 2.0), (DULL, 1.0)], ids=["end", "dull", "as stated"]
+    ("where", "times"), [(beside_the_hole(), 3.0), (DULL, 2.0), (DULL, 1.0)], ids=["end", "dull", "as-stated"]
 )
 def test_sigmas_hold_where_nodes_err_by_more_than_they_state(where: BoolArray, times: float) -> None:
     both = [range_errors(fitted(np.where(where, times, 1.0), np.random.default_rng(k))) for k in range(8)]
