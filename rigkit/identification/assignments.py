@@ -51,10 +51,6 @@ class Assignment:
     def chi2(self) -> float:
         return float(self.chi2_1.sum() + self.chi2_2.sum())
 
-    def rms_px(self, view1: ImageObservations, view2: ImageObservations) -> float:
-        """Return the rms distance of the corners (2-D, both images) from the joint fit."""
-        return float(np.sqrt(self.pose.squared_px.sum() / _corner_count(self.matches, view1, view2)))
-
     def differs_from(self, other: Assignment) -> bool:
         """Say whether the two contradict each other: one detection, but another partner or position."""
         mine = {("1", s.first): (s.second, s.key) for s in self.matches} | {
@@ -65,10 +61,6 @@ class Assignment:
             or mine.get(("2", s.second), s.first) != s.first
             for s in other.matches
         )
-
-
-def _corner_count(matches: Sequence[BoardMatch], view1: ImageObservations, view2: ImageObservations) -> int:
-    return sum(len(view1.observations[s.first].rays) + len(view2.observations[s.second].rays) for s in matches)
 
 
 def ranked_assignments(
@@ -107,23 +99,6 @@ def ranked_assignments(
         if name not in found or assignment.chi2 < found[name].chi2:
             found[name] = assignment
     return sorted(found.values(), key=lambda s: s.chi2)
-
-
-def forced_rms_px(
-    assignment: Assignment,
-    matches: Sequence[BoardMatch],
-    view1: ImageObservations,
-    view2: ImageObservations,
-    kinds: Sequence[BoardKind],
-) -> tuple[int, float]:
-    """Return how many boards, and with what rms (px, 2-D per corner), fit if the solution has to explain all it can."""
-    predictor = _Predictor.build(matches, view2, kinds)
-    miss = predictor.misses(assignment.pose.cam2_from_cam1[None])[0]
-    mine = {s.key: (s.first, s.second) for s in assignment.matches}
-    own = np.array([mine.get(s.key) == (s.first, s.second) for s in matches])
-    chosen = [matches[n] for n in _choose(np.where(own, miss - miss.max() - 1.0, miss), np.inf, matches, kinds)]
-    pose = _fit(assignment.pose.cam2_from_cam1, chosen, view1, view2, kinds, SEARCH_TOLERANCE)
-    return len(chosen), float(np.sqrt(pose.squared_px.sum() / _corner_count(chosen, view1, view2)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

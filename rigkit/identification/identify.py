@@ -19,9 +19,9 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.truth import MeasuredAngle
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.identification.assignments import Assignment, forced_rms_px, ranked_assignments
+from rigkit.identification.assignments import Assignment, ranked_assignments
 from rigkit.identification.board_ids import LocatedBoard, assign_board_ids, first_corner_turn
-from rigkit.identification.board_matches import BoardMatch, GridPoses, ImageObservations, matches_between
+from rigkit.identification.board_matches import GridPoses, ImageObservations, matches_between
 from rigkit.identification.joint_pose import BoardObservation, JointPose, refine_joint
 from rigkit.identification.measured_angles import ids_by_angles
 from rigkit.identification.pair_identity import PairIdentity
@@ -31,8 +31,6 @@ LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
 MISFIT_FLOOR_PX = 0.01
 """No camera and no printed board is truer than this: smaller misfits decide nothing."""
-MAX_RIVALS = 6
-"""Rivals that are made to explain all boards, for the runner-up's residual."""
 
 
 def identify_pair(
@@ -79,9 +77,7 @@ def identify_pair(
     best = ranked[0]
     tied = [s for s in ranked if s is best or _log_odds(best, s, free1, free2, views) < LOG_ODDS]
     winner = min(tied, key=lambda s: (-len(s.matches), sum(x.against_colour for x in s.matches), _roll_rad(s)))
-    rivals = [s for s in ranked if s.differs_from(winner)]
-    runner_up_px = _runner_up_px(winner, rivals, matches, views, kinds)
-    identity = _result(winner, runner_up_px, tied, views, kinds, boards, layout)
+    identity = _result(winner, tied, views, kinds, boards, layout)
     given = {d.board_id for d in (*detections1, *detections2)} | set(layout or ())
     fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
     if not fitting:
@@ -90,7 +86,7 @@ def identify_pair(
     if len(fitting) > 1:
         said += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
     notes = (*identity.notes, f"{said}; a layout would say for certain which is which")
-    return replace(_result(winner, runner_up_px, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
+    return replace(_result(winner, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
 
 
 def _checked_kinds(boards: Sequence[Board]) -> tuple[BoardKind, ...]:
@@ -195,7 +191,6 @@ def _identified_boards(
 
 def _result(
     winner: Assignment,
-    runner_up_px: float,
     tied: Sequence[Assignment],
     views: tuple[ImageObservations, ImageObservations],
     kinds: Sequence[BoardKind],
@@ -239,7 +234,6 @@ def _result(
         cam2_from_cam1=Rigid3.from_matrix(pose.cam2_from_cam1),
         cam1_from_board={i: Rigid3.from_matrix(m) for i, m in start.items()},
         residual_px=float(np.sqrt(pose.squared_px.sum() / corners.sum())),
-        runner_up_px=runner_up_px,
         ambiguous=bool(contradicting),
         missing=_missing(boards, detections, both),
         notes=(
@@ -273,22 +267,6 @@ def _refined(
         observations[1],
         points[1],
     )
-
-
-def _runner_up_px(
-    winner: Assignment,
-    rivals: Sequence[Assignment],
-    matches: Sequence[BoardMatch],
-    views: tuple[ImageObservations, ImageObservations],
-    kinds: Sequence[BoardKind],
-) -> float:
-    """Return the smallest rms of a joint fit of at least as many boards among the best rivals."""
-    enough = len(winner.matches)
-    fits = [
-        (enough, s.rms_px(*views)) if len(s.matches) >= enough else forced_rms_px(s, matches, *views, kinds)
-        for s in rivals[:MAX_RIVALS]
-    ]
-    return min((rms for count, rms in fits if count >= enough), default=float("inf"))
 
 
 def _why_left_over(image: int, view: ImageObservations, index: int) -> str:

@@ -20,8 +20,6 @@ class PairIdentity:
     cam2_from_cam1 : relative pose, metric, refined over all corners of the boards seen in both images.
     cam1_from_board : pose of every named board, from both images where both see it.
     residual_px : rms distance (2-D per corner, both images) of the corners from the rigid scene of the winner.
-    runner_up_px : the same for the best clearly different assignment of as many boards, however badly it fits;
-        infinite where there is none.
     ambiguous : whether geometry alone cannot tell the winner from another assignment; the one with the smallest roll
         between the cameras was then taken, and `notes` says so.
     missing : why a listed board is not in both lists, by board id.
@@ -33,7 +31,6 @@ class PairIdentity:
     cam2_from_cam1: Rigid3
     cam1_from_board: Mapping[str, Rigid3]
     residual_px: float
-    runner_up_px: float
     ambiguous: bool
     missing: Mapping[str, str]
     notes: tuple[str, ...] = ()

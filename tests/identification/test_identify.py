@@ -36,8 +36,6 @@ POSE_RAD = 2e-3
 NOISE_PX = 0.05
 RMS_BAND = (0.9, 1.1)
 """144 corners in two images: the rms of the residuals is the noise within a few per cent, parameters included."""
-CLEARLY = 5.0
-"""The runner-up of an unambiguous pair must stand out by this factor; the worst of 400 random pairs had 60."""
 
 EQUAL = tuple(Board(i, 8, 6, 50.0, 50.0) for i in "abc")
 MIXES = {
@@ -72,7 +70,6 @@ def test_kept_captures(name: str, sigma_px: float, rng: np.random.Generator) -> 
     identity = identify_pair(one, two, scene.boards, scene.camera1, scene.camera2)
     assert_right(identity, scene, 3)
     assert not identity.ambiguous and not identity.missing
-    assert identity.runner_up_px > CLEARLY * identity.residual_px
     # The captures call the right wall plane1, the floor plane2, the left wall plane3: the rule's order.
     assert [true_corners(d, scene.pixels1)[0] for d in identity.detections1] == ["plane1", "plane2", "plane3"]
     truth = json.loads((shared_data("lab-a") / "captures" / name / "truth.json").read_text())
@@ -87,7 +84,6 @@ def test_three_equal_boards_in_random_corners(camera: object, rng: np.random.Gen
         identity = identify_pair(*both_views(scene, rng, NOISE_PX), EQUAL, camera, camera)  # type: ignore[arg-type]
         assert_right(identity, scene, 3)
         assert not identity.ambiguous
-        assert identity.runner_up_px > CLEARLY * identity.residual_px
         assert RMS_BAND[0] < identity.residual_px / (NOISE_PX * np.sqrt(2.0)) < RMS_BAND[1]
 
 
@@ -97,7 +93,6 @@ def test_three_equal_boards_in_400_random_corners(rng: np.random.Generator) -> N
         camera = (regular_camera(), fisheye_camera())[k % 2]
         scene = trihedral_scene(rng, EQUAL, camera)
         identity = identify_pair(*both_views(scene, rng, NOISE_PX), EQUAL, camera, camera)
-        assert identity.ambiguous or identity.runner_up_px > CLEARLY * identity.residual_px
         if not identity.ambiguous:
             assert_right(identity, scene, 3)
 
@@ -157,7 +152,6 @@ def test_a_symmetric_arrangement_is_called_ambiguous(rng: np.random.Generator) -
         identity = identify_pair(*both_views(scene, rng, NOISE_PX), EQUAL, scene.camera1, scene.camera2)
         assert identity.ambiguous
         assert "smallest roll" in " ".join(identity.notes)
-        assert identity.runner_up_px == pytest.approx(identity.residual_px, rel=0.1)
 
 
 def test_a_slightly_unsymmetric_arrangement_is_told(rng: np.random.Generator) -> None:
@@ -179,7 +173,7 @@ def test_one_board_alone(rng: np.random.Generator) -> None:
     scene = trihedral_scene(rng, unique, regular_camera())
     identity = identify_pair(*both_views(scene, rng), unique, scene.camera1, scene.camera2)
     assert_right(identity, scene, 1)
-    assert not identity.ambiguous and identity.runner_up_px == np.inf
+    assert not identity.ambiguous
 
 
 @pytest.mark.parametrize(("side", "roll_rad", "turns"), [(7, 1.4, 0), (6, 0.3, 1)])

@@ -17,8 +17,6 @@ from rigkit.identification.identify import identify_pair
 from rigkit.synthetic.render import Optics
 
 BATCH = 10
-RIVAL = 5.0
-"""The runner-up of an unambiguous pair must stand out by this factor; the least of 200 pairs had 447."""
 RESIDUAL_PX = 0.03
 """Rms of the rigid scene, 2-D: corners are good to about 0.01 px at blur 0.7 and noise 2."""
 
@@ -40,7 +38,6 @@ def test_rendered_pairs(first: int, noise_levels: float) -> None:
         assert verdict != PairVerdict.WRONG, f"seed {seed}: {what}"
         symmetric = "symmetric" in what
         if verdict == PairVerdict.RIGHT and not symmetric:
-            assert found.runner_up_px > RIVAL * found.residual_px
             assert found.residual_px < RESIDUAL_PX * noise_levels / 2.0
         # An answer of "cannot tell" is timid but where boards can be exchanged, and due where they exactly can.
         if " 0 mm" in what:
