@@ -126,9 +126,13 @@ class Bench:
         return Row(set=self.name, quantity=quantity, unit=unit, tool=tool, value=value, **more)
 
 
-def number(value: float | None) -> str:
-    """Return a number with as many digits as say something, empty without."""
-    return "" if value is None else f"{value:.3g}" if abs(value) < 10.0 else f"{value:.2f}"
+def number(value: float | None, unit: str = "px") -> str:
+    """Return a number with as many digits as say something, a count (no unit) whole, empty without."""
+    if value is None:
+        return ""
+    if not unit:
+        return f"{value:.0f}"
+    return f"{value:#.3g}" if abs(value) < 10.0 else f"{value:.2f}"
 
 
 def long_table(rows: Sequence[Row]) -> str:
@@ -136,10 +140,10 @@ def long_table(rows: Sequence[Row]) -> str:
     head = ["set", "quantity", "unit", "tool", "value", "stated sigma", "measured", "error", "error / sigmas", "how"]
     lines = ["| " + " | ".join(head) + " |", "|" + ":--|" * len(head)]
     for row in rows:
-        measured = number(row.truth) + ("" if row.truth_sigma is None else f" ± {number(row.truth_sigma)}")
+        measured = number(row.truth, row.unit) + ("" if row.truth_sigma is None else f" ± {number(row.truth_sigma)}")
         tool = row.tool + (f" ({row.variant})" if row.variant else "")
-        value = "fails" if row.value is None else number(row.value)
-        numbers = [value, number(row.sigma), measured, number(row.error), number(row.in_sigmas)]
+        value = "fails" if row.value is None else number(row.value, row.unit)
+        numbers = [value, number(row.sigma), measured, number(row.error, row.unit), number(row.in_sigmas)]
         lines.append("| " + " | ".join([row.set, row.quantity, row.unit, tool, *numbers, row.how]) + " |")
     return "\n".join(lines) + "\n"
 
@@ -153,7 +157,7 @@ def short_table(rows: Sequence[Row]) -> str:
     last = ""
     for (name, quantity, unit), own in groups.items():
         truth = own[0].truth
-        known = "" if truth is None else number(truth)
+        known = "" if truth is None else number(truth, unit)
         known += "" if own[0].truth_sigma is None else f" ± {number(own[0].truth_sigma)}"
         cells = ["; ".join(_cell(row) for row in own if row.tool == tool) for tool in TOOLS]
         what = quantity + (f", {unit}" if unit else "")
@@ -163,7 +167,7 @@ def short_table(rows: Sequence[Row]) -> str:
 
 
 def _cell(row: Row) -> str:
-    value = "fails" if row.value is None else number(row.value)
+    value = "fails" if row.value is None else number(row.value, row.unit)
     sigma = "" if row.sigma is None else f" ± {number(row.sigma)}"
     return value + sigma + (f" ({row.variant})" if row.variant else "")
 
