@@ -26,5 +26,6 @@ EXPORT const char *instruction_set(void);
 #include "api_fits.h"
 #include "api_calibration.h"
 #include "api_pairs.h"
+#include "api_painting.h"
 
 #endif

@@ -25,8 +25,17 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.kernels.painting import (
+    COVERED_PARTLY,
+    COVERED_WHOLLY,
+    Float32,
+    PaintedSurface,
+    paint_surface,
+    reduce_tile,
+    tile_cover,
+)
 from rigkit.synthetic.photometry import Photometry, develop
-from rigkit.synthetic.raycast import FULL, PART, Chart, Float32, Surface, board_surface, charts_of, paint, panel_surface
+from rigkit.synthetic.raycast import Chart, Surface, board_surface, charts_of, panel_surface
 from rigkit.synthetic.scene import Panel, PlacedBoard
 
 TILE = 64
@@ -118,47 +127,43 @@ def radiance(
         [reduce.axis(left, width) for left in lefts],
         [reduce.axis(top, height) for top in tops],
         optics.field_deg,
+        optics.supersample,
     )
+    layers = [(surface, surface.for_kernel()) for surface in surfaces]
     for (top, left), chart in zip(product(tops, lefts), charts, strict=True):
         tile = out[top : top + TILE, left : left + TILE]
-        tile[:] = _render_tile(chart, surfaces, tile.shape, reduce, background)
+        tile[:] = _render_tile(chart, layers, tile.shape, reduce, background)
     return out
 
 
 class _Reduction:
-    """From sub-samples to pixels: one matrix along each axis, shared by all tiles of an image."""
+    """From sub-samples to pixels: one kernel along each axis, shared by all tiles of an image."""
 
     def __init__(self, optics: Optics) -> None:
-        from scipy.sparse import csr_array
-
         self.step = 1.0 / optics.supersample
         self.count = optics.supersample
         self.reach = optics.reach_px
         n = (TILE + 2 * self.reach) * self.count
         self.offsets: FloatArray = np.asarray((np.arange(n) + 0.5) * self.step - 0.5 - self.reach, dtype=np.float64)
-        # Sparse: a pixel needs few sub-samples, and BLAS would start threads for these small matrices.
-        self.matrix = csr_array(_reduction_matrix(self.offsets, self.step, optics.blur_px).astype(np.float32))
+        self.kernel = _reduction_kernel(self.offsets[: (1 + 2 * self.reach) * self.count], self.step, optics.blur_px)
         self.spread = _spread_kernel(optics)
 
     def axis(self, first: int, size: int) -> FloatArray:
         """Return where, px, the sub-samples lie that a tile needs which begins at `first` of an image of `size` px."""
         return np.asarray(self.offsets[: (min(TILE, size - first) + 2 * self.reach) * self.count] + first)
 
-    def __call__(self, fine: Float32, shape: tuple[int, int]) -> FloatArray:
+    def __call__(self, fine: Float32, shape: tuple[int, int]) -> Float32:
         if self.spread is not None:
             fine = np.asarray(cv2.filter2D(fine, cv2.CV_32F, self.spread, borderType=cv2.BORDER_REPLICATE))
-        rows = self.matrix[: shape[0], : fine.shape[0]]
-        columns = self.matrix[: shape[1], : fine.shape[1]]
-        return np.asarray((columns @ (rows @ fine).T).T, dtype=np.float64)
+        return reduce_tile(fine, self.kernel, self.count, shape)
 
 
-def _reduction_matrix(offsets: FloatArray, step: float, sigma: float) -> FloatArray:
-    """Return (TILE, n): the pixel's box convolved with a Gaussian, on sub-samples; rows sum to 1.
+def _reduction_kernel(distance: FloatArray, step: float, sigma: float) -> Float32:
+    """Return the pixel's box convolved with a Gaussian, on sub-samples at a `distance` (n,) from its centre, px.
 
-    Each sub-sample stands for its cell, so the Gaussian is sampled, not integrated: the variance of the whole is then
-    1/12 + sigma^2 exactly.
+    It sums to 1. Each sub-sample stands for its cell, so the Gaussian is sampled, not integrated: the variance of the
+    whole is then 1/12 + sigma^2 exactly.
     """
-    distance = offsets - np.arange(TILE)[:, None]
     within = (np.arange(round(1.0 / step)) + 0.5) * step - 0.5
     if sigma == 0.0:
         kernel = (np.abs(distance) < 0.5).astype(np.float64)
@@ -166,7 +171,7 @@ def _reduction_matrix(offsets: FloatArray, step: float, sigma: float) -> FloatAr
         from_centre = distance[..., None] - within
         terms = np.exp(-0.5 * (from_centre / sigma) ** 2)
         kernel = np.where(np.abs(from_centre) <= KERNEL_SIGMAS * sigma + 0.5 * step, terms, 0.0).sum(axis=-1)
-    return np.asarray(kernel / kernel.sum(axis=1, keepdims=True))
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
 
 
 def _spread_kernel(optics: Optics) -> Float32 | None:
@@ -190,25 +195,29 @@ def _spread_kernel(optics: Optics) -> Float32 | None:
 
 
 def _render_tile(
-    chart: Chart, surfaces: Sequence[Surface], shape: tuple[int, int], reduce: _Reduction, background: float
-) -> FloatArray:
-    """Return one tile (height, width = `shape`)."""
+    chart: Chart,
+    layers: Sequence[tuple[Surface, PaintedSurface]],
+    shape: tuple[int, int],
+    reduce: _Reduction,
+    background: float,
+) -> Float32 | float:
+    """Return one tile (height, width = `shape`), or the one brightness of all its pixels."""
     if chart.dark:
-        return np.zeros(shape)
-    seen: list[Surface] = []
+        return 0.0
+    seen: list[PaintedSurface] = []
     base = background
-    for surface in surfaces:
-        cover = chart.cover(surface)
-        if cover == FULL:
+    for surface, painted in layers:
+        cover = tile_cover(chart.tile, painted)
+        if cover == COVERED_WHOLLY:
             # Hides all that was drawn before.
             seen, base = [], surface.white
-        if cover == PART or (cover == FULL and surface.printed):
-            seen.append(surface)
+        if cover == COVERED_PARTLY or (cover == COVERED_WHOLLY and surface.printed):
+            seen.append(painted)
     if not seen and chart.lit is None:
-        return np.full(shape, base)
+        return base
     fine = np.full(chart.shape, base, dtype=np.float32)
-    for surface in seen:
-        paint(fine, surface, chart, reduce.count)
+    for painted in seen:
+        paint_surface(fine, chart.tile, painted)
     if chart.lit is not None:
         fine *= chart.lit
     return reduce(fine, shape)

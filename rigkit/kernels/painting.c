@@ -1,0 +1,498 @@
+/* Rectangles with what is printed on them, painted into the sub-samples of an image's tile, and these reduced to pixels. The
+ * definitions in numpy are in tests/kernels/reference/painting.py, their meaning in rigkit.synthetic.raycast.
+ *
+ * A cell, that is a sub-sample's share of a pixel, is a parallelogram to a coordinate of the plane: the sum of two boxes, one
+ * from its side along u and one from that along v. Only so do the shares of an edge's two sides add up, whatever its direction. */
+#include "kernels.h"
+
+/* Board coordinate of rays that miss a board's plane. */
+#define FAR_SQUARES 1e4
+/* Depth ratio over a tile above which x and y are interpolated themselves: the error is below 6 ** -TILE_NODES = 1e-7. */
+#define SMOOTH_DEPTH_RATIO 0.5
+/* Least depth of what is in front. */
+#define LEAST_DEPTH 1e-9
+/* A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean nothing. */
+#define MIN_CELL 1e-6f
+#define MAX_CELL 2.0f
+
+/* A part of a tile, in sub-samples: its first row and column, and its size. */
+typedef struct {
+    int64_t top, left, rows, columns;
+} box_t;
+
+/* Where the sub-samples of a box meet the plane, and in each of its pixels (`columns` / per_pixel in a row) the longer and the
+ * shorter side of the cells, the least and the most of the sub-samples; of x and of y. */
+typedef struct {
+    box_t box;
+    int64_t per_pixel;
+    float *axes[2], *wide[2], *narrow[2], *least[2], *most[2];
+} places_t;
+
+/* Return the values (TILE_NODES, TILE_NODES) of x, y and perhaps depth that are interpolated: how many of them. */
+static int set_node_values(const tile_t *tile, const double *matrix, double values[3][TILE_NODES * TILE_NODES])
+{
+    double nearest = INFINITY, farthest = -INFINITY;
+    for (int n = 0; n < TILE_NODES * TILE_NODES; n++) {
+        const double *ray = tile->nodes + 3 * n;
+        for (int k = 0; k < 3; k++)
+            values[k][n] = matrix[3 * k] * ray[0] + matrix[3 * k + 1] * ray[1] + matrix[3 * k + 2] * ray[2];
+        nearest = values[2][n] < nearest ? values[2][n] : nearest;
+        farthest = values[2][n] > farthest ? values[2][n] : farthest;
+    }
+    if (!(nearest > SMOOTH_DEPTH_RATIO * farthest))
+        return 3;
+    for (int n = 0; n < TILE_NODES * TILE_NODES; n++) {
+        values[0][n] /= values[2][n];
+        values[1][n] /= values[2][n];
+    }
+    return 2;
+}
+
+/* Set x and y of one row of sub-samples, every `step`th from `left` on, `count` of them. */
+INLINE void set_row(
+    const tile_t *tile, const double *matrix, const double values[3][TILE_NODES * TILE_NODES], int terms, int64_t row,
+    int64_t left, int64_t step, int64_t count, double *restrict x, double *restrict y, double *restrict depth)
+{
+    if (tile->ray_rows) {
+        const double *ray = tile->rays + 3 * (row * tile->columns + left);
+        for (int64_t n = 0; n < count; n++, ray += 3 * step) {
+            x[n] = matrix[0] * ray[0] + matrix[1] * ray[1] + matrix[2] * ray[2];
+            y[n] = matrix[3] * ray[0] + matrix[4] * ray[1] + matrix[5] * ray[2];
+            depth[n] = matrix[6] * ray[0] + matrix[7] * ray[1] + matrix[8] * ray[2];
+        }
+    } else {
+        double *out[3] = {x, y, depth};
+        const double *down = tile->weights_v + row * TILE_NODES;
+        for (int k = 0; k < terms; k++) {
+            double line[TILE_NODES] = {0.0};
+            for (int i = 0; i < TILE_NODES; i++)
+                for (int j = 0; j < TILE_NODES; j++)
+                    line[j] += down[i] * values[k][i * TILE_NODES + j];
+            const double *across = tile->weights_u + left;
+            for (int64_t n = 0; n < count; n++) {
+                double sum = 0.0;
+                for (int j = 0; j < TILE_NODES; j++)
+                    sum += line[j] * across[j * tile->columns + n * step];
+                out[k][n] = sum;
+            }
+        }
+        if (terms == 2)
+            return;
+    }
+    for (int64_t n = 0; n < count; n++) {
+        const int front = depth[n] > LEAST_DEPTH;
+        const double over = 1.0 / (front ? depth[n] : 1.0);
+        x[n] = front ? x[n] * over : FAR_SQUARES;
+        y[n] = front ? y[n] * over : FAR_SQUARES;
+    }
+}
+
+/* Return the difference of `values` along an axis of `count`, at `k`: between its neighbours, at the ends to the only one. */
+INLINE double difference(const double *value, int64_t k, int64_t count, int64_t stride)
+{
+    if (k == 0)
+        return value[stride] - value[0];
+    return k == count - 1 ? value[0] - value[-stride] : 0.5 * (value[stride] - value[-stride]);
+}
+
+/* Set the sub-samples that can meet the rectangle, in whole pixels with one more around; return whether there are any. `coarse`:
+ * where the first sub-sample of every pixel meets the plane, (2, height, width). */
+static int set_box(
+    const double *coarse, int64_t height, int64_t width, const surface_t *surface, int64_t per_pixel, box_t *box)
+{
+    int64_t top = height, bottom = -1, left = width, right = -1;
+    for (int64_t v = 0; v < height; v++)
+        for (int64_t u = 0; u < width; u++) {
+            int near = 1;
+            for (int k = 0; k < 2; k++) {
+                const double *at = coarse + (k * height + v) * width + u;
+                const double down = difference(at, v, height, width), across = difference(at, u, width, 1);
+                /* A rectangle narrower than a pixel falls between the corners: look a pixel further along each axis. */
+                const double step = sqrt(down * down + across * across);
+                near &= *at >= surface->ends[k] - step && *at <= surface->ends[2 + k] + step;
+            }
+            if (!near)
+                continue;
+            top = v < top ? v : top;
+            bottom = v;
+            left = u < left ? u : left;
+            right = u > right ? u : right;
+        }
+    if (bottom < 0)
+        return 0;
+    top = top > 0 ? top - 1 : 0;
+    left = left > 0 ? left - 1 : 0;
+    bottom = bottom < height - 1 ? bottom + 1 : bottom;
+    right = right < width - 1 ? right + 1 : right;
+    *box = (box_t){top * per_pixel, left * per_pixel, (bottom - top + 1) * per_pixel, (right - left + 1) * per_pixel};
+    return 1;
+}
+
+/* Set the sides of the cells of each pixel of the box, from where the first sub-samples of all pixels are. */
+static void set_cells(const double *coarse, int64_t height, int64_t width, const places_t *places)
+{
+    const int64_t across = places->box.columns / places->per_pixel, down = places->box.rows / places->per_pixel;
+    const int64_t top = places->box.top / places->per_pixel, left = places->box.left / places->per_pixel;
+    for (int k = 0; k < 2; k++)
+        for (int64_t i = 0; i < down; i++)
+            for (int64_t j = 0; j < across; j++) {
+                const int64_t v = top + i, u = left + j;
+                const double *at = coarse + (k * height + v) * width + u;
+                float one = (float)(fabs(difference(at, v, height, width)) / (double)places->per_pixel);
+                float other = (float)(fabs(difference(at, u, width, 1)) / (double)places->per_pixel);
+                one = one < MIN_CELL ? MIN_CELL : one > MAX_CELL ? MAX_CELL : one;
+                other = other < MIN_CELL ? MIN_CELL : other > MAX_CELL ? MAX_CELL : other;
+                places->wide[k][i * across + j] = one > other ? one : other;
+                places->narrow[k][i * across + j] = one > other ? other : one;
+            }
+}
+
+/* Set where all sub-samples of the box meet the plane, and the least and the most of each pixel's. */
+INLINE void set_axes(const tile_t *tile, const double *matrix, const places_t *places, double *memory)
+{
+    const int64_t columns = places->box.columns, per_pixel = places->per_pixel, across = columns / per_pixel;
+    double values[3][TILE_NODES * TILE_NODES];
+    const int terms = tile->ray_rows ? 3 : set_node_values(tile, matrix, values);
+    double *rows[3] = {memory, memory + columns, memory + 2 * columns};
+    for (int64_t v = 0; v < places->box.rows; v++) {
+        set_row(
+            tile, matrix, values, terms, places->box.top + v, places->box.left, 1, columns, rows[0], rows[1], rows[2]);
+        for (int k = 0; k < 2; k++) {
+            float *axis = places->axes[k] + v * columns;
+            for (int64_t u = 0; u < columns; u++)
+                axis[u] = (float)rows[k][u];
+            float *least = places->least[k] + v / per_pixel * across, *most = places->most[k] + v / per_pixel * across;
+            for (int64_t q = 0; q < across; q++) {
+                float low = v % per_pixel ? least[q] : axis[q * per_pixel], high = v % per_pixel ? most[q] : low;
+                for (int64_t u = q * per_pixel; u < (q + 1) * per_pixel; u++) {
+                    low = axis[u] < low ? axis[u] : low;
+                    high = axis[u] > high ? axis[u] : high;
+                }
+                least[q] = low;
+                most[q] = high;
+            }
+        }
+    }
+}
+
+/* Return the share of a cell beyond an edge less 1/2, from its middle's distance from it: the integral of a trapezoid, which
+ * rises over the narrow box, is flat, and falls over the narrow box. */
+INLINE float beyond(float distance, float wide, float narrow)
+{
+    const float far = fabsf(distance), reach = 0.5f * (wide + narrow);
+    float slope = far - 0.5f * (wide - narrow);
+    slope = slope < 0.0f ? 0.0f : slope > narrow ? narrow : slope;
+    const float share = far < reach ? (far - slope * slope / (2.0f * narrow)) / wide : 0.5f;
+    return copysignf(share, distance);
+}
+
+/* Return the share of a cell with low <= place <= high. */
+INLINE float inside(float place, float low, float high, float wide, float narrow)
+{
+    const float upper = high - place, lower = place - low;
+    return beyond(upper < lower ? upper : lower, wide, narrow) + 0.5f;
+}
+
+/* Set, averaged over a cell, the indicator of -1 <= place <= count, and return the wave within it: +1 on [0, 1), it changes sign
+ * at every inner corner 0 .. count - 1. A cell is narrower than a square, so it meets one edge at most. */
+INLINE float wave_of(float place, int64_t count, float wide, float narrow, float *within)
+{
+    *within = inside(place, -1.0f, (float)count, wide, narrow);
+    /* Triangle wave: 0 at every corner, slope +-1 there, positive on [0, 1). */
+    float wave = (place - 0.5f) * 0.5f;
+    wave = fabsf(wave - rintf(wave)) * -2.0f + 0.5f;
+    wave = beyond(wave, wide, narrow) * 2.0f;
+    const float last = count % 2 ? 1.0f : -1.0f;
+    return place < -0.5f ? -*within : place > (float)count - 0.5f ? last * *within : wave;
+}
+
+/* Lay sheet and squares over the sub-samples of pixel (row, column) of the box. */
+INLINE void paint_pixel(float *restrict fine, int64_t stride, const places_t *places, const surface_t *surface, int64_t row, int64_t column)
+{
+    const int64_t per_pixel = places->per_pixel, columns = places->box.columns, pixel = row * (columns / per_pixel) + column;
+    const float wide_x = places->wide[0][pixel], narrow_x = places->narrow[0][pixel];
+    const float wide_y = places->wide[1][pixel], narrow_y = places->narrow[1][pixel];
+    const float white = (float)surface->white, half = (float)(0.5 * (surface->black - surface->white));
+    const float sign = surface->first_black ? 1.0f : -1.0f;
+    for (int64_t v = row * per_pixel; v < (row + 1) * per_pixel; v++) {
+        const float *x = places->axes[0] + v * columns, *y = places->axes[1] + v * columns;
+        for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++) {
+            const float share = inside(x[u], (float)surface->ends[0], (float)surface->ends[2], wide_x, narrow_x)
+                                * inside(y[u], (float)surface->ends[1], (float)surface->ends[3], wide_y, narrow_y);
+            float value = fine[v * stride + u];
+            value += share * (white - value);
+            if (surface->columns) {
+                float in_x, in_y;
+                const float wave_x = wave_of(x[u], surface->columns, wide_x, narrow_x, &in_x);
+                const float wave_y = wave_of(y[u], surface->rows, wide_y, narrow_y, &in_y);
+                value += half * (sign * wave_x * wave_y + in_x * in_y);
+            }
+            fine[v * stride + u] = value;
+        }
+    }
+}
+
+/* Return whether no edge of sheet and squares is within reach of a coordinate's sub-samples in a pixel; then `*within` says
+ * whether they are on the sheet, `*wave` what the squares' wave is there, 0 beyond. */
+INLINE int is_even(
+    const places_t *places, const surface_t *surface, int k, int64_t pixel, int64_t count, float *within, float *wave)
+{
+    const float reach = 0.5f * (places->wide[k][pixel] + places->narrow[k][pixel]);
+    const float low = places->least[k][pixel] - reach, high = places->most[k][pixel] + reach;
+    const float begin = (float)surface->ends[k], end = (float)surface->ends[2 + k];
+    *wave = 0.0f;
+    *within = 0.0f;
+    if (high < begin || low > end)
+        return 1;
+    if (!(low > begin && high < end))
+        return 0;
+    *within = 1.0f;
+    if (!count || high < -1.0f || low > (float)count)
+        return 1;
+    const float cell = floorf(low);
+    if (!(low > -1.0f && high < (float)count && high < cell + 1.0f && low > cell))
+        return 0;
+    *wave = (int64_t)cell % 2 ? -1.0f : 1.0f;
+    return 1;
+}
+
+/* Lay the rectangle and its squares over the box. */
+INLINE void paint_sheet(float *fine, int64_t stride, const places_t *places, const surface_t *surface)
+{
+    const int64_t per_pixel = places->per_pixel, across = places->box.columns / per_pixel, down = places->box.rows / per_pixel;
+    const float white = (float)surface->white, half = (float)(0.5 * (surface->black - surface->white));
+    const float sign = surface->first_black ? 1.0f : -1.0f;
+    for (int64_t row = 0; row < down; row++)
+        for (int64_t column = 0; column < across; column++) {
+            float in_x, in_y, wave_x, wave_y;
+            const int64_t pixel = row * across + column;
+            const int even_x = is_even(places, surface, 0, pixel, surface->columns, &in_x, &wave_x);
+            const int even_y = is_even(places, surface, 1, pixel, surface->rows, &in_y, &wave_y);
+            if ((even_x && in_x == 0.0f) || (even_y && in_y == 0.0f))
+                continue;
+            if (!(even_x && even_y)) {
+                paint_pixel(fine, stride, places, surface, row, column);
+                continue;
+            }
+            const float pattern = wave_x == 0.0f || wave_y == 0.0f ? 0.0f : half * (sign * wave_x * wave_y + 1.0f);
+            for (int64_t v = row * per_pixel; v < (row + 1) * per_pixel; v++)
+                for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++)
+                    fine[v * stride + u] = white + pattern;
+        }
+}
+
+/* Add `change` times the share of a rectangle in squares, (low x, low y, high x, high y), to the box. */
+INLINE void add_rectangle(float *fine, int64_t stride, const places_t *places, const double ends[4], float change)
+{
+    const int64_t per_pixel = places->per_pixel, columns = places->box.columns, across = columns / per_pixel;
+    const float low[2] = {(float)ends[0], (float)ends[1]}, high[2] = {(float)ends[2], (float)ends[3]};
+    const int64_t pixels = across * (places->box.rows / per_pixel);
+    for (int64_t pixel = 0; pixel < pixels; pixel++) {
+        int near = 1;
+        for (int k = 0; k < 2; k++) {
+            const float reach = 0.5f * (places->wide[k][pixel] + places->narrow[k][pixel]);
+            near &= places->most[k][pixel] > low[k] - reach && places->least[k][pixel] < high[k] + reach;
+        }
+        if (!near)
+            continue;
+        const int64_t row = pixel / across, column = pixel % across;
+        for (int64_t v = row * per_pixel; v < (row + 1) * per_pixel; v++)
+            for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++) {
+                const float x = places->axes[0][v * columns + u], y = places->axes[1][v * columns + u];
+                fine[v * stride + u] += change * inside(x, low[0], high[0], places->wide[0][pixel], places->narrow[0][pixel])
+                                        * inside(y, low[1], high[1], places->wide[1][pixel], places->narrow[1][pixel]);
+            }
+    }
+}
+
+/* Set the range of the box's pixels in x and y, with the farthest reach of a cell. */
+static void set_range(const places_t *places, float low[2], float high[2])
+{
+    const int64_t pixels = places->box.columns / places->per_pixel * (places->box.rows / places->per_pixel);
+    for (int k = 0; k < 2; k++) {
+        low[k] = INFINITY, high[k] = -INFINITY;
+        for (int64_t pixel = 0; pixel < pixels; pixel++) {
+            const float reach = 0.5f * (places->wide[k][pixel] + places->narrow[k][pixel]);
+            low[k] = places->least[k][pixel] - reach < low[k] ? places->least[k][pixel] - reach : low[k];
+            high[k] = places->most[k][pixel] + reach > high[k] ? places->most[k][pixel] + reach : high[k];
+        }
+    }
+}
+
+/* Blacken the marks, which touch but do not overlap. */
+INLINE void paint_marks(float *fine, int64_t stride, const places_t *places, const surface_t *surface)
+{
+    float low[2], high[2];
+    set_range(places, low, high);
+    for (int64_t n = 0; n < surface->mark_count; n++) {
+        const double *mark = surface->marks + 4 * n;
+        const double ends[4] = {mark[0], mark[1], mark[0] + mark[2], mark[1] + mark[3]};
+        if (ends[2] > low[0] && ends[0] < high[0] && ends[3] > low[1] && ends[1] < high[1])
+            add_rectangle(fine, stride, places, ends, (float)(surface->black - surface->white));
+    }
+}
+
+/* Return by how much a coordinate changes to the next sub-sample down or across, mm, at most two squares. */
+INLINE float side_of(const float *value, int64_t k, int64_t count, int64_t stride, float square_mm)
+{
+    const float slope = k == 0 ? value[stride] - value[0]
+                        : k == count - 1 ? value[0] - value[-stride]
+                                         : 0.5f * (value[stride] - value[-stride]);
+    return (slope < -MAX_CELL ? -MAX_CELL : slope > MAX_CELL ? MAX_CELL : slope) * square_mm;
+}
+
+/* Return the share of a sub-sample's cell inside of a disc (x, y, radius in mm), whose edge is taken as straight within it. */
+INLINE float share_of_disc(const places_t *places, const surface_t *surface, const double *disc, int64_t v, int64_t u)
+{
+    const int64_t columns = places->box.columns, rows = places->box.rows;
+    const float scale[2] = {(float)surface->width_mm, (float)surface->height_mm};
+    float off[2], down[2], across[2];
+    for (int k = 0; k < 2; k++) {
+        const float *at = places->axes[k] + v * columns + u;
+        off[k] = *at * scale[k] - (float)disc[k];
+        down[k] = side_of(at, v, rows, columns, scale[k]);
+        across[k] = side_of(at, u, columns, 1, scale[k]);
+    }
+    float distance = sqrtf(off[0] * off[0] + off[1] * off[1]);
+    distance = distance > 1e-9f ? distance : 1e-9f;
+    float one = fabsf((off[0] * down[0] + off[1] * down[1]) / distance);
+    float other = fabsf((off[0] * across[0] + off[1] * across[1]) / distance);
+    one = one > MIN_CELL ? one : MIN_CELL;
+    other = other > MIN_CELL ? other : MIN_CELL;
+    return beyond((float)disc[2] - distance, one > other ? one : other, one > other ? other : one) + 0.5f;
+}
+
+/* Paint the discs, which do not overlap, on their ground. `covered` has room for the shares of the box's sub-samples. */
+INLINE void paint_discs(float *fine, int64_t stride, const places_t *places, const surface_t *surface, float *covered)
+{
+    const int64_t per_pixel = places->per_pixel, columns = places->box.columns, rows = places->box.rows;
+    const int64_t across = columns / per_pixel, pixels = across * (rows / per_pixel);
+    const double scale[2] = {surface->width_mm, surface->height_mm};
+    float change = (float)(surface->black - surface->white), low[2], high[2];
+    for (int64_t k = 0; k < surface->grounds; k++) {
+        add_rectangle(fine, stride, places, surface->ground + 4 * k, change);
+        change = -change;
+    }
+    memset(covered, 0, sizeof(float) * (size_t)(rows * columns));
+    set_range(places, low, high);
+    for (int64_t n = 0; n < surface->disc_count; n++) {
+        const double *disc = surface->discs + 3 * n;
+        double begin[2], end[2];
+        int seen = 1;
+        for (int k = 0; k < 2; k++) {
+            begin[k] = (disc[k] - disc[2]) / scale[k], end[k] = (disc[k] + disc[2]) / scale[k];
+            seen &= end[k] > low[k] && begin[k] < high[k];
+        }
+        for (int64_t pixel = 0; seen && pixel < pixels; pixel++) {
+            double reach_mm = 0.0;
+            int near = 1;
+            /* Towards a disc a cell reaches at most as far as along x and y together; it changes within a pixel. */
+            for (int k = 0; k < 2; k++)
+                reach_mm += scale[k] * (double)(places->wide[k][pixel] + places->narrow[k][pixel]);
+            for (int k = 0; k < 2; k++)
+                near &= places->most[k][pixel] > begin[k] - reach_mm / scale[k] && places->least[k][pixel] < end[k] + reach_mm / scale[k];
+            if (!near)
+                continue;
+            const int64_t row = pixel / across, column = pixel % across;
+            for (int64_t v = row * per_pixel; v < (row + 1) * per_pixel; v++)
+                for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++) {
+                    const float share = share_of_disc(places, surface, disc, v, u);
+                    float *most = covered + v * columns + u;
+                    *most = share > *most ? share : *most;
+                }
+        }
+    }
+    for (int64_t v = 0; v < rows; v++)
+        for (int64_t u = 0; u < columns; u++)
+            fine[v * stride + u] += change * covered[v * columns + u];
+}
+
+/* Lay a rectangle and its pattern over the sub-samples of a tile; return 0 where memory is short, else 1. */
+EXPORT FOR_EACH_PROCESSOR int64_t paint_surface(float *fine, const tile_t *tile, const surface_t *surface)
+{
+    const int64_t per_pixel = tile->per_pixel, height = tile->rows / per_pixel, width = tile->columns / per_pixel;
+    const int64_t pixels = height * width, samples = tile->rows * tile->columns;
+    double *memory = malloc(sizeof(double) * (size_t)(2 * pixels + 3 * tile->columns) + sizeof(float) * (size_t)(8 * pixels + 3 * samples));
+    if (!memory)
+        return 0;
+    double *coarse = memory, *rows = memory + 2 * pixels, values[3][TILE_NODES * TILE_NODES];
+    const double *matrix = surface->plane_from_ray;
+    const int terms = tile->ray_rows ? 3 : set_node_values(tile, matrix, values);
+    for (int64_t v = 0; v < height; v++)
+        set_row(
+            tile, matrix, values, terms, v * per_pixel, 0, per_pixel, width, coarse + v * width, coarse + pixels + v * width, rows);
+    places_t places = {.per_pixel = per_pixel};
+    if (set_box(coarse, height, width, surface, per_pixel, &places.box)) {
+        float *room = (float *)(rows + 3 * tile->columns);
+        for (int k = 0; k < 2; k++) {
+            places.wide[k] = room + (4 * k) * pixels, places.narrow[k] = room + (4 * k + 1) * pixels;
+            places.least[k] = room + (4 * k + 2) * pixels, places.most[k] = room + (4 * k + 3) * pixels;
+            places.axes[k] = room + 8 * pixels + k * samples;
+        }
+        set_cells(coarse, height, width, &places);
+        set_axes(tile, matrix, &places, rows);
+        float *target = fine + places.box.top * tile->columns + places.box.left;
+        paint_sheet(target, tile->columns, &places, surface);
+        if (surface->mark_count)
+            paint_marks(target, tile->columns, &places, surface);
+        if (surface->disc_count)
+            paint_discs(target, tile->columns, &places, surface, room + 8 * pixels + 2 * samples);
+    }
+    free(memory);
+    return 1;
+}
+
+/* Return how much of the tile the rectangle may cover, NOT_COVERED, PARTLY or WHOLLY; errs towards a part. */
+EXPORT int64_t tile_cover(const tile_t *tile, const surface_t *surface)
+{
+    if (tile->ray_rows)
+        return COVERED_PARTLY;
+    double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
+    int in_front = 0;
+    for (int n = 0; n < TILE_NODES * TILE_NODES; n++) {
+        const double *ray = tile->nodes + 3 * n, *matrix = surface->plane_from_ray;
+        const double depth = matrix[6] * ray[0] + matrix[7] * ray[1] + matrix[8] * ray[2];
+        if (!(depth > LEAST_DEPTH))
+            continue;
+        in_front++;
+        for (int k = 0; k < 2; k++) {
+            const double place = (matrix[3 * k] * ray[0] + matrix[3 * k + 1] * ray[1] + matrix[3 * k + 2] * ray[2]) / depth;
+            low[k] = place < low[k] ? place : low[k];
+            high[k] = place > high[k] ? place : high[k];
+        }
+    }
+    if (in_front < TILE_NODES * TILE_NODES)
+        return in_front ? COVERED_PARTLY : NOT_COVERED;
+    int wholly = 1;
+    for (int k = 0; k < 2; k++) {
+        /* The nodes stop short of the tile's border; half the range more is ample. */
+        const double pad = 0.5 * (high[k] - low[k]), begin = surface->ends[k], end = surface->ends[2 + k];
+        if (!(high[k] + pad >= begin && low[k] - pad <= end))
+            return NOT_COVERED;
+        wholly &= low[k] - pad >= begin && high[k] + pad <= end;
+    }
+    return wholly ? COVERED_WHOLLY : COVERED_PARTLY;
+}
+
+/* Reduce sub-samples to pixels by the same `kernel` along both axes. */
+EXPORT FOR_EACH_PROCESSOR void reduce_tile(
+    const float *fine, int64_t rows, int64_t columns, const float *kernel, int64_t length, int64_t per_pixel, float *memory,
+    float *out, int64_t height, int64_t width)
+{
+    (void)rows;
+    for (int64_t v = 0; v < height; v++) {
+        memset(memory, 0, sizeof(float) * (size_t)columns);
+        for (int64_t k = 0; k < length; k++) {
+            const float *row = fine + (v * per_pixel + k) * columns;
+            for (int64_t u = 0; u < columns; u++)
+                memory[u] += kernel[k] * row[u];
+        }
+        for (int64_t u = 0; u < width; u++) {
+            float sum = 0.0f;
+#pragma omp simd reduction(+ : sum)
+            for (int64_t k = 0; k < length; k++)
+                sum += kernel[k] * memory[u * per_pixel + k];
+            out[v * width + u] = sum;
+        }
+    }
+}

@@ -1,0 +1,66 @@
+"""The kernels in painting.c: rectangles painted into the sub-samples of a tile, and these reduced to pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigkit.core.arrays import FloatArray
+from rigkit.kernels import kernels
+from rigkit.kernels.calls import Struct, structure
+from rigkit.kernels.declarations import header
+
+TILE_NODES, NOT_COVERED, COVERED_PARTLY, COVERED_WHOLLY = (
+    header().constants[name] for name in ("TILE_NODES", "NOT_COVERED", "COVERED_PARTLY", "COVERED_WHOLLY")
+)
+
+Float32 = NDArray[np.float32]
+
+
+@structure("tile_t")
+class PaintedTile(Struct):
+    """The sub-samples of `synthetic.raycast.Chart`."""
+
+    @classmethod
+    def of_rays(
+        cls, weights_v: FloatArray, weights_u: FloatArray, nodes: FloatArray, rays: FloatArray | None, per_pixel: int
+    ) -> PaintedTile:
+        """Return a tile of (rows, TILE_NODES) and (TILE_NODES, columns) weights; `rays` (rows, columns, 3) where they
+        are not to be interpolated from those at the `nodes`, (TILE_NODES, TILE_NODES, 3)."""
+        rows, columns = len(weights_v), weights_u.shape[1]
+        return cls.of(
+            weights_v=weights_v,
+            weights_u=weights_u,
+            nodes=nodes,
+            rays=np.empty((0, columns, 3)) if rays is None else np.ascontiguousarray(rays, np.float64),
+            rows=rows,
+            columns=columns,
+            per_pixel=per_pixel,
+            ray_rows=0 if rays is None else rows,
+        )
+
+
+@structure("surface_t")
+class PaintedSurface(Struct):
+    """The rectangle of a `synthetic.raycast.Surface`."""
+
+
+def tile_cover(tile: PaintedTile, surface: PaintedSurface) -> int:
+    """Return how much of a tile the rectangle may cover, one of the three constants; errs towards a part."""
+    return int(kernels().tile_cover(tile, surface))
+
+
+def paint_surface(fine: Float32, tile: PaintedTile, surface: PaintedSurface) -> None:
+    """Lay a rectangle and its pattern over the sub-samples `fine` (rows, columns) of a tile, in place."""
+    if not kernels().paint_surface(fine, tile, surface):
+        raise MemoryError("no memory for the sub-samples of a tile")
+
+
+def reduce_tile(fine: Float32, kernel: Float32, per_pixel: int, shape: tuple[int, int]) -> Float32:
+    """Return the pixels (height, width = `shape`) of sub-samples `fine`: along each axis `kernel` weighs those from
+    `per_pixel` times the pixel's place on."""
+    out = np.empty(shape, np.float32)
+    kernels().reduce_tile(
+        fine, *fine.shape, kernel, len(kernel), per_pixel, np.empty(fine.shape[1], np.float32), out, *shape
+    )
+    return out
