@@ -210,6 +210,18 @@ def length_error_mm(calibration: Calibration, length: Task) -> float:
     return float(np.sqrt(squared))
 
 
+def test_a_length_is_measured_with_each_other_camera_or_with_the_only_one(tmp_path: Path) -> None:
+    length = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=500.0)
+    guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_mm=0.2, reach=REACH)
+    coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=guide, length=length))
+    (alone,) = coach.guide.options.lengths([CAMERA], [Rigid3.identity()])
+    (both,) = coach.guide.options.lengths([CAMERA, CAMERA], [Rigid3.identity(), MOUNT])
+    assert alone.wanted == both.wanted == 0.2 and alone.goal.unit == both.goal.unit == "mm"
+    # Of one camera the lens, of two both and how they stand to each other.
+    count = CAMERA.parameters.size
+    assert alone.goal.weight.shape == (count, count) and both.goal.weight.shape == (2 * count + 6, 2 * count + 6)
+
+
 def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator) -> None:
     guide = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_mm=0.2, reach=REACH)
     length = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=500.0)

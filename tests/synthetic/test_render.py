@@ -214,6 +214,9 @@ def test_outside_the_lens_is_black_and_panels_lie_behind_boards() -> None:
     assert image[radius > 34].max() < 1e-6
     bare = radiance([BOARD], FISHEYE, Rigid3.identity(), optics=Optics(0.5, field_deg=50.0), background=0.6)
     np.testing.assert_allclose(image[radius < 24], bare[radius < 24], atol=1e-6)
+    # The second tile begins at column 64: nothing of it is lit.
+    narrow = radiance([BOARD], FISHEYE, Rigid3.identity(), panels=[wall], optics=Optics(0.5, field_deg=10.0))
+    assert (narrow[:, 64:] == 0.0).all() and narrow[radius < 4].min() > 0.05
 
 
 def test_motion_and_defocus_keep_the_mean_position() -> None:
