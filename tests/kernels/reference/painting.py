@@ -98,7 +98,7 @@ class Cells:
 
     @classmethod
     def of(cls, axis: Float32, per_pixel: int) -> Cells:
-        slopes = np.stack(np.gradient(axis[::per_pixel, ::per_pixel])) / np.float32(per_pixel)
+        slopes = np.array(np.gradient(axis[::per_pixel, ::per_pixel]), np.float32) / np.float32(per_pixel)
         return cls.of_sides(np.clip(np.kron(slopes, np.ones((per_pixel, per_pixel), np.float32)), -MAX_CELL, MAX_CELL))
 
     @classmethod
