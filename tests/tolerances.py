@@ -9,8 +9,5 @@ JACOBIAN_REL = 1e-6
 ROUND_TRIP_PX = 1e-8
 """A correct polynomial round trip measures 2e-13 px; a wrong stretch gives 3e-3."""
 
-AGREE_PX = 1e-3
-"""Two implementations of one model, float32 inside the other."""
-
 ROUNDING = 1e-12
 """A handful of double operations on numbers of order 1."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
-from helpers.rig_scenes import NOISE_PX, mounts, rig_views
+from helpers.rig_scenes import NOISE_PX, mounts, rig_views, sizes
 
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
@@ -20,10 +20,6 @@ LINEAR = 0.002
 """Terms of the second order, of the errors of a mount: 4e-4 was seen."""
 BOW_ERROR_MM = 0.05
 """Of a bow of 1 mm in 14 views with corners of 0.2 px: 0.01 was seen."""
-
-
-def sizes() -> dict[str, tuple[int, int]]:
-    return {name: camera.size_px for name, (camera, _) in mounts().items()}
 
 
 def off_in_sigmas(pose: Rigid3, true: Rigid3, covariance: np.ndarray) -> float:

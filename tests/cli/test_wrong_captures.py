@@ -24,7 +24,6 @@ from rigkit.synthetic.render import Optics
 
 SIZE = (640, 480)
 BOARDS = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
-ANGLES = ("angle plane1-plane2", "angle plane1-plane3", "angle plane2-plane3")
 CAMERAS: dict[str, Camera] = {
     "regular": Brown(SIZE, np.array([534.0, 535.0, 323.5, 233.5, -0.15, 0.08, 2e-4, -1e-4, 0.0])),
     "fisheye": KannalaBrandt(SIZE, np.array([235.0, 235.0, 322.7, 237.0, -0.021, 0.0012, 0.0, 0.0])),

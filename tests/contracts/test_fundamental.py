@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.epipolar_scenes import FISHEYE, REGULAR, pixel_fundamental, plane_in_sight, pose_errors_deg
+from helpers.epipolar_scenes import (
+    FISHEYE,
+    REGULAR,
+    pixel_fundamental,
+    plane_in_sight,
+    pose_errors_deg,
+    same_up_to_sign,
+)
 from helpers.epipolar_scenes import pair as pair_of_type
 from tolerances import EXACT_REL
 
@@ -32,10 +39,6 @@ SCENE = {"standard-rows": "standard", "forward-roll": "forward"}
 
 def pair(rng, count, kind="general", **options):
     return pair_of_type(rng, count, SCENE.get(kind, kind), **options)
-
-
-def same_up_to_sign(a, b):
-    return min(np.abs(a - b).max(), np.abs(a + b).max())
 
 
 def swapped(m: Matches) -> Matches:

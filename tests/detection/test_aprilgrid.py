@@ -11,9 +11,9 @@ from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import BenchScene, bench_camera, one_board
 from detection_bench.tag_bound import tag_information
 from detectors.degradations import degraded
+from helpers.detection_scenes import errors_by_place
 
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import TAG_FAMILIES, AprilGrid
 from rigkit.detection.detect import detect_boards
@@ -26,11 +26,6 @@ KALIBR = Board("k", 10, 8, 60.0, 60.0, pattern=AprilGrid(0.3))
 
 OPENCV_PX = 2.0
 """Contours of markers, in whole pixels; another tag would be off by tens."""
-
-
-def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
-    """Return found minus true pixels by grid position: a board in another place would be off by whole tags."""
-    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
 
 
 def facing(board: Board, square_px: float = 50.0) -> BenchScene:
@@ -74,7 +69,7 @@ def test_every_corner_has_its_own_number(lens: str, pattern: AprilGrid, rng: np.
     (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [scene.boards[0].board])
     assert found.board_id == "k"
     assert len(found.grid) >= 78
-    off = errors(found, scene.truth()[0])
+    off = errors_by_place(found, scene.truth()[0])
     # At the rim of a fisheye, tags alone leave a few corners a quarter of a pixel open, and say so.
     assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
     assert np.sqrt((off**2).mean()) < (0.03 if pattern.corner_squares else 0.1)
@@ -95,7 +90,7 @@ def test_tags_with_borders_narrower_than_windows_are_fitted_whole(squares: bool)
         place[truth.grid[:, 1], truth.grid[:, 0]] = np.arange(len(truth.grid))
         bound = np.trace(position_bound(tag_information(scene, 0.7), 2.0), axis1=1, axis2=2)
         bound = bound[place[found.grid[:, 1], found.grid[:, 0]]]
-        off, known = errors(found, truth), np.isfinite(bound)
+        off, known = errors_by_place(found, truth), np.isfinite(bound)
         squared, bounds = squared + (off[known] ** 2).sum(), bounds + bound[known].sum()
         relative.append(off / found.sigma_px[:, None])
     assert np.sqrt(squared / bounds) < 1.15
@@ -111,7 +106,7 @@ def test_tags_at_the_rim_of_a_fisheye_are_read_where_the_others_have_them(patter
     scene = one_board(rng, lens="fisheye", board=board)
     (found,) = detect_boards(scene.render(blur_px=0.7, noise_levels=2.0, rng=rng), [board])
     assert len(found.grid) == 80
-    off = errors(found, scene.truth()[0])
+    off = errors_by_place(found, scene.truth()[0])
     assert np.abs(off).max() < 0.15
     assert (np.abs(off) < 5.0 * found.sigma_px[:, None]).all()
 
@@ -122,7 +117,7 @@ def test_tags_alone_with_narrow_borders_are_completed() -> None:
     scene = one_board(rng, lens="fisheye", board=board)
     (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [board])
     assert len(found.grid) >= 78
-    assert (np.abs(errors(found, scene.truth()[0])) < 5.0 * found.sigma_px[:, None]).all()
+    assert (np.abs(errors_by_place(found, scene.truth()[0])) < 5.0 * found.sigma_px[:, None]).all()
 
 
 def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> None:
@@ -136,7 +131,7 @@ def test_two_boards_are_told_apart_by_their_tags(rng: np.random.Generator) -> No
     assert set(found) == {"a", "b"}
     for truth in scene.truth():
         assert len(found[str(truth.board_id)].grid) == 36
-        assert np.abs(errors(found[str(truth.board_id)], truth)).max() < 0.2
+        assert np.abs(errors_by_place(found[str(truth.board_id)], truth)).max() < 0.2
 
 
 def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
@@ -144,7 +139,7 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     cover = Panel(scene.boards[0].world_from_board @ Rigid3(np.eye(3), np.array([170.0, 90.0, -2.0])), 60.0, 400.0, 0.4)
     scene = replace(scene, occluders=(cover,))
     (found,) = detect_boards(scene.render(noise_levels=2.0, rng=rng), [KALIBR])
-    off = np.linalg.norm(errors(found, scene.truth()[0]), axis=1)
+    off = np.linalg.norm(errors_by_place(found, scene.truth()[0]), axis=1)
     assert 30 < len(off) < 72
     assert np.median(off) < 0.05
     assert off.max() < 0.5
@@ -196,7 +191,7 @@ def test_white_tags_are_found_where_black_ones_are_in_the_negative(squares: bool
     assert found.complete and found.board_id == "b"
     (negative,) = detect_boards(255 - image, [black])
     np.testing.assert_array_equal(found.pixels, negative.pixels)
-    assert np.sqrt((errors(found, scene.truth()[0]) ** 2).sum(axis=1).mean()) < 0.05
+    assert np.sqrt((errors_by_place(found, scene.truth()[0]) ** 2).sum(axis=1).mean()) < 0.05
     assert detect_boards(image, [black]) == ()
 
 

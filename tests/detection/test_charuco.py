@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 from detection_bench.scenes import BenchScene, bench_camera, one_board
+from helpers.detection_scenes import errors_by_place
 
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
@@ -30,11 +30,6 @@ ROUNDED_LEVELS = 0.51
 """Our image is rounded to whole grey levels, OpenCV's enlarged drawing, averaged, is not."""
 BLURRED_PX = 0.08
 """Largest error of a corner at a blur of 2.5 px, with markers 6 px beside it: measured 0.053, with their ink 0.3."""
-
-
-def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
-    """Return found minus true pixels by grid position: a board in another place would be off by whole squares."""
-    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -77,7 +72,7 @@ def test_every_corner_has_its_own_number_and_is_finer_than_opencvs(lens: str) ->
         (found,) = detect_boards(image, [BOARD])
         assert found.board_id == "c"
         assert len(found.grid) >= 48
-        ours.append(errors(found, truth))
+        ours.append(errors_by_place(found, truth))
         sigmas.append(ours[-1] / found.sigma_px[:, None])
         grid, pixels = _marked_corners(image, BOARD)
         theirs.append(pixels - truth.lattice()[grid[:, 1], grid[:, 0]])
@@ -97,7 +92,7 @@ def test_a_part_keeps_its_numbers(rng: np.random.Generator) -> None:
     found = detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), [BOARD])
     assert found[0].board_id == "c"
     assert not found[0].complete
-    off = np.linalg.norm(errors(found[0], scene.truth()[0]), axis=1)
+    off = np.linalg.norm(errors_by_place(found[0], scene.truth()[0]), axis=1)
     assert len(off) > 20
     assert np.median(off) < 0.03
     assert off.max() < 1.0
@@ -110,7 +105,7 @@ def test_markers_too_faint_for_outlines_are_read_in_their_squares(rng: np.random
     assert not len(_marked_corners(image, BOARD)[0])
     (found,) = detect_boards(image, [BOARD])
     assert found.board_id == "c" and found.complete
-    assert np.abs(errors(found, scene.truth()[0])).max() < 0.5
+    assert np.abs(errors_by_place(found, scene.truth()[0])).max() < 0.5
 
 
 def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng: np.random.Generator) -> None:
@@ -163,7 +158,7 @@ def test_two_boards_of_one_size_are_told_apart_by_their_markers(rng: np.random.G
     found = {d.board_id: d for d in detect_boards(scene.render(supersample=2, noise_levels=2.0, rng=rng), boards[::-1])}
     assert set(found) == set(names)
     for truth in scene.truth():
-        assert np.abs(errors(found[truth.board_id], truth)).max() < 0.2
+        assert np.abs(errors_by_place(found[truth.board_id], truth)).max() < 0.2
 
 
 def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) -> None:
@@ -172,7 +167,7 @@ def test_declared_as_a_chessboard_it_is_read_as_one(rng: np.random.Generator) ->
     (found,) = detect_boards(image, [Board("plain", 9, 6, 30.0, 30.0)])
     assert (found.board_id, found.complete) == ("plain", True)
     truth = scene.truth()[0]
-    off = [np.abs(errors(found, t)).max() for t in (truth, truth.turned(2))]
+    off = [np.abs(errors_by_place(found, t)).max() for t in (truth, truth.turned(2))]
     assert min(off) < 0.2
 
 
@@ -228,7 +223,7 @@ def test_a_board_whose_markers_blur_into_its_edges_is_found_whole(seed: int) -> 
     (found,) = detect_boards(scene.render(blur_px=2.5, noise_levels=2.0, rng=rng), [board])
     truth = scene.truth()[0]
     assert found.complete
-    off = errors(found, truth)
+    off = errors_by_place(found, truth)
     assert np.abs(off).max() < BLURRED_PX
     assert 0.5 < np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2)) < 1.5
 
@@ -240,7 +235,7 @@ def test_an_inverted_board_out_of_focus_is_placed_as_finely() -> None:
     scene = one_board(rng, board=board, square_px=52.0)
     (found,) = detect_boards(scene.render(blur_px=1.5, noise_levels=2.0, rng=rng), [board])
     assert found.complete
-    assert np.abs(errors(found, scene.truth()[0])).max() < BLURRED_PX
+    assert np.abs(errors_by_place(found, scene.truth()[0])).max() < BLURRED_PX
 
 
 def test_boards_alike_in_one_image_are_told() -> None:

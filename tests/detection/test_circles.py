@@ -11,9 +11,9 @@ from detection_bench.blanks import BLANKS, blank
 from detection_bench.circle_bound import circle_information
 from detection_bench.corner_bound import position_bound
 from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, bench_field_deg, one_board
+from helpers.detection_scenes import errors_by_place
 
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import find_grids
@@ -48,10 +48,6 @@ QUICK_PX = 0.3
 NOISY = replace(BENCH_PHOTOMETRY, noise_levels=2.0)
 
 
-def errors(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
-    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
-
-
 def slanted(board: Board, lens: str, off_deg: float, slant_deg: float, distance_mm: float) -> BenchScene:
     """Return a scene of one board whose middle lies off the axis and which is slanted to the ray that it lies on."""
     camera = bench_camera(lens)
@@ -75,7 +71,7 @@ def test_grids_are_found_whole_and_named_with_honest_sigmas(board: Board, lens: 
         assert found.board_id == board.board_id
         assert found.complete
         turns = [found, *(found.turned(k) for k in board.turns)]
-        tried = (errors(turn, truth) / turn.sigma_px[:, None] for turn in turns)
+        tried = (errors_by_place(turn, truth) / turn.sigma_px[:, None] for turn in turns)
         relative.append(min(tried, key=lambda e: float(np.abs(e).max())))
     assert HONEST[0] < np.sqrt((np.concatenate(relative) ** 2).mean()) < HONEST[1]
 
@@ -116,7 +112,7 @@ def test_the_lens_tells_what_neighbours_do_not(board: Board) -> None:
     off = []
     for found in (alone, known):
         turns = [found, *(found.turned(k) for k in board.turns)]
-        off.append(min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max())))
+        off.append(min((errors_by_place(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max())))
     assert len(off[0]) == len(off[1]) == board.corner_count
     assert np.sqrt((off[1] ** 2).mean()) < np.sqrt((off[0] ** 2).mean())
     assert np.abs(off[1]).max() < 2.0 * MAX_BIAS_PX
@@ -137,7 +133,7 @@ def test_a_cut_grid_gets_its_place_where_its_borders_show() -> None:
     assert len(truth.grid) < ASYMMETRIC.corner_count
     (found,) = detect_boards(scene.render(), [ASYMMETRIC])
     assert found.board_id == "a"
-    assert np.abs(errors(found, truth)).max() < SINGLE_PX
+    assert np.abs(errors_by_place(found, truth)).max() < SINGLE_PX
 
 
 @pytest.mark.parametrize("turn_deg", [-65.0, -55.0, 55.0])
@@ -153,7 +149,7 @@ def test_a_board_whose_corner_is_cut_off_is_told_from_a_larger_one(turn_deg: flo
         (found,) = detect_boards(image, boards)
         assert found.board_id == small.board_id
         assert len(found.grid) == small.corner_count - 1
-        assert np.abs(errors(found, truth)).max() < SINGLE_PX
+        assert np.abs(errors_by_place(found, truth)).max() < SINGLE_PX
 
 
 @pytest.mark.parametrize("pattern", [REGULAR.pattern, HEXAGONAL.pattern], ids=["regular", "hexagonal"])
@@ -195,7 +191,7 @@ def test_circles_that_something_covers_are_left_out() -> None:
     truth, clear = scene.truth()[0], scene.clear()[0]
     assert found.board_id == "h"
     assert clear.sum() - 8 <= len(found.grid) < len(truth.grid)
-    assert np.abs(errors(found, truth)).max() < SINGLE_PX
+    assert np.abs(errors_by_place(found, truth)).max() < SINGLE_PX
 
 
 @pytest.mark.parametrize(("motion_px", "least"), [((2.6, 1.5), 0.35), ((5.2, 3.0), 0.14)])
@@ -208,7 +204,10 @@ def test_a_motion_that_stretches_all_circles_alike_makes_none_uncertain(
     image = scene.render(optics=Optics(0.7, motion_px=motion_px), photometry=NOISY, rng=rng)
     (found,) = detect_boards(image, [REGULAR])
     turns = [found, *(found.turned(k) for k in REGULAR.turns)]
-    z = min((errors(t, scene.truth()[0]) / t.sigma_px[:, None] for t in turns), key=lambda e: float(np.abs(e).max()))
+    z = min(
+        (errors_by_place(t, scene.truth()[0]) / t.sigma_px[:, None] for t in turns),
+        key=lambda e: float(np.abs(e).max()),
+    )
     assert least < np.sqrt((z**2).mean()) < HONEST[1]
 
 
@@ -259,7 +258,7 @@ def test_centres_are_as_fine_as_the_pixels_allow(board: Board, lens: str) -> Non
         for _ in range(3):
             (found,) = detect_boards(develop(light, photometry, rng), [board])
             turns = [found, *(found.turned(k) for k in board.turns)]
-            off = min((errors(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max()))
+            off = min((errors_by_place(turn, truth) for turn in turns), key=lambda e: float(np.abs(e).max()))
             assert found.complete
             relative.append((off**2).sum(axis=1).mean() / np.trace(bound, axis1=1, axis2=2).mean())
     assert np.sqrt(np.mean(relative)) < MAX_BOUND

@@ -88,6 +88,11 @@ def single(
     return Scene((PlacedBoard(board, place, **kwargs),), regular(), Rigid3.identity())
 
 
+def errors_by_place(found: BoardDetection, truth: BoardDetection) -> np.ndarray:
+    """Return found minus true pixels by place in the grid, (N, 2): another board would be off by whole squares."""
+    return found.pixels - truth.lattice()[found.grid[:, 1], found.grid[:, 0]]
+
+
 def errors_by_position(found: BoardDetection, truth: np.ndarray) -> np.ndarray:
     """Return found minus nearest true corner, (N, 2)."""
     return found.pixels - truth[cKDTree(truth).query(found.pixels)[1]]

@@ -163,3 +163,8 @@ def pose_errors_deg(found: Rigid3, true: Rigid3) -> tuple[float, float]:
     turn = rotation_angle(found.rotation @ true.rotation.T)
     lean = angle_between(found.translation_mm, true.translation_mm)
     return float(np.degrees(turn)), float(np.degrees(lean))
+
+
+def same_up_to_sign(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the largest difference of two matrices of which the sign means nothing."""
+    return float(min(np.abs(a - b).max(), np.abs(a + b).max()))

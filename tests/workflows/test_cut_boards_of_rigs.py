@@ -33,7 +33,10 @@ def cut(pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 column = COVERED[number][side]
                 image[:, slice(column, None) if side == "left" else slice(None, column)] = 120
             cv2.imwrite(str(folder / side / f"{number}.png"), image)
-    assert main(["calibrate", str(folder / "left"), str(folder / "right"), "--board", "9x6x30", "--model", "brown", "-r"]) == 0
+    assert (
+        main(["calibrate", str(folder / "left"), str(folder / "right"), "--board", "9x6x30", "--model", "brown", "-r"])
+        == 0
+    )
     return folder
 
 
