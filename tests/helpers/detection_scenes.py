@@ -31,7 +31,7 @@ class Scene:
     cam_from_world: Rigid3
 
     def image(self, rng: np.random.Generator, *, blur_px: float = 0.7, **photometry: Any) -> np.ndarray:
-        # Blur of this size is rendered from fewer sub-samples as well, in a half of the time.
+        # Blur of this size is rendered from fewer sub-samples as well, in two thirds of the time.
         optics = Optics(blur_px, supersample=2 if blur_px >= 0.6 else 4)
         light = radiance(self.boards, self.camera, self.cam_from_world, optics=optics)
         settings = {"noise_levels": 2.0, "vignetting": 0.25, **photometry}
