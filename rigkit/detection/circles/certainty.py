@@ -1,8 +1,10 @@
 """How certain the centres of a grid's circles are: by the noise of pixels, and by what their shapes say of all else.
 
-Where neighbouring pixels share their noise (a picture smoothed after it was taken, JPEG), where print or light differ
-along the edges, there is more about a circle than the residuals of its pixels show. It changes how circles are slanted
-as much as where they lie, each in its sigmas for white noise, and slant is known: neighbours foretell it.
+Where neighbouring pixels share their noise (a picture smoothed after it was taken), where print or light differ along
+the edges, there is more about a circle than the residuals of its pixels show; there is less where noise changes its
+sign from pixel to pixel (JPEG), and where the residuals are those of another blur (motion), the same on both sides. It
+changes how circles are slanted as much as where they lie, each in its sigmas for white noise, and slant is known:
+neighbours foretell it.
 """
 
 from __future__ import annotations
@@ -20,16 +22,18 @@ ODD_BY_NOISE = 3.8
 """Noise makes the sum of squares of three changes of shape so many times its usual one once in a hundred circles."""
 WAVY_BY_NOISE = 2.5
 """Likewise the mean square of harmonics 3 to 6 of a circle's edge."""
+SMOOTH_TERMS = 6
+"""Of the surface beside which circles are slanted."""
 
 
 def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | float, radius: float) -> FloatArray:
     """Return standard deviations (N,) of the centres of a grid's circles, px.
 
-    By how much slants scatter beyond what white noise makes of them, all are less sure. What a single circle is off in
-    size and slant, beyond that and beyond what all are (motion stretches them), shows the error of the map's first
-    derivatives. At the rim, where it is not small, the map is foretold from one side, and what its polynomial leaves of
-    order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that, times the radius, moves
-    the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
+    By how much more slants scatter, or less, than white noise makes them, all are less sure, or more. What a single
+    circle is off in size and slant, beyond that and beyond what all are (motion stretches them), shows the error of the
+    map's first derivatives. At the rim, where it is not small, the map is foretold from one side, and what its
+    polynomial leaves of order n in the distance t has second over first derivatives (n - 1) / t. A quarter of that,
+    times the radius, moves the centre. What makes an edge wavy (dirt, a finger, print) moves it as much.
 
     Parameters
     ----------
@@ -41,12 +45,22 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     usual = fit.growth_variance + (MODEL_SIGMA_PX / size_px)[:, None] ** 2
     usual = usual + 0.5 * (slope_gain * radius * relative)[:, None] ** 2
     odd = _beside_smooth(fit.growth, label) ** 2
-    # The mean of two squares of normal deviates has the median ln 2.
-    more = max(float(np.median((odd / usual)[:, 1:].mean(axis=1))) / np.log(2.0), 1.0)
+    more = _beside_white((odd / usual)[:, 1:])
     misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * usual.sum(axis=1), 0.0)
     wavy = ((fit.harmonics - np.median(fit.harmonics, axis=0)) ** 2).mean(axis=(1, 2))
     uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
     return np.asarray(np.sqrt(more * fit.sigma_px**2 + ((MAP_ERROR * radius) ** 2 * misshapen + uneven) * size_px**2))
+
+
+def _beside_white(slants: FloatArray) -> float:
+    """Return the variance of the centres over that by white noise, from the squares (N, 2) of how circles are slanted,
+    each over its variance by white noise: 1 as far as chance may have made them differ."""
+    free = len(slants) - SMOOTH_TERMS if len(slants) >= MIN_SMOOTH else len(slants) - 1
+    # The mean of two squares of normal deviates has the median ln 2; medians of N scatter by 1 / (ln 2 sqrt(N)) of them.
+    times = float(np.median(slants.mean(axis=1))) / np.log(2.0) * len(slants) / free
+    chance = times**2 / (free * np.log(2.0) ** 2)
+    sure = 1.0 - chance / max((times - 1.0) ** 2, 1e-12)
+    return 1.0 + max(sure, 0.0) * (times - 1.0)
 
 
 def _beside_smooth(values: FloatArray, label: IntArray) -> FloatArray:
