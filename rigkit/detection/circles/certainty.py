@@ -9,6 +9,8 @@ neighbours foretell it.
 
 from __future__ import annotations
 
+from math import log
+
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
@@ -56,9 +58,9 @@ def _beside_white(slants: FloatArray) -> float:
     """Return the variance of the centres over that by white noise, from the squares (N, 2) of how circles are slanted,
     each over its variance by white noise: 1 as far as chance may have made them differ."""
     free = len(slants) - SMOOTH_TERMS if len(slants) >= MIN_SMOOTH else len(slants) - 1
-    # The mean of two squares of normal deviates has the median ln 2; medians of N scatter by 1 / (ln 2 sqrt(N)) of them.
-    times = float(np.median(slants.mean(axis=1))) / np.log(2.0) * len(slants) / free
-    chance = times**2 / (free * np.log(2.0) ** 2)
+    # The mean of two squares of normal deviates has the median ln 2; that of N scatters by 1 / (ln 2 sqrt(N)) of it.
+    times = float(np.median(slants.mean(axis=1))) / log(2.0) * len(slants) / free
+    chance = times**2 / (free * log(2.0) ** 2)
     sure = 1.0 - chance / max((times - 1.0) ** 2, 1e-12)
     return 1.0 + max(sure, 0.0) * (times - 1.0)
 
