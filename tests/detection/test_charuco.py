@@ -7,9 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from detection_bench.scenes import BenchScene, bench_camera, one_board
+from detection_bench.scenes import BENCH_PHOTOMETRY, BenchScene, bench_camera, one_board
 from helpers.detection_scenes import errors_by_place
 
+from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
@@ -247,3 +248,36 @@ def test_boards_alike_in_one_image_are_told() -> None:
         assert words is not None
         assert f"'{board.board_id}' are seen twice" in words
     assert alike_boards(picture, [Board("plain", 9, 6, 30.0, 30.0)]) is None
+
+
+def _scored(scene: BenchScene, image: np.ndarray, camera: Camera | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors (N, 2) of the corners of the board in an image, px, and these over their sigmas."""
+    (found,) = detect_boards(image, [scene.boards[0].board], camera=camera)
+    off = found.pixels - scene.truth()[0].lattice()[found.grid[:, 1], found.grid[:, 0]]
+    assert found.complete
+    return off, off / found.sigma_px[:, None]
+
+
+NARROW = replace(BOARD, pattern=Charuco("DICT_5X5_100", 23.0))
+"""Its markers' ink is in all windows."""
+
+
+def test_a_known_lens_makes_corners_beside_markers_no_worse() -> None:
+    """Fitted again in the picture with its markers, they were four times as far off."""
+    rng = np.random.default_rng(51)
+    scene = one_board(rng, board=NARROW)
+    image = scene.render(noise_levels=1.0, rng=rng)
+    (alone, _), (known, over_sigma) = _scored(scene, image), _scored(scene, image, scene.camera)
+    assert np.sqrt((known**2).mean()) < 1.1 * np.sqrt((alone**2).mean())
+    assert np.sqrt((over_sigma**2).mean()) < 1.25
+
+
+def test_sigmas_under_jpeg_know_how_noise_is_shared() -> None:
+    """Taken for white, its noise makes them 1.4 to 1.6 times the errors."""
+    relative = []
+    for seed in (51, 53):
+        rng = np.random.default_rng(seed)
+        scene = one_board(rng, board=NARROW)
+        photometry = replace(BENCH_PHOTOMETRY, noise_levels=1.0, jpeg_quality=85)
+        relative.append(_scored(scene, scene.render(photometry=photometry, rng=rng))[1])
+    assert 0.75 < np.sqrt((np.concatenate(relative) ** 2).mean()) < 1.25

@@ -26,7 +26,7 @@ from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.subpixel.correlation import with_uneven
+from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -189,11 +189,13 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
     bends = line_bends_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
     blur = known_median(state.blur)
     fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, bends)
-    return state.with_fit(
-        known,
-        with_uneven(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco)),
-        fit.valid & (fit.contrast > 0.0) & cells[known],
-    )
+    fit = _with_uneven(fit, shape.sides, board)
+    return state.with_fit(known, fit, fit.valid & (fit.contrast > 0.0) & cells[known])
+
+
+def _with_uneven(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
+    usual = shared_noise(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
+    return with_uneven(fit, sides, RADIUS_PX, usual)
 
 
 def _known_factor(found: BoardDetection, state: BoardState) -> float:
@@ -296,7 +298,7 @@ def _again(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
         return state
     blur = known_median(state.blur)
     fit = fit_corners(image, guide.board, cells, shape.of(seen), state.pixels[cells], state.signs[cells], blur)
-    fit = with_uneven(fit, shape.sides[seen], RADIUS_PX, marked=isinstance(guide.board.pattern, Charuco))
+    fit = _with_uneven(fit, shape.sides[seen], guide.board)
     return replace(state.with_fit(cells, fit, fit.valid & (fit.contrast > 0.0)), together=False)
 
 

@@ -75,14 +75,20 @@ def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray)
     return edges.NoiseOfCorners(fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used, good, owner)
 
 
-def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> EdgeFit:
-    """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with `uneven_factors`.
+def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> float:
+    """Return the `sigma_factors` of one board, of the `fit` of its N corners, whose cells have `sides` (N, 2, 2).
 
     On a board that is `marked` between its corners all that is left counts as noise, and no factor of the board's does.
     """
     good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
-    usual = np.ones(1) if marked else sigma_factors(fit, good, sides, owner, 1, radius_px)
-    return fit.less_sure(uneven_factors(fit, good, sides, owner, usual, radius_px))
+    return 1.0 if marked else float(sigma_factors(fit, good, sides, owner, 1, radius_px)[0])
+
+
+def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, usual: float) -> EdgeFit:
+    """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with `uneven_factors` beside the
+    board's `usual` one."""
+    good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
+    return fit.less_sure(uneven_factors(fit, good, sides, owner, np.array([usual]), radius_px))
 
 
 @functools.cache

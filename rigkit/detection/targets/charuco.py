@@ -8,7 +8,7 @@ what these have missed, and stand in for them. Where the corners are exactly, th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -26,7 +26,7 @@ from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
-from rigkit.detection.subpixel.correlation import with_uneven
+from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
 from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
@@ -60,16 +60,27 @@ class CharucoFinder(Finder):
         found, rest = _charuco_boards(search, lattices, boards)
         finest = pyramid(search.grey)[0] if rest else None
         search.leave([item for item in rest if finest and not has_edge_offset(item.lattice, finest)])
-        every = [completed(search.grey, _detection(*item), boards, search.camera) for item in found]
+        every = [completed(item.picture, _detection(item), [item.shown], search.camera) for item in found]
         if search.quick:
             return every
         pairs = zip(every, found, strict=True)
-        return [relit(search.grey, item, refined, board) for item, (refined, board) in pairs]
+        return [relit(search.grey, detection, item.refined, item.board) for detection, item in pairs]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _MarkedBoard:
+    """A board's corners on its grid, the picture that they were placed in last, and what that shows: without its
+    markers, if these are taken away, the squares of the `board` alone."""
+
+    refined: RefinedLattice
+    board: Board
+    picture: GreyImage
+    shown: Board
 
 
 def _charuco_boards(
     search: Search, found: Sequence[RefinedLattice], boards: Sequence[Board]
-) -> tuple[list[tuple[RefinedLattice, Board]], list[RefinedLattice]]:
+) -> tuple[list[_MarkedBoard], list[RefinedLattice]]:
     """Return the ChArUco boards in an image on their own grids, and the lattices that are none.
 
     Parameters
@@ -87,10 +98,9 @@ def _charuco_boards(
             whole, left = _by_outlines(pictures, rest, board)
         if not whole.count:
             continue
-        (refined,) = refine(image, [whole])
-        refined = _beside_markers(image, refined, board)
-        if refined.lattice.count >= search.min_corners:
-            out.append((refined, board))
+        placed = _beside_markers(image, refine(image, [whole])[0], board)
+        if placed.refined.lattice.count >= search.min_corners:
+            out.append(placed)
             rest = left
     return out, rest
 
@@ -239,28 +249,29 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
     return out
 
 
-def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> RefinedLattice:
+def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> _MarkedBoard:
     """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
     known = refined.lattice.known
     if not known.any():
-        return refined
+        return _MarkedBoard(refined, board, image, board)
     shape, blur = fit_cells(refined.lattice.pixels, known), float(np.median(refined.blur_px[known]))
     narrow = _fitted(image, refined, board, blur)
     if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
-        return narrow
+        return _MarkedBoard(narrow, board, image, board)
     # Their ink reaches into any window.
-    empty = replace(board, pattern=Chessboard())
+    picture, empty = image, replace(board, pattern=Chessboard())
     every = (slice(0, known.shape[0]), slice(0, known.shape[1]))
     for _ in range(WIPES):
         wiped = without_markers(image, narrow, board, blur)
         if wiped is None:
-            return narrow
+            return _MarkedBoard(narrow, board, image, board)
+        picture = wiped
         narrow = placed_together(wiped, _fitted(wiped, narrow, empty, blur))
         blur = float(np.median(narrow.blur_px[narrow.lattice.known]))
     # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
     alone = narrow.sigma_px / narrow.scatter
     scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
-    return replace(narrow, sigma_px=scatter * alone, scatter=scatter)
+    return _MarkedBoard(replace(narrow, sigma_px=scatter * alone, scatter=scatter), board, picture, empty)
 
 
 def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> RefinedLattice:
@@ -271,7 +282,8 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     # A corner that a shadow crosses, or a finger, bends no lines: it is uncertain, and says so.
     bends = line_bends_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
     fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, bends)
-    fit = with_uneven(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
+    shared = shared_noise(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
+    fit = with_uneven(fit, shape.sides, RADIUS_PX, shared)
 
     def spread(values: FloatArray) -> FloatArray:
         out = np.full((*known.shape, *values.shape[1:]), np.nan)
@@ -281,19 +293,20 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     fitted = replace(
         refined,
         lattice=Lattice(spread(fit.pixels), spread(fit.contrast), lattice.rising),
-        sigma_px=spread(fit.sigma_px),
+        sigma_px=shared * spread(fit.sigma_px),
         blur_px=spread(fit.blur),
         residual=spread(fit.residual),
         noise=spread(fit.noise),
         scatter=1.0,
-        correlated=1.0,
+        correlated=shared,
     )
     drop = known.copy()
     drop[known] = ~fit.valid | (fit.contrast <= 0.0)
     return fitted.without(drop)
 
 
-def _detection(refined: RefinedLattice, board: Board) -> BoardDetection:
+def _detection(found: _MarkedBoard) -> BoardDetection:
+    refined, board = found.refined, found.board
     row, column = np.nonzero(refined.lattice.known)
     grid = np.stack([column, row], axis=-1)
     pixels, sigma = refined.lattice.pixels[row, column], refined.sigma_px[row, column]
