@@ -272,7 +272,8 @@ def _judged(
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
     far, clusters = _determined(result), found.observations.clusters()
     solved_for = found.observations, fit
-    verdicts = judge(result, also, far=far, clusters=clusters, in_force=in_force, solved=solved_for)
+    order = begun.observations.images
+    verdicts = judge(result, also, far=far, clusters=clusters, in_force=in_force, solved=solved_for, order=order)
     return replace(result, verdicts=verdicts)
 
 

@@ -105,8 +105,8 @@ def as_mask(value: ArrayLike, shape: tuple[int, ...], name: str) -> BoolArray:
 def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
     """Return a read-only copy of a covariance (`size`, `size`).
 
-    Raises InputError: another shape, not finite, not symmetric, or with a negative variance in some direction: beyond
-    what rounding leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
+    Raises InputError: another shape, not finite, not symmetric, all zero, or with a negative variance in some
+    direction: beyond what rounding leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
     """
     covariance = as_array(value if size else np.zeros((0, 0)), (size, size), name)
     variance = np.diag(covariance)
@@ -115,6 +115,8 @@ def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
             f"{name}: a variance is negative ({variance.min():.3g}); the numbers were changed or damaged; "
             "calibrate again"
         )
+    if size and not variance.any():
+        raise InputError(f"{name}: every variance is zero, and nothing that is measured is exact; calibrate again")
     if (variance > MAX_VARIANCE).any():
         raise InputError(f"{name}: a variance is {variance.max():.3g}, which says nothing; calibrate again")
     sigma = np.sqrt(variance)

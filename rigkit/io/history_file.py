@@ -226,11 +226,16 @@ def _entry(data: Any) -> HistoryEntry:
         raise ValueError("date, kind, source, reference, digest and verdict are words")
     if not datetime.fromisoformat(texts["date"]).year > 1:
         raise ValueError("its date is of the year 1")
+    frames, rms_px = whole(data.pop("frames")), real(data.pop("rms_px"))
+    if frames < 0 or rms_px < 0.0:
+        raise ValueError("frames and rms_px are not negative")
+    if temperature is not None and real(temperature) < ABSOLUTE_ZERO_C:
+        raise ValueError(f"no temperature is {temperature:g} C")
     entry = HistoryEntry(
         holds=holds,
         chance=chance,
-        frames=whole(data.pop("frames")),
-        rms_px=real(data.pop("rms_px")),
+        frames=frames,
+        rms_px=rms_px,
         temperature_c=None if temperature is None else real(temperature),
         amounts={str(name): (real(a), _sigma(s)) for name, (a, s) in data.pop("amounts").items()},
         **texts,

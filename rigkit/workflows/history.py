@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 
@@ -48,6 +48,14 @@ def show_history(
             "by their dates",
             register,
             "1 entry" if earlier == 1 else f"{earlier} entries",
+        )
+    to_come = [entry.date for entry in kept if entry.moment - datetime.now(UTC) > CLOCKS_APART]
+    if to_come:
+        _log.warning(
+            "register '%s': %s to come, '%s' the last: a clock was wrong; correct the dates in that file",
+            register,
+            "1 entry has a date" if len(to_come) == 1 else f"{len(to_come)} entries have dates",
+            to_come[-1],
         )
     entries = tuple(sorted(kept, key=lambda entry: entry.moment))
     for said in (*overwritten(editions(entries)), *_since(register, entries)):

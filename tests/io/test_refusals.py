@@ -165,6 +165,10 @@ def test_covariances(rng: np.random.Generator) -> None:
         as_covariance(1.9 * np.eye(3) - 0.9, "c", 3)
     with pytest.raises(InputError, match="shape"):
         as_covariance(np.eye(3), "c", 2)
+    # What is held may be taken as exact, all of a calibration may not.
+    assert as_covariance(np.diag([0.0, 1.0]), "c", 2) is not None
+    with pytest.raises(InputError, match="every variance is zero"):
+        as_covariance(np.zeros((2, 2)), "c", 2)
 
 
 @pytest.mark.parametrize("value", [[True, False], ["1", "2"], [b"1", b"2"]])

@@ -74,6 +74,37 @@ def test_a_register_that_the_work_reads_is_not_added_to(tmp_path: Path) -> None:
         ensure_register(register, [tmp_path / "lab" / ".." / "cam.jsonl"])
 
 
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"frames": -3}, "not negative"),
+        ({"rms_px": -0.1}, "not negative"),
+        ({"temperature_c": -400.0}, "no temperature is -400 C"),
+    ],
+)
+def test_entries_that_cannot_be(
+    changed: dict[str, float], words: str, calibration: Calibration, tmp_path: Path
+) -> None:
+    register = tmp_path / "cam.jsonl"
+    check = checked(calibration, lens("reg"), np.random.default_rng(3))
+    add_entry(register, HistoryEntry.of_check(check, Path("c.json")))
+    register.write_text(json.dumps(json.loads(register.read_text()) | changed) + "\n")
+    with pytest.raises(InputError, match=f"line 1.*{words}"):
+        load_history(register)
+
+
+def test_dates_to_come_are_told(calibration: Calibration, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    register = tmp_path / "cam.jsonl"
+    check = checked(calibration, lens("reg"), np.random.default_rng(3))
+    add_entry(register, HistoryEntry.of_check(check, Path("c.json")))
+    show_history(register)
+    assert not caplog.text
+    entry = json.loads(register.read_text()) | {"date": "9999-12-31T23:59:59-05:00"}
+    register.write_text(register.read_text() + json.dumps(entry) + "\n")
+    show_history(register)
+    assert "1 entry has a date to come, '9999-12-31T23:59:59-05:00' the last" in caplog.text
+
+
 def test_every_entry_has_its_own_control_limits(calibration: Calibration) -> None:
     check = checked(calibration, lens("reg"), np.random.default_rng(3))
     one = HistoryEntry.of_check(check, Path("c.json"), now=datetime(2026, 3, 1, tzinfo=UTC))

@@ -21,8 +21,9 @@ from rigkit.calibration.judging.captured import (
     judge_capture,
     same_way_up,
 )
-from rigkit.calibration.judging.changing import MOTION, changing
+from rigkit.calibration.judging.changing import WAYS, changing
 from rigkit.calibration.judging.mixed import two_cameras
+from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.judging.two_kinds import APART, fewest_of_a_kind
 from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
@@ -50,7 +51,6 @@ RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 MAX_OUTLIER_SHARE = 0.2
 """A view with this part of its corners outliers."""
-NOT_OF_LENS = (*MOTION, "bend", "shift")
 NAMED = 3
 """So many images are named one by one."""
 PATTERN = 0.35
@@ -82,6 +82,7 @@ def judge(
     clusters: IntArray | None = None,
     in_force: Collection[str] = (),
     solved: tuple[Observations, Fit] | None = None,
+    order: Sequence[str] = (),
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first.
 
@@ -91,6 +92,7 @@ def judge(
     far, clusters : what `FarProjection.of` and `cluster_numbers` (V,) return, where they are known already.
     in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
     solved : what was calibrated, for `changing`.
+    order : names of all images, those that are left out too, in the order given.
     """
     far = FarProjection.of(calibration) if far is None else far
     if clusters is None:
@@ -105,13 +107,13 @@ def judge(
     effects = _unsure(calibration, far)
     # Images that contradict each other make a lens unsure, however many there are.
     contradicting = worst(effects) is Severity.BAD
-    # Pictures of two kinds are why the second half of them is of another lens than the first.
+    # Pictures of two kinds are why later ones are of another lens than the first.
     named = bool(mixed) or worst(change) is Severity.BAD
     # What says that nobody knows how good the rest is: then it is not good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
-        *_of_another_kind(calibration),
+        *_of_another_kind(calibration, order),
         *change,
         *unlike,
         *judge_capture(calibration, clusters),
@@ -147,8 +149,8 @@ def _residuals(
     """Return findings on two cameras that are mixed, and on what else residuals tell of images and lens."""
     if mixed := two_cameras(c, clusters):
         return mixed, []
-    # Where it was another lens later on, residuals of one for both are of no motion and of no board.
-    but = NOT_OF_LENS if worst(also) is Severity.BAD else ()
+    # Where it was another lens later on, residuals of one for both are of no motion, of no board, and no second cause.
+    but = WAYS if worst(also) is Severity.BAD else ()
     change = changing(c, correlation, solved, but, clusters)
     # A pupil that moves looks a little like a zoom in every image, and what changes never like a pupil.
     return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
@@ -199,14 +201,16 @@ def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResul
     return out if len(out) >= fewest_of_a_kind(len(used) + len(out)) else []
 
 
-def _of_another_kind(c: Calibration) -> list[Finding]:
-    """Whatever the error of the rest: so many images are of another lens, setting or board, or the rest is."""
+def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
+    """Whatever the error of the rest: so many images are of another lens, setting or board, or the rest is. `order` is
+    that of all images."""
     images = _contradicting(c.dropped, c.views)
     if not images:
         return []
-    total = len({view.image for view in c.views}) + len(images)
-    what = f"{len(images)} of {total} images contradict the others and are left out, '{images[0]}' the first"
-    return [Finding.look(what, APART, images[0])]
+    used = {view.image for view in c.views}
+    what = f"{len(images)} of {len(used) + len(images)} images contradict the others and are left out, "
+    at = moment([image for image in dict.fromkeys(order) if image in used or image in images], images)
+    return [Finding.look(what + (f"all {at}" if at else f"'{images[0]}' the first"), APART, images[0])]
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
