@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.reading import is_file_or_lost_link, read_bytes
+from rigkit.io.reading import is_file_or_lost_link, read_bytes, refuse_archive
 from rigkit.io.tiff import TIFF_STARTS, as_stored, page_sizes
 
 _log = logging.getLogger(__name__)
@@ -77,6 +77,7 @@ def read_image(path: str | Path) -> Image:
         raise InputError(
             f"image '{source}' is {name}, which is not read; convert it to PNG or TIFF without changing pixels"
         )
+    refuse_archive(data, f"image '{source}'")
     fault = _fault(data)
     if fault:
         raise InputError(f"image '{source}' is {fault}; copy it again from the camera")

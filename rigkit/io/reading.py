@@ -52,6 +52,17 @@ def usable_path(path: str | Path) -> Path:
     return Path(text)
 
 
+ARCHIVES = {b"PK\x03\x04": "a ZIP archive", b"\x1f\x8b": "a gzip archive", b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive"}
+"""What files of others come packed in, by their first bytes."""
+
+
+def refuse_archive(data: bytes, name: str) -> None:
+    """Raise InputError where a file that begins with `data` is packed; `name` is said of it."""
+    packed = next((words for start, words in ARCHIVES.items() if data.startswith(start)), None)
+    if packed is not None:
+        raise InputError(f"{name} is {packed}; unpack it, and give what is in it")
+
+
 def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_BYTES) -> bytes:
     """Return the content of a regular file.
 
@@ -80,12 +91,13 @@ def read_bytes(path: str | Path, what: str = "", *, max_bytes: int = MAX_BINARY_
 def read_text(path: str | Path, what: str = "", *, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return the text of a UTF-8 file, without the byte order mark that spreadsheets and editors may put in front.
 
-    Raises InputError as `read_bytes` does, and for what is no text.
+    Raises InputError as `read_bytes` does, and for what is no text, an archive by that name.
     """
     data = read_bytes(path, what, max_bytes=max_bytes)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        refuse_archive(data, _named(path, what))
         raise InputError(
             f"{_named(path, what)} cannot be read: not UTF-8 text; save it as UTF-8, or give another"
         ) from error

@@ -14,7 +14,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.board_words import board_of_words
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.images import IMAGE_ENDINGS
-from rigkit.io.reading import about, read_bytes, usable_path
+from rigkit.io.reading import about, read_bytes, read_text, usable_path
 from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
 from rigkit.io.session import SESSION_NAME, Session, load_session
 from rigkit.io.video import VIDEO_ENDINGS, is_video
@@ -66,6 +66,9 @@ def calibrate_sources(
             raise InputError(
                 f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file"
             )
+        if first.suffix.lower() != ".toml":
+            read_text(first)  # Raises InputError for an archive, and whatever else is no text.
+            raise InputError(f"calibrate: '{first}' is none of these: a folder of images, a video, a session's file")
         raise InputError(
             f"calibrate: '{first}' states its board and model already; leave out --board, --square-mm and --model"
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -364,3 +365,31 @@ def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFix
     assert stop.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in said
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "calibrate photos.zip --square-mm 30",
+        "calibrate photos.zip",
+        "detect photos.zip --board 9x6x30 -o out.csv",
+        "validate photos.zip",
+    ],
+)
+def test_pictures_that_are_packed(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with zipfile.ZipFile("photos.zip", "w") as packed:
+        packed.writestr("01.jpg", bytes(range(256)))
+    assert main(words.split()) == 2
+    assert "is a ZIP archive; unpack it" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_session_is_not_said_to_be_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.txt").write_text("9x6, 30 mm\n")
+    assert main(["calibrate", "notes.txt", "--square-mm", "30"]) == 2
+    assert "none of these: a folder of images, a video, a session's file" in capsys.readouterr().err
