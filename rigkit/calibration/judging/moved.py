@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.judging.two_kinds import fewest_of_a_kind
+from rigkit.calibration.judging.two_kinds import UNTRUE, fewest_of_a_kind
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares
@@ -34,9 +34,8 @@ lenses. Halves of one and the same are 1 apart, at most 2."""
 AGAINST_PLACE = 1.4
 """They are, if what they say beside any other way to part the images (root of what the cost falls) is so many times
 what that says beside them. Measured, the least of all ways: 0.3 to 1.1 in 12 REAL and rendered sessions of one lens;
-there in random orders that chance parts as clearly, 0.9 to 1.5 (once 1.7 in 720); 1.3 to 20, usually 2.8, where six of
-them, halved by a zoom of 3 or 15 %, are parted where it was."""
-UNTRUE = "the uncertainties that are stated do not hold"
+there in random orders that chance parts as clearly, 0.9 to 1.6 (once 1.7 in 720); in nine of ten 1.3 and more, usually
+2.7, where eight of them are parted at a zoom of 3 or 15 %."""
 ORDERS, CHANCE = 199, 0.02
 """Random orders of the images, and how many of them may part these as well as time does."""
 RIDGE = 1e-9

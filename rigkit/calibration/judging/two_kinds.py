@@ -33,6 +33,8 @@ APART = (
     "or undistorted, and calibrate each kind from its own images"
 )
 """What to do about images of two kinds."""
+UNTRUE = "the uncertainties that are stated do not hold"
+"""What follows for everything that was calculated."""
 SIDES_ROUNDS = 8
 """Images change sides in so many rounds at most."""
 RIDGE_OF_STEP = 1e-9
@@ -88,7 +90,8 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     sides = [[v.image for v, of in zip(views, best.second, strict=True) if of == kind] for kind in (False, True)]
     like = " and ".join(f"{len(set(images))} like '{images[0]}'" for images in sides)
     return Finding.bad(
-        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}", APART
+        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}; {UNTRUE}",
+        APART,
     )
 
 
