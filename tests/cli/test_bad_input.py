@@ -393,3 +393,17 @@ def test_a_file_that_is_no_session_is_not_said_to_be_one(
     Path("notes.txt").write_text("9x6, 30 mm\n")
     assert main(["calibrate", "notes.txt", "--square-mm", "30"]) == 2
     assert "none of these: a folder of images, a video, a session's file" in capsys.readouterr().err
+
+
+def test_a_camera_of_a_rig_that_sees_no_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The board may be described rightly: another camera of the rig sees it."""
+    monkeypatch.chdir(tmp_path)
+    for camera in ("left", "right"):
+        Path(camera).mkdir()
+        for k in range(3):
+            cv2.imwrite(f"{camera}/{k}.png", np.full((60, 80), 90, np.uint8))
+    assert main(["calibrate", "left", "right", "--board", "5x4x20"]) == 2
+    assert "of camera 'left'" in (said := capsys.readouterr().err)
+    assert "look whether that camera saw the boards, else leave it out; or check columns and rows" in said

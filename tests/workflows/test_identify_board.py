@@ -155,3 +155,16 @@ def test_a_folder_of_two_boards(tmp_path: Path, capsys: pytest.CaptureFixture[st
     out = capsys.readouterr().out
     assert "seen in 2 of 4 images\n--board aprilgrid:4x3xMM,spacing=0.3" in out
     assert "2 other images, such as '1.png', show another board: --board 8x6xMM" in out
+
+
+def test_every_second_image_shows_the_board(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Of 24 images every second one is looked at first: those that show nothing."""
+    paths = [tmp_path / f"{k:02d}.png" for k in range(24)]
+    for k, path in enumerate(paths):
+        cv2.imwrite(str(path), np.full((40, 40), 200 * (k % 2), np.uint8))
+    seen = BoardGuess(board=Board("b", 9, 6, 1.0, 1.0), images=(0, 1))
+    monkeypatch.setattr(
+        identify_board, "guess_board", lambda images, *_: seen if any(image.mean() > 0.0 for image in images) else None
+    )
+    assert identify_board.suggestion(paths).words == "9x6xMM"
+    assert identify_board.suggestion(paths[::2]).words is None

@@ -94,9 +94,10 @@ def session_views(
         reasons = Counter(reason for _, reason in dropped).most_common(1)[0]
         # A first calibration that fails is asked for no reason.
         shown = explained(session.images, session.boards) if corners.source else None
+        alone = "look whether that camera saw the boards, else leave it out; or " if session.whose else ""
         raise InputError(
             f"{session.path}: no board can be used in {counted(len(found), 'image')}{session.whose}; "
-            + (shown or f"{reasons[1]} times: {reasons[0]}; check columns and rows in the board file")
+            + (shown or f"{reasons[1]} times: {reasons[0]}; {alone}check columns and rows in the board file")
         )
     return views, size_px, dropped
 

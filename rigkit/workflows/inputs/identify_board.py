@@ -279,9 +279,12 @@ def _guess(
     guess: BoardGuess | None = None
     unreadable: InputError | None = None
     pictures: list[tuple[str, GreyImage]] = []
-    for most in (EXPLAINING_IMAGES, ENOUGH_IMAGES):
+    for most, between in ((EXPLAINING_IMAGES, False), (ENOUGH_IMAGES, False), (ENOUGH_IMAGES, True)):
+        # Every second one of a session may be of something else.
+        if between and (guess is not None or len(paths) <= most):
+            break
         pictures = []
-        for name, one in _pictures(paths, most):
+        for name, one in _pictures(paths, most, between):
             if isinstance(one, InputError):
                 unreadable = unreadable or one
             else:
@@ -297,12 +300,14 @@ def _guess(
     return guess, pictures, unreadable
 
 
-def _pictures(paths: Sequence[Path], most: int) -> Iterator[tuple[str, GreyImage | InputError]]:
-    """Yield the names and grey levels of about `most` images, evenly spread over `paths`, or why one cannot be read.
+def _pictures(paths: Sequence[Path], most: int, between: bool = False) -> Iterator[tuple[str, GreyImage | InputError]]:
+    """Yield the names and grey levels of about `most` images, evenly spread over `paths`, or why one cannot be read;
+    of those that lie between these.
 
     Of videos frames are taken.
     """
-    for path in paths[:: max(1, -(-len(paths) // most))]:
+    step = max(1, -(-len(paths) // most))
+    for path in paths[step // 2 if between else 0 :: step]:
         try:
             if is_video(path):
                 yield from _frames(path, max(1, most // len(paths)))
