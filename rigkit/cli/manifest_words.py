@@ -117,8 +117,10 @@ def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple
     """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for other pairs and what is no length."""
     out = {}
     for text in told:
-        name, _, value = text.partition("=")
+        name, of, value = text.partition("=")
         number, _, sigma = value.partition("+-")
+        if not of:
+            raise InputError(f"init: --baseline-mm '{text}' names no pair: write PAIR=MM+-SIGMA, such as first={text}")
         if pairs and name not in pairs:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")
         what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"

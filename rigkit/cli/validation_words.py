@@ -51,6 +51,7 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
 def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> int:
     """Print the paper's tables; return the exit code. What the paper claims passes or fails no check of ours."""
     from rigkit.report.tables import tables_to_text
+    from rigkit.workflows.paper import NOT_CHECKED
 
     if json:
         result = {"output": str(options.output), "reports": [report.to_dict() for report in done.reports]}
@@ -58,6 +59,7 @@ def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> i
     else:
         print(tables_to_text([table for table in done.tables if table.key != "estimators"]))
         print(f"{options.output}")
+    note(NOT_CHECKED)
     return exit_code_of(done.failures, ExitCode.WELL)
 
 

@@ -32,6 +32,11 @@ from rigkit.workflows.provenance import software_facts
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""
+NOT_CHECKED = (
+    "neither what was measured nor what is declared (pose types, levels, sizes of boards) is checked here; `rigkit "
+    "validate` without --paper does that"
+)
+"""What a reader of the paper's tables must know: this pipeline errs by more than most wrong declarations."""
 PLANES_FILE = "planes.csv"
 BASELINES = "baselines.csv"
 
@@ -163,7 +168,7 @@ def paper_page(name: str, images: str | None, tables: Sequence[Table], provenanc
         "The paper's own pipeline: chords to neighbouring corners, equal weights, its linear solvers with the formulas "
         "corrected, no refinement, planes by principal components.",
         f"The images are {images}." if images else "Nobody said whether the images are real or rendered.",
-        "What the paper claims passes or fails no check of ours.",
+        f"What the paper claims passes or fails no check of ours, and {NOT_CHECKED}.",
     )
     facts = PageFacts(
         headline=f"{held} of {len(judged)} statements of the paper that this data set can test hold on it",

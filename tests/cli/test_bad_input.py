@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -365,45 +364,3 @@ def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFix
     assert stop.value.code == 2
     said = capsys.readouterr().err
     assert said.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in said
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "calibrate photos.zip --square-mm 30",
-        "calibrate photos.zip",
-        "detect photos.zip --board 9x6x30 -o out.csv",
-        "validate photos.zip",
-    ],
-)
-def test_pictures_that_are_packed(
-    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with zipfile.ZipFile("photos.zip", "w") as packed:
-        packed.writestr("01.jpg", bytes(range(256)))
-    assert main(words.split()) == 2
-    assert "is a ZIP archive; unpack it" in capsys.readouterr().err
-
-
-def test_a_file_that_is_no_session_is_not_said_to_be_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("notes.txt").write_text("9x6, 30 mm\n")
-    assert main(["calibrate", "notes.txt", "--square-mm", "30"]) == 2
-    assert "none of these: a folder of images, a video, a session's file" in capsys.readouterr().err
-
-
-def test_a_camera_of_a_rig_that_sees_no_board(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The board may be described rightly: another camera of the rig sees it."""
-    monkeypatch.chdir(tmp_path)
-    for camera in ("left", "right"):
-        Path(camera).mkdir()
-        for k in range(3):
-            cv2.imwrite(f"{camera}/{k}.png", np.full((60, 80), 90, np.uint8))
-    assert main(["calibrate", "left", "right", "--board", "5x4x20"]) == 2
-    assert "of camera 'left'" in (said := capsys.readouterr().err)
-    assert "look whether that camera saw the boards, else leave it out; or check columns and rows" in said

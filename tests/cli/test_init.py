@@ -105,6 +105,13 @@ def test_lengths_that_are_none(options: list[str], tmp_path: Path, capsys: pytes
     assert not (tmp_path / "dataset.toml").exists()
 
 
+def test_a_baseline_of_no_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
+    options = ["--square-mm", "50", "--baseline-mm", "120+-1"]
+    assert main(["init", str(tmp_path), "--calibration", "c.json", "--pose-type", "general", *options]) == 2
+    assert "'120+-1' names no pair: write PAIR=MM+-SIGMA, such as first=120+-1" in capsys.readouterr().err
+
+
 def test_several_cameras_and_pose_types(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.judging.two_kinds import UNTRUE, fewest_of_a_kind
+from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, UNTRUE, fewest_of_a_kind
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares
@@ -38,8 +38,6 @@ there in random orders that chance parts as clearly, 0.9 to 1.6 (once 1.7 in 720
 2.7, where eight of them are parted at a zoom of 3 or 15 %."""
 ORDERS, CHANCE = 199, 0.02
 """Random orders of the images, and how many of them may part these as well as time does."""
-RIDGE = 1e-9
-"""Part of all information that keeps what a few images leave open at rest."""
 DIGITS = re.compile(r"\d+")
 
 
@@ -106,7 +104,7 @@ class _Pulls:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information.sum(axis=0) + prior), np.finfo(float).tiny))
         across = scale[:, None] * scale
         fewest = int(np.ceil(fewest_of_a_kind(len(score))))
-        return cls(information * across, score * scale, prior * across + RIDGE * np.eye(p), fewest)
+        return cls(information * across, score * scale, prior * across + RIDGE_OF_STEP * np.eye(p), fewest)
 
     def gains(self, order: IntArray) -> FloatArray:
         """Return by how much the cost falls when the first k of the images in this order (N,) and the others have

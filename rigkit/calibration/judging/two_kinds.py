@@ -38,7 +38,7 @@ UNTRUE = "the uncertainties that are stated do not hold"
 SIDES_ROUNDS = 8
 """Images change sides in so many rounds at most."""
 RIDGE_OF_STEP = 1e-9
-"""Part of its own information that keeps what the images leave open at rest."""
+"""Part of its own (or all) information that keeps what the images leave open at rest."""
 SAME = 0.15
 """A principal point lies where another one is after a turn within this part of the way between both."""
 MIN_APART_PX = 1.0

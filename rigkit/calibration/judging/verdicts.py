@@ -91,13 +91,10 @@ def judge(
     also : verdicts found elsewhere.
     far, clusters : what `FarProjection.of` and `cluster_numbers` (V,) return, where they are known already.
     in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
-    solved : what was calibrated, for `changing`.
-    order : names of all images, those that are left out too, in the order given.
+    solved, order : what was calibrated, and the names of all images in the order given, those left out too.
     """
     far = FarProjection.of(calibration) if far is None else far
-    if clusters is None:
-        views = calibration.views
-        clusters = cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
+    clusters = _clusters(calibration.views) if clusters is None else clusters
     upright = same_way_up(calibration)
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
@@ -136,6 +133,10 @@ def judge(
             *_outliers(calibration, [finding.image for finding in (*unlike, *unclear)]),
         ]
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
+
+
+def _clusters(views: Sequence[ViewResult]) -> IntArray:
+    return cluster_numbers([v.image for v in views], [v.board_id for v in views], [v.pixels for v in views])
 
 
 def _residuals(
