@@ -65,8 +65,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
             )
             return (Finding.bad(message, "calibrate each camera from its own images"),)
     distance = _surely_apart(observations, fit, state, number, later, pulls)
-    chance = pulls.chance(observations.clusters(), number) if distance is not None else 1.0
-    if chance > CHANCE:
+    if distance is None or (chance := pulls.chance(observations.clusters(), number)) > CHANCE:
         return ()
     message = (
         f"the lens (or the board) was another one from '{images[first]}' on ({distance:.0f} standard deviations; the "
