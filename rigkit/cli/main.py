@@ -19,7 +19,7 @@ from typing import Any
 from rigkit.cli.examples import EXAMPLES, FIRST_STEPS
 from rigkit.cli.log import add_log_arguments, logged_run, logging_to
 from rigkit.cli.surroundings import SURROUNDINGS, Terminated, open_streams, say, settle_stderr, signals_interrupt
-from rigkit.core.errors import ExitCode, RigkitError, printable
+from rigkit.core.errors import ExitCode, RigkitError, interruption, printable
 
 VERBS: dict[str, str] = {
     "demo": "render a small capture and run everything on it",
@@ -118,17 +118,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             args = build_parser(verb).parse_args(arguments)
             with logging_to(verbose=args.verbose, log_file=args.log_file):
                 return logged_run(args)
-    except RigkitError as error:
-        say(f"{error}")
-        return error.exit_code
     except BrokenPipeError:
         sys.stderr.close()
         return 0
-    except KeyboardInterrupt as stop:
-        number = stop.number if isinstance(stop, Terminated) else signal.SIGINT
-        say("interrupted")
-        return ExitCode.BY_SIGNAL + number
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
+        if (stop := interruption(error)) is not None:
+            say("interrupted")
+            return ExitCode.BY_SIGNAL + (stop.number if isinstance(stop, Terminated) else signal.SIGINT)
+        if isinstance(error, RigkitError):
+            say(f"{error}")
+            return error.exit_code
         if isinstance(error, MemoryError) or (type(error).__module__ == "cv2" and "Insufficient memory" in str(error)):
             reason = printable(str(error)) or "out of memory"
             say(f"{reason}; use fewer processes (-j 1), smaller images, or a machine with more memory")

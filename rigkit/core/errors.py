@@ -61,6 +61,15 @@ class InternalError(RigkitError):
         return Exception.__str__(self)
 
 
+def interruption(error: BaseException) -> KeyboardInterrupt | None:
+    """Return the interruption that `error` came of; None where it came of something else. Libraries that are
+    interrupted while they are loaded say that they could not be."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    return cause
+
+
 def printable(text: str) -> str:
     """Return the text with escapes in place of line ends, codes for terminals and characters that no file can hold."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

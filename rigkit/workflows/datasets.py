@@ -22,7 +22,7 @@ from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.errors import InputError, InternalError, RigkitError
+from rigkit.core.errors import InputError, InternalError, RigkitError, interruption
 from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.io.calibration_file import calibration_text, load_calibration_or_camera
@@ -275,11 +275,13 @@ def over_pairs(
 def _attempt(work: Callable[[PairJob[Options]], Result], job: PairJob[Options]) -> Result | RigkitError:
     try:
         return work(job)
-    except RigkitError as error:
-        return error
-    except MemoryError as error:
-        return InputError(f"{error or 'out of memory'}; use fewer processes (-j 1), or smaller images")
     except Exception as error:
+        if (stop := interruption(error)) is not None:
+            raise stop from None
+        if isinstance(error, RigkitError):
+            return error
+        if isinstance(error, MemoryError):
+            return InputError(f"{error or 'out of memory'}; use fewer processes (-j 1), or smaller images")
         # A fault of ours in one pair must not lose the others' results; the traceback says where it is.
         return InternalError(
             f"{traceback.format_exc()}this is a bug in rigkit ({error!r}); please report the lines above"

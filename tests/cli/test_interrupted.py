@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rigkit.cli import diff
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.core.processes import worker_pool
+from rigkit.workflows.datasets import _attempt
 
 WORK = """
 import os, sys, time
@@ -156,6 +158,26 @@ def test_the_version_says_what_is_installed(capsys: pytest.CaptureFixture[str]) 
     assert first.startswith("rigkit ")
     assert second.split()[0] == "kernels" and len(second.split()[1].rstrip(",")) == 16
     assert "Python 3." in third
+
+
+@pytest.mark.parametrize("said", [ImportError("initialization failed"), InputError("a library cannot be loaded")])
+def test_a_library_interrupted_while_it_is_loaded(
+    said: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It says that it could not be loaded, of which the interruption is the cause."""
+
+    def work(_: object) -> int:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as stop:
+            raise said from stop
+
+    monkeypatch.setattr(diff, "run", work)
+    assert main(["diff", "a.json", "b.json"]) == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "rigkit: interrupted\n"
+    job: Any = None
+    with pytest.raises(KeyboardInterrupt):
+        _attempt(work, job)
 
 
 def test_an_interrupted_pool_leaves_no_thread() -> None:
