@@ -24,6 +24,12 @@ SIDES = (
 )
 """How people mark the two images of a pair at the end of a name."""
 
+SIDES_FIRST = (
+    (re.compile(r"^left(?=[ _-]|\d)", re.IGNORECASE), 1),
+    (re.compile(r"^right(?=[ _-]|\d)", re.IGNORECASE), 2),
+)
+"""The same at the beginning: left01, right_p0."""
+
 SIDE_FOLDERS = (
     (re.compile(r"(left|cam(era)?[_-]?0*1)$", re.IGNORECASE), 1),
     (re.compile(r"(right|cam(era)?[_-]?0*2)$", re.IGNORECASE), 2),
@@ -99,7 +105,7 @@ def group_pairs(shown: Sequence[ImageBoards], root: Path) -> list[FoundPair]:
     """
     free = [s for s in shown if s.boards]
     pairs: list[FoundPair] = []
-    for marked in (_by_name, _by_folder):
+    for marked in (_by_first, _by_name, _by_folder):
         sides: dict[tuple[Path, str], dict[int, ImageBoards]] = {}
         for one in free:
             found = marked(one.image, root)
@@ -131,6 +137,12 @@ def _by_name(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
     return None if found is None else ((image.parent, found[0]), found[1])
 
 
+def _by_first(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
+    """Return the same where the mark comes first: of left_1 and right_1, not of left_1 and left_2."""
+    found = _side(image.stem, SIDES_FIRST)
+    return None if found is None else ((image.parent, found[0]), found[1])
+
+
 def _by_folder(image: Path, root: Path) -> tuple[tuple[Path, str], int] | None:
     """Return the same of an image in a folder that is marked: left/0001.png."""
     parent = image.parent
@@ -142,7 +154,7 @@ def _side(name: str, marks: Sequence[tuple[re.Pattern[str], int]]) -> tuple[str,
     for pattern, side in marks:
         rest, count = pattern.subn("", name)
         if count:
-            return rest.rstrip("_- "), side
+            return rest.strip("_- "), side
     return None
 
 
@@ -177,8 +189,8 @@ def manifest_text(new: NewManifest, root: Path) -> str:
     pairs, told = new.pairs, new.told
     if not pairs:
         raise InputError(
-            "init: no two images look like a pair; name them ...left/...right, view1/view2 or NAME1/NAME2, put them "
-            "into folders named so, or each pair into a folder of its own"
+            "init: no two images look like a pair; name them left01/right01, ...left/...right, view1/view2 or "
+            "NAME1/NAME2, put them into folders named so, or each pair into a folder of its own"
         )
     out = [
         "# Started by `rigkit init`; what a person measured is for a person to check.",

@@ -75,6 +75,19 @@ def test_numbers_one_and_two_are_a_pair_where_there_are_no_others(tmp_path: Path
     assert group_pairs(shown[4:], root) == []
 
 
+@pytest.mark.parametrize("rests", [("01", "02"), ("_1", "_2"), ("_p0_0", "_p0_1")])
+def test_names_that_begin_with_the_side(tmp_path: Path, rests: tuple[str, str]) -> None:
+    """As stereo programs write them; left_1 and left_2 are of one camera."""
+    root = tmp_path.resolve()
+    names = [f"{side}{rest}" for side in ("left", "right") for rest in rests]
+    pairs = group_pairs([ImageBoards(root / f"{n}.jpg", (800, 600), ((8, 6),)) for n in names], root)
+    assert [(p.name, p.first.image.stem, p.second.image.stem) for p in pairs] == [
+        (rest.strip("_"), f"left{rest}", f"right{rest}") for rest in rests
+    ]
+    lefts = [ImageBoards(root / f"left_{n}.jpg", (800, 600), ((8, 6),)) for n in ("view1", "view2")]
+    assert [p.first.image.stem for p in group_pairs(lefts, root)] == ["left_view1"]
+
+
 def test_what_images_cannot_tell_must_be_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
