@@ -50,11 +50,13 @@ Fields = Callable[[FloatArray], FloatArray]
 @dataclass(frozen=True, eq=False, slots=True)
 class Departures:
     """How far a lens may depart from its model: covariance (J, J) px^2 of the J displacements (about zero, what the
-    images say of them counted in), and by how much the parameters (P, J) have followed each."""
+    images say of them counted in), by how much the parameters (P, J) have followed each, and the pupil's terms (2, J),
+    where that moves."""
 
     size_px: tuple[int, int]
     covariance: FloatArray
     followed: FloatArray
+    followed_by_pupil: FloatArray
 
     @classmethod
     def of(cls, calibration: Calibration) -> Departures:
@@ -71,7 +73,8 @@ class Departures:
         variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
         covariance = _averaged(left[:-1, :-1] / variance, left[:-1, -1] / variance)
         moved = sigmas[:, None] * followed[:, :-1]
-        return cls(calibration.camera.size_px, covariance, moved[: calibration.camera.parameters.size])
+        own = calibration.camera.parameters.size
+        return cls(calibration.camera.size_px, covariance, moved[:own], moved[own:])
 
     def left_over(self, pixels: Pixels, design: FloatArray) -> FloatArray:
         """Return the displacements (2, J, M) at pixels (M, 2) less what the parameters have followed; `design`

@@ -26,6 +26,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import Along, FarProjection
 from rigkit.cameras.base import Camera, RadialCurve, image_center
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import BoolArray, FloatArray, Mat3
 from rigkit.core.errors import InputError
@@ -167,23 +168,30 @@ class LensModes:
     turns: FloatArray | None = None
 
 
-def uncertain_camera(calibration: Calibration, *, quoted: bool = True) -> UncertainCamera:
+def uncertain_camera(calibration: Calibration, *, quoted: bool = True, near: bool = False) -> UncertainCamera:
     """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
     with boards all over the image and a model that fits none do, and the camera is the calibration's own.
 
     The covariance is that which is `quoted`; otherwise Student's, for what counts the calibration's degrees of freedom
-    itself.
+    itself. It is of what is far away; with `near` of points in mm, a `NearCamera` where the pupil moves: before boards
+    lens and pupil are off by less together than each alone.
     """
-    known = calibration.covariance * (calibration.widening**2 if quoted else 1.0)
-    (camera,), covariance = with_modes((calibration.camera,), known, (lens_modes(calibration),))
-    return UncertainCamera(camera, covariance)
+    pupil = calibration.pupil if near else None
+    known = calibration.covariance if pupil is None else calibration.near_covariance[:-6, :-6]
+    known = known * (calibration.widening**2 if quoted else 1.0)
+    modes = lens_modes(calibration, near=near)
+    (camera,), covariance = with_modes((calibration.camera,), known, (modes,))
+    return UncertainCamera(camera if pupil is None else NearCamera.of(camera, pupil.terms), covariance)
 
 
-def lens_modes(calibration: Calibration) -> LensModes:
-    """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it."""
+def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
+    """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it, and those of
+    its pupil with `near`."""
     far = FarProjection.of(calibration)
-    modes = telling_modes(far)
-    return LensModes(modes, -far.departures.followed @ modes, -far.hides_departures @ modes)
+    modes, followed = telling_modes(far), far.departures.followed
+    if near:
+        followed = np.concatenate([followed, far.departures.followed_by_pupil])
+    return LensModes(modes, -followed @ modes, -far.hides_departures @ modes)
 
 
 def with_modes(

@@ -167,6 +167,16 @@ class NearCamera(Camera):
         return u, v, valid & near
 
 
+def as_other_from_afar(pixels: Pixels, points: Points, camera: Camera, other: Camera) -> Pixels:
+    """Return pixels (N, 2) of points (N, 3), which are `as_from_afar` by a camera, as they are by another that saw the
+    same; the pixels where one of the two is central, and of points that are not seen."""
+    if not (isinstance(camera, NearCamera) and isinstance(other, NearCamera)):
+        return pixels
+    seen = pixels - camera.as_from_afar(np.zeros_like(pixels), points)
+    again = other.as_from_afar(seen, points)
+    return np.where(np.isfinite(again), again, pixels)
+
+
 def far_camera(camera: Camera) -> Camera:
     """Return the central camera that is exact far away: of one with a moving pupil its lens, else the camera."""
     return camera.lens if isinstance(camera, NearCamera) else camera

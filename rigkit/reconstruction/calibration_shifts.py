@@ -24,7 +24,7 @@ from rigkit.core.matches import Matches
 from rigkit.geometry.projection_jacobian import pair_projection_jacobians
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.metric import triangulate_matches
-from rigkit.reconstruction.moved_cameras import moved_pairs, seen_by_all
+from rigkit.reconstruction.moved_cameras import Known, moved_pairs, moved_pixels, seen_by_all
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.reconstruction.scale import metric_scale
 from rigkit.relative_pose.refinement.refine import refine_pose
@@ -45,11 +45,10 @@ class CalibrationShifts:
 
     @cached_property
     def rays(self) -> list[list[tuple[Rays, RayJacobians]]]:
-        """Rays (N, 3) of the pixels of image 1 and of image 2, and their derivatives by the pixel (N, 3, 2), by the
+        """Rays (N, 3) of the corners in image 1 and in image 2, and their derivatives by the pixel (N, 3, 2), by the
         cameras as they are and as each move has them."""
-        pixels = self.base.pixels1, self.base.pixels2
-        each = [(shift.camera1, shift.camera2) for shift in (self.base, *self.moved)]
-        return [[(c.unproject(p)[0], c.ray_jacobian(p)) for c, p in zip(both, pixels, strict=True)] for both in each]
+        each = [((r.camera1, r.pixels1), (r.camera2, r.pixels2)) for r in (self.base, *self.moved)]
+        return [[(camera.unproject(p)[0], camera.ray_jacobian(p)) for camera, p in both] for both in each]
 
     def points(self) -> FloatArray:
         """Return how the points move along each axis (K, N, 3), mm; NaN where that is not known."""
@@ -84,11 +83,19 @@ def calibration_shifts(
     there = PosedPair(r.camera1, r.camera2, r.cam2_from_cam1)
     calibrations = known1 if isinstance(known1, UncertainPair) else (known1, known2)
     moves = [there, *moved_pairs(there, calibrations)]
+    known = (known1, known2 or known1) if isinstance(known1, UncertainCamera) else (None, None)
     # A corner at the rim of the field can lie outside a moved camera's: then it says nothing here, of no camera.
     seen = seen_by_all([(move.camera1, move.camera2) for move in moves], r.pixels1, r.pixels2)
-    again = [_again(r, move, seen, pose_is_known) for move in moves]
+    again = [_again(_seen_through(r, known, move), move, seen, pose_is_known) for move in moves]
     base, *moved = (estimated for estimated, _ in again)
     return CalibrationShifts(base, tuple(moved), np.logical_and.reduce([found for _, found in again]))
+
+
+def _seen_through(r: Reconstruction, known: Known, there: PosedPair) -> Reconstruction:
+    """Return the reconstruction with the pixels that moved cameras have, see `moved_pixels`."""
+    points = r.cloud.points_mm, r.cam2_from_cam1.apply(r.cloud.points_mm)
+    pixels1, pixels2 = moved_pixels((r.pixels1, r.pixels2), points, known, (there.camera1, there.camera2))
+    return replace(r, pixels1=pixels1, pixels2=pixels2)
 
 
 def _again(

@@ -27,7 +27,7 @@ from rigkit.reconstruction.board_planes import (
     variance_and_covariance,
 )
 from rigkit.reconstruction.coplanar_problem import CoplanarProblem, CoplanarState
-from rigkit.reconstruction.moved_cameras import moved_cameras, seen_by_all
+from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels, seen_by_all
 from rigkit.reconstruction.scale import board_scales_and_gradients, square_sigmas
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def coplanar_planes(
     planes = [geometry.pair.identity.cam1_from_board[board.board_id] for board in boards]
     state = problem.start(geometry.refined.cam2_from_cam1, planes, geometry.metric.baseline_mm)
     problem, state = _without_outliers(problem, state)
-    return _result(problem, state, boards, total, moved, pair.pair_id)
+    return _result(problem, state, boards, total, moved, (known1, known1 if one_camera else known2), pair.pair_id)
 
 
 def _on_boards(matches: Matches, boards: tuple[Board, ...]) -> tuple[Matches, list[Board], int]:
@@ -179,6 +179,7 @@ def _result(
     boards: list[Board],
     total: int,
     moved: list[tuple[Camera, Camera]],
+    known: Known,
     pair_id: str,
 ) -> CoplanarPlanes:
     """Return the planes at a minimum in mm, with the covariance that the residuals and the moved cameras show."""
@@ -193,8 +194,14 @@ def _result(
     by_point = scale.value * problem.turned_back(motions) + np.multiply.outer(scale.by_state, points_mm / scale.value)
     moves, point_moves = [np.zeros((0, len(by_scale)))], [np.zeros((0, *points.shape))]
     residuals = here.residual[: 2 * count]
+    pose, normals, _ = problem.in_camera(state)
+    cam2_from_cam1 = Rigid3(pose.rotation, scale.value * pose.translation_mm)
+    pixels, in_cameras = (
+        (problem.matches.pixels1, problem.matches.pixels2),
+        (points_mm, cam2_from_cam1.apply(points_mm)),
+    )
     for cameras in moved:
-        there = problem.through(*cameras)
+        there = problem.through(cameras, moved_pixels(pixels, in_cameras, known, cameras))
         change = there.corners(state)[0].ravel() - residuals
         step = -of_free @ here.jacobian[: 2 * count].T @ change / factor
         # What moves at a fixed state: the points, and with them the scale.
@@ -207,10 +214,9 @@ def _result(
     own = scale.value**2 * problem.turned_back(np.swapaxes(problem.turned_back(noise), 1, 2))
     own += (scale.sigma / scale.value) ** 2 * points_mm[:, :, None] * points_mm[:, None, :]
     shared = np.einsum("fni,fg,gnj->nij", by_point, of_free, by_point)
-    pose, normals, _ = problem.in_camera(state)
     return CoplanarPlanes(
         board_ids=tuple(board.board_id for board in boards),
-        cam2_from_cam1=Rigid3(pose.rotation, scale.value * pose.translation_mm),
+        cam2_from_cam1=cam2_from_cam1,
         covariance=by_state @ of_free @ by_state.T + scale.sigma**2 * np.outer(by_scale, by_scale),
         calibration_moves=np.concatenate(moves),
         variance_factor=factor,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Points
+from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points
 from rigkit.core.errors import DegenerateError
 from rigkit.core.matches import Matches
 from rigkit.core.posetype import PoseType
@@ -77,9 +77,9 @@ class CoplanarProblem:
     def select(self, which: BoolArray) -> CoplanarProblem:
         return replace(self, matches=self.matches.select(which), bases2=self.bases2[which])
 
-    def through(self, camera1: Camera, camera2: Camera) -> CoplanarProblem:
-        """Return the same corners by other cameras."""
-        seen = self.matches.through(camera1, camera2)
+    def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> CoplanarProblem:
+        """Return the same corners by other cameras, at these pixels."""
+        seen = replace(self.matches, pixels1=pixels[0], pixels2=pixels[1]).through(*cameras)
         seen = seen if self.frames is None else self.frames.matches(seen)
         return replace(self, matches=seen, bases2=np.asarray(np.linalg.pinv(seen.jacobians2)))
 

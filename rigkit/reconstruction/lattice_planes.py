@@ -32,7 +32,7 @@ from rigkit.reconstruction.board_planes import (
     near_the_rest,
     variance_and_covariance,
 )
-from rigkit.reconstruction.moved_cameras import moved_cameras
+from rigkit.reconstruction.moved_cameras import Known, moved_cameras, moved_pixels
 
 if TYPE_CHECKING:
     from rigkit.reconstruction.geometry import PairGeometry
@@ -110,8 +110,9 @@ def lattice_planes(
     data = here.residual[: 2 * problem.count]
     covariance, moves = np.zeros((len(free), len(free))), np.zeros((len(moved), len(free)))
     covariance[np.ix_(free, free)] = of_free
+    known = known1, known1 if one_camera else known2
     for k, cameras in enumerate(moved):
-        change = problem.through(cameras).residuals(state) - data
+        change = problem.through(cameras, problem.moved_pixels(state, known, cameras)).residuals(state) - data
         moves[k, free] = -of_free @ here.jacobian[: len(data)].T @ change / factor
     poses = [Rigid3.from_matrix(matrix) for matrix in (state[0], *state[1])]
     return LatticePlanes(
@@ -184,11 +185,21 @@ class LatticeProblem:
         """Which parameters are unknown: a board's size only where a sigma of it is stated."""
         return np.concatenate([np.ones(6 * (len(self.size_sigma) + 1), dtype=bool), self.size_sigma > 0.0])
 
-    def through(self, cameras: tuple[Camera, Camera]) -> LatticeProblem:
-        """Return the same corners as other cameras see them."""
+    def moved_pixels(self, state: PlacedLattices, known: Known, moved: tuple[Camera, Camera]) -> tuple[Pixels, Pixels]:
+        """Return the corners as of `moved_pixels` where the boards are placed so."""
+        motion, boards, log_sizes = state
+        points = []
+        for c, second in zip(self.images, (False, True), strict=True):
+            p = np.exp(log_sizes)[c.board, None] * c.points
+            p = np.einsum("nij,nj->ni", boards[c.board, :3, :3], p) + boards[c.board, :3, 3]
+            points.append(p @ motion[:3, :3].T + motion[:3, 3] if second else p)
+        return moved_pixels(self.pixels, (points[0], points[1]), known, moved)
+
+    def through(self, cameras: tuple[Camera, Camera], pixels: tuple[Pixels, Pixels]) -> LatticeProblem:
+        """Return the same corners as other cameras see them, at these pixels."""
         first, second = (
-            seen_corners(camera, pixels, c.sigma_px, c.points, c.board)
-            for camera, pixels, c in zip(cameras, self.pixels, self.images, strict=True)
+            seen_corners(camera, at, c.sigma_px, c.points, c.board)
+            for camera, at, c in zip(cameras, pixels, self.images, strict=True)
         )
         return replace(self, images=(first, second))
 

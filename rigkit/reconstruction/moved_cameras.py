@@ -11,9 +11,12 @@ from typing import TypeAlias
 import numpy as np
 
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import as_other_from_afar
 from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
-from rigkit.core.arrays import BoolArray, Pixels
+from rigkit.core.arrays import BoolArray, Pixels, Points
 
+Known: TypeAlias = tuple[UncertainCamera | None, UncertainCamera | None]
+"""Both cameras as they are known, None: nothing is known of one."""
 Calibrations: TypeAlias = tuple[UncertainCamera, UncertainCamera | None] | UncertainPair
 """Both cameras as they are known; None: the second is the first. Of a rig the pose between them, too."""
 
@@ -38,6 +41,18 @@ def moved_pairs(pair: PosedPair, calibrations: Calibrations) -> list[PosedPair]:
         return calibrations.moved()
     moved = moved_cameras(pair.camera1, pair.camera2, *calibrations, one=calibrations[1] is None)
     return [PosedPair(*cameras, pair.cam2_from_cam1) for cameras in moved]
+
+
+def moved_pixels(
+    pixels: tuple[Pixels, Pixels], points: tuple[Points, Points], known: Known, moved: tuple[Camera, Camera]
+) -> tuple[Pixels, Pixels]:
+    """Return the pixels (N, 2) of both images as moved cameras have what was seen of points (N, 3) mm in each camera's
+    frame: where a pupil moves, what that does is taken out anew (`as_other_from_afar`)."""
+    one, two = (
+        at if camera is None else as_other_from_afar(at, p, camera.camera, other)
+        for at, p, camera, other in zip(pixels, points, known, moved, strict=True)
+    )
+    return one, two
 
 
 def seen_by_all(cameras: Sequence[tuple[Camera, Camera]], pixels1: Pixels, pixels2: Pixels) -> BoolArray:

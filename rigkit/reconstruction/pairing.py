@@ -12,6 +12,8 @@ import numpy as np
 from rigkit.affine.affinities import DirectionNoise
 from rigkit.affine.directions import Support, direction_field
 from rigkit.cameras.base import Camera
+from rigkit.cameras.board_pose import board_from_afar
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -38,7 +40,8 @@ class MatchedPair:
     Attributes
     ----------
     pair_id : name of the pair.
-    camera1, camera2 : calibrated cameras of the images as captured.
+    camera1, camera2 : calibrated cameras of the images as captured, central: where the pupil of one moves, all corners
+        are `as_from_afar`.
     boards : boards seen in both images, in the order of `matches.board_index`.
     identity : which board and which corner is which.
     chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
@@ -99,7 +102,8 @@ def match_pair(
     Parameters
     ----------
     pair_id : for messages.
-    camera1, camera2 : the cameras; one object twice where one camera was moved.
+    camera1, camera2 : the cameras; one object twice where one camera was moved. Those whose pupil moves, `NearCamera`,
+        take that out of the corners: the boards' squares say how far away these are.
     detections1, detections2 : all boards found in either image.
     boards : the boards that stand there.
     layout : board id -> "left", "right", "floor", "ceiling" or "back" where a person said so.
@@ -108,8 +112,35 @@ def match_pair(
     support, window : what a direction is estimated from, see `direction_field`.
     """
     _check_sizes(pair_id, (*detections1, *detections2), boards)
-    identity = identify_pair(detections1, detections2, boards, camera1, camera2, layout=layout, angles=angles)
-    return _matched(pair_id, camera1, camera2, boards, identity, chain, support, window)
+
+    def identified(one: Sequence[BoardDetection], two: Sequence[BoardDetection]) -> PairIdentity:
+        return identify_pair(one, two, boards, *lenses, layout=layout, angles=angles)
+
+    lenses = far_camera(camera1), far_camera(camera2)
+    identity, notes = identified(detections1, detections2), list[str]()
+    if lenses != (camera1, camera2):
+        one, said1 = _from_afar(identity.detections1, boards, camera1, "image 1")
+        two, said2 = _from_afar(identity.detections2, boards, camera2, "image 2")
+        identity, notes = identified(one, two), [*said1, *said2]
+    matched = _matched(pair_id, *lenses, boards, identity, chain, support, window)
+    return replace(matched, notes=(*notes, *matched.notes))
+
+
+def _from_afar(
+    detections: Sequence[BoardDetection], boards: Sequence[Board], camera: Camera, image: str
+) -> tuple[Sequence[BoardDetection], list[str]]:
+    """Return known boards as a camera whose pupil did not move would have seen them, and what to say of that."""
+    if not isinstance(camera, NearCamera):
+        return detections, []
+    by_id = {board.board_id: board for board in boards}
+    out = [
+        replace(d, pixels=board_from_afar(camera, d.pixels, by_id[str(d.board_id)].points(d.grid))) for d in detections
+    ]
+    largest = max(
+        (float(np.abs(new.pixels - old.pixels).max()) for new, old in zip(out, detections, strict=True)), default=0.0
+    )
+    words = f"{image}: the entrance pupil of the lens moves; corners are where it would show them if it did not, "
+    return out, [f"{words}up to {largest:.1f} px away"]
 
 
 def _matched(

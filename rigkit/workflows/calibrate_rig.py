@@ -151,9 +151,7 @@ def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
     session = load_rig_session(path) if is_rig_session(path) else None
     if session is None or len(session.cameras) > 1:
         own = load_session(path)
-        # Pairs and rigs take lenses for central: at the boards' distance such a one is right, and one with a pupil far
-        # away.
-        return calibration_from(own, session_corners(own, progress=progress), pupil="central", progress=progress)
+        return calibration_from(own, session_corners(own, progress=progress), progress=progress)
     require_distinct(session)
     corners = {name: session_corners(own, progress=progress) for name, own in session.cameras.items()}
     return judged(rig_from(session, corners, progress=progress).cameras[0].calibration)

@@ -63,7 +63,7 @@ def crosscheck_dataset(
 def _crosscheck(job: PairJob[DatasetOptions]) -> CrossCheckReport:
     """Reconstruct one pair and compare it with every independent method."""
     camera1, camera2 = job.cameras.of(job.pair)
-    matched, _, _ = match_images(job.pair, camera1.camera, camera2.camera, job.options.chain)
+    matched, _, _ = match_images(job.pair, camera1.near, camera2.near, job.options.chain)
     other = reconstruct_other_chain(matched, job.pair)
     ours = reconstruct_with(matched, job.pair, "3SDIR")
     return crosscheck(ours, other_chain=other, shifts=shifts_of(ours, camera1, camera2))

@@ -29,7 +29,7 @@ from rigkit.io.calibration_file import calibration_text, load_calibration_or_cam
 from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
-from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
+from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
@@ -115,9 +115,14 @@ class LoadedCamera:
     calibration: Calibration | None
 
     @property
+    def near(self) -> Camera:
+        """The camera of points in mm: where its pupil moves a `NearCamera`."""
+        return self.camera if self.calibration is None else self.calibration.near
+
+    @property
     def known(self) -> UncertainCamera | None:
-        """The camera with what its calibration leaves open, where that is known."""
-        return None if self.calibration is None else uncertain_camera(self.calibration)
+        """The camera of points in mm with what its calibration leaves open, where that is known."""
+        return None if self.calibration is None else uncertain_camera(self.calibration, near=True)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -204,10 +209,7 @@ def _file_of(camera_id: str, index: int) -> str:
 
 def _load(path: Path) -> LoadedCamera:
     known = load_calibration_or_camera(path)
-    if not isinstance(known, Calibration):
-        return LoadedCamera(known, None)
-    warn_of_pupil(path, known)
-    return LoadedCamera(known.camera, known)
+    return LoadedCamera(known.camera, known) if isinstance(known, Calibration) else LoadedCamera(known, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

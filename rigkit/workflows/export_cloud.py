@@ -65,7 +65,7 @@ def export_cloud(
         ensure_writable(options.output, force=options.force, inputs=known.inputs)
     pair.require_images()
     camera1, camera2 = load_cameras(known.select([pair.pair_id]), progress=progress).of(pair)
-    matched, image1, _ = match_images(pair, camera1.camera, camera2.camera, "raw")
+    matched, image1, _ = match_images(pair, camera1.near, camera2.near, "raw")
     r = reconstruct_with(matched, pair, options.method, image1)
     r = with_whole_sigmas(r, options.planes or pair.planes, camera1, camera2)
     folder, files = options.output, dict[str, str | bytes]()

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.directions import Support
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.planes import Planes
@@ -38,7 +39,7 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
     found: list[Detections] = []
     for path, camera, entry in ((pair.image1, camera1, pair.camera1), (pair.image2, camera2, pair.camera2)):
         image = read_image_of(path, camera.size_px, entry.calibration)
-        detections = detect_boards(to_grey(image), pair.boards, camera=camera)
+        detections = detect_boards(to_grey(image), pair.boards, camera=far_camera(camera))
         if not detections:
             sizes = ", ".join(sorted({f"{b.columns}x{b.rows}" for b in pair.boards}))
             raise InputError(
@@ -66,7 +67,7 @@ def match_found(
     chain: str,
     support: Support = "patch",
 ) -> MatchedPair:
-    """Match the boards found in the two images of a pair as the manifest declares it."""
+    """Match the boards found in the two images of a pair as the manifest declares it; cameras as of `match_pair`."""
     return match_pair(
         pair.pair_id,
         camera1,

@@ -130,7 +130,7 @@ def _without_unit(name: str) -> str:
 def _repeat(job: PairJob[PaperOptions]) -> tuple[ValidationReport, ...]:
     """Return the reports of one pair, an estimator that fails on it left out and said."""
     pair = job.pair
-    camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
+    camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))
     matched, _, _ = match_images(pair, camera1, camera2, job.options.chain)
     motions = OWN_MOTIONS if job.options.own_solvers else MOTIONS
     reports, errors = [], []

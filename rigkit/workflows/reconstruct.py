@@ -82,7 +82,7 @@ def _reconstruct(job: PairJob[ReconstructOptions]) -> PairReconstruction:
     """Reconstruct one pair and render its files."""
     pair, options = job.pair, job.options
     camera1, camera2 = job.cameras.of(pair)
-    matched, image1, image2 = match_images(pair, camera1.camera, camera2.camera, options.chain, options.support)
+    matched, image1, image2 = match_images(pair, camera1.near, camera2.near, options.chain, options.support)
     r = reconstruct_with(matched, pair, options.method, image1, det_scale=options.det_scale)
     planes = options.planes or pair.planes
     r = with_whole_sigmas(r, planes, camera1, camera2)

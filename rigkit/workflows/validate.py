@@ -134,7 +134,7 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     """Reconstruct one pair with every estimator and judge each."""
     pair = job.pair
     names = (pair.camera1.camera_id, pair.camera2.camera_id)
-    camera1, camera2 = (loaded.camera for loaded in job.cameras.of(pair))
+    camera1, camera2 = (loaded.near for loaded in job.cameras.of(pair))
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
     known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
     causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
