@@ -10,7 +10,7 @@ from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import Carried, GlobalCovariance
-from rigkit.calibration.pupil import SolvedPupil
+from rigkit.calibration.pupil import without_pupil
 from rigkit.calibration.result import Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.normal_equations import Residuals
@@ -18,7 +18,7 @@ from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.cameras.moving_pupil import NearCamera, far_camera
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
@@ -41,9 +41,7 @@ def assemble(
     state, sigma = fit.state, fit.sigma_px
     covariance, clustered = _covariance(observations, fit)
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:-6]))
-    camera, pupil = far_camera(state.camera), None
-    if isinstance(state.camera, NearCamera):
-        covariance, pupil = SolvedPupil.split(state.camera.pupil, covariance)
+    camera, covariance, pupil = without_pupil(state.camera, covariance)
     p = camera.parameters.size
     return Calibration(
         camera=camera,

@@ -27,7 +27,7 @@ from rigkit.calibration.lens_choice import (
     twins,
 )
 from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
-from rigkit.calibration.one_model import Solved, only, solved
+from rigkit.calibration.one_model import Solved, on_same_images, only, solved
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
@@ -202,23 +202,12 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
 
 def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
     """Say whether cameras that are alike are better off with the model that they were solved with again."""
-    pairs = [_on_same_images(now, then) for now, then in zip(found, again, strict=True)]
+    pairs = [on_same_images(now, then, ("found", "again")) for now, then in zip(found, again, strict=True)]
     if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
         return False  # Nothing can be compared.
     if len(pairs) == 1:
         return choose(pairs[0], SURELY).name == "again"
     return HeldOut.of(pairs).chosen() == "again"
-
-
-def _on_same_images(found: Solved, again: Solved) -> list[Option]:
-    """Return what two solutions of a camera chose, judged on the images that both have: each leaves out those that
-    disagree with its own model."""
-    images = [list(dict.fromkeys(one.observations.images)) for one in (found, again)]
-    out = []
-    for name, one, own, other in zip(("found", "again"), (found, again), images, images[::-1], strict=True):
-        both, heldout = [k for k, image in enumerate(own) if image in set(other)], one.chosen.heldout
-        out.append(replace(one.chosen, name=name, heldout=None if heldout is None else heldout[both]))
-    return out
 
 
 def _result(
@@ -228,7 +217,7 @@ def _result(
     central, how = _judged(begun, found, tried, rivals, likely), begun.how
     if how.pupil == "central" or (how.pupil == "auto" and not may_move(central)):
         return central
-    moving = solved_with_pupil(found, how)
+    moving = solved_with_pupil(found, begun.observations, how)
     if moving is not None:
         if len(tried.models) == 1:
             rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()

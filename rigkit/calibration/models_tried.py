@@ -16,7 +16,7 @@ from rigkit.calibration.solving.shape import SHAPES
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.registry import MODELS, camera_model, check_order
-from rigkit.core.arrays import BoolArray
+from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress
 
@@ -47,7 +47,7 @@ class How:
     folds: int
     progress: Progress
     pupil: str = "central"
-    """Cameras of a rig look from one point: the rig is solved for with such."""
+    """Or "auto", "moving": see `calibrate`."""
 
 
 def wanted_models(how: How) -> Wanted:
@@ -114,7 +114,7 @@ def agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArr
     best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
     total = observations.present.sum(axis=1)
-    keep = kept >= np.maximum(MIN_KEPT_SHARE * total, 4)
+    keep = enough_agree(kept, total)
     reasons = tuple(
         (view.image, f"only {k} of {n} corners of board '{view.board.board_id}' {DISAGREES_WITH_VIEWS}")
         for view, k, n, ok in zip(observations.views, kept, total, keep, strict=True)
@@ -123,6 +123,11 @@ def agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArr
     if not keep.any():
         raise DegenerateError("calibration: no view agrees with the others; check the board's size and the images")
     return keep, reasons
+
+
+def enough_agree(kept: IntArray, total: IntArray) -> BoolArray:
+    """Return which views have enough corners `kept` (V,) of their `total` (V,) for the view to agree with others."""
+    return np.asarray(kept >= np.maximum(MIN_KEPT_SHARE * total, 4))
 
 
 def _best(observations: Observations, options: list[Option]) -> Option:

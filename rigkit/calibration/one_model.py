@@ -15,15 +15,18 @@ from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.shape import often_seen
 from rigkit.calibration.views.observations import Observations
+from rigkit.core.arrays import BoolArray
 from rigkit.core.progress import Progress
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Solved:
-    """What one camera model came to: the observations used, why views were left out, the size and board shape chosen,
-    what was tried, which larger sizes were, the sizes compared on flat boards, and the board shapes compared."""
+    """What one camera model came to: the observations used, which of all views (V,) these are and why others were left
+    out, the size and board shape chosen, what was tried, which larger sizes were, the sizes compared on flat boards,
+    and the board shapes compared."""
 
     observations: Observations
+    used: BoolArray
     reasons: tuple[tuple[str, str], ...]
     chosen: Option
     candidates: list[Candidate]
@@ -59,6 +62,7 @@ def solved(
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
     return Solved(
         observations=observations,
+        used=keep,
         reasons=reasons,
         chosen=chosen,
         candidates=[*candidates, *tried],
@@ -66,6 +70,17 @@ def solved(
         sizes=options,
         shapes=shapes,
     )
+
+
+def on_same_images(found: Solved, again: Solved, names: tuple[str, str]) -> list[Option]:
+    """Return what two solutions of a camera chose, judged on the images that both have: each leaves out those that
+    disagree with its own model. They are called `names`."""
+    images = [list(dict.fromkeys(one.observations.images)) for one in (found, again)]
+    out = []
+    for name, one, own, other in zip(names, (found, again), images, images[::-1], strict=True):
+        both, heldout = [k for k, image in enumerate(own) if image in set(other)], one.chosen.heldout
+        out.append(replace(one.chosen, name=name, heldout=None if heldout is None else heldout[both]))
+    return out
 
 
 def with_board_shape(

@@ -16,12 +16,9 @@ from rigkit.calibration.heldout import heldout_squares
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.one_model import with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.solving.fit import CAUCHY_SIGMAS, SETTLE_ROUNDS, Fit, fit_kept
+from rigkit.calibration.solving.fit import Fit, fit_kept, posed
 from rigkit.calibration.solving.linearise import normal_equations
-from rigkit.calibration.solving.outliers import OUTLIER_SIGMAS, inliers, sigma_of
-from rigkit.calibration.solving.poses import find_poses, refine_poses
 from rigkit.calibration.solving.solver import Convergence
-from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.usable import usable_views
 from rigkit.cameras.base import Camera, RadialCurve
@@ -31,7 +28,6 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
-START_MM = 1000.0
 MIN_KEPT_SHARE = 0.5
 """A view in which fewer of the corners fit the known lens is dropped."""
 MAX_LENS_MISFIT_PX = 1.0
@@ -90,7 +86,7 @@ def _on_flat_boards(
     """Return the views that fit the lens, their poses before flat boards, and why the others were dropped."""
     used, dropped = usable_views(views, camera.size_px)
     observations = Observations.from_views(used)
-    state, kept = _posed(observations, camera)
+    state, kept = posed(observations, camera)
     fits = kept.sum(axis=1) >= np.maximum(MIN_KEPT_SHARE * observations.present.sum(axis=1), 4)
     if not fits.any():
         raise DegenerateError("no view fits the known lens; is it that of another camera, image size or focus?")
@@ -122,29 +118,6 @@ def _shaped(
     state = replace(chosen.fit.state, camera=lens)
     data = normal_equations(observations, state, chosen.fit.weight(observations))
     return observations, replace(chosen.fit, state=state, data=data), chosen.heldout_px, tuple(candidates)
-
-
-def _posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:
-    """Return the poses of all views, each at its own minimum, and which corners (V, C) are no outliers there."""
-    count = len(observations.views)
-    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
-    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
-    state = find_poses(observations, start, observations.weight, None)
-    norm = evaluate(state, observations).weighted(observations)
-    sigma = sigma_of(norm, observations.present)
-    if norm.max() > OUTLIER_SIGMAS * sigma:
-        state = find_poses(observations, state, observations.weight, CAUCHY_SIGMAS * sigma)
-        norm = evaluate(state, observations).weighted(observations)
-        sigma = sigma_of(norm, observations.present)
-    kept = inliers(norm, observations, sigma, camera.size_px)
-    for _ in range(SETTLE_ROUNDS):
-        state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
-        norm = evaluate(state, observations).weighted(observations)
-        agree = inliers(norm, observations, sigma_of(norm, kept), camera.size_px)
-        if (agree == kept).all():
-            break
-        kept = agree
-    return state, kept
 
 
 def _misfit(result: Calibration) -> tuple[Finding, ...]:

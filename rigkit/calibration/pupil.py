@@ -7,7 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.cameras.moving_pupil import PUPIL_TERMS, pupil_shift_mm
+from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, pupil_shift_mm
 from rigkit.core.arrays import FloatArray, IntArray, keep_arrays
 from rigkit.core.errors import InputError
 
@@ -61,6 +62,14 @@ class SolvedPupil:
 
         size = float(self.terms @ np.linalg.pinv(self.covariance, hermitian=True) @ self.terms) / PUPIL_TERMS
         return float(fdtrc(PUPIL_TERMS, min(freedom, 1e9), size))
+
+
+def without_pupil(camera: Camera, joint: FloatArray) -> tuple[Camera, FloatArray, SolvedPupil | None]:
+    """Return the central camera of a camera of points in mm, the covariance of its parameters and of the boards' mean
+    motion, from that of all, `joint`, and the pupil where one moves."""
+    if not isinstance(camera, NearCamera):
+        return camera, joint, None
+    return camera.lens, *SolvedPupil.split(camera.pupil, joint)
 
 
 def require_of_frame(pupil: SolvedPupil | None, frame: int) -> None:

@@ -11,15 +11,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.judging.pupil import BY_CHANCE
-from rigkit.calibration.models_tried import How, compared
-from rigkit.calibration.one_model import Solved, with_board_shape
+from rigkit.calibration.models_tried import How, compared, enough_agree, reweighted
+from rigkit.calibration.one_model import Solved, on_same_images, with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.solving.fit import fit_kept, fit_other_lens
-from rigkit.calibration.solving.state import State
+from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, posed, robust_sigma
+from rigkit.calibration.solving.outliers import inliers
+from rigkit.calibration.solving.state import State, evaluate
+from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
+from rigkit.core.arrays import BoolArray
 from rigkit.core.errors import DegenerateError, InputError
 
 PUPILS = ("auto", "central", "moving")
@@ -28,23 +33,20 @@ CENTRAL, MOVING = "one point of view", "moving pupil"
 """Names of the candidates."""
 
 
-def solved_with_pupil(found: Solved, how: How) -> Solved | None:
+def solved_with_pupil(found: Solved, everything: Observations, how: How) -> Solved | None:
     """Return what a camera comes to with a pupil that moves, its model's sizes and the boards' shape chosen again; None
-    where the images do not tell it from the rest."""
-    observations, kept = found.observations, found.chosen.fit.kept
-    poses = found.chosen.fit.state
-    options: list[Option] = []
-    for size in found.sizes:
-        lens = NearCamera.of(far_camera(size.fit.state.camera))
-        start = State.start(lens, poses.rotation, poses.translation_mm, observations)
-        try:
-            fit = fit_kept(observations, fit_other_lens(observations, start, kept).state, kept, settle=True)
-        except (InputError, DegenerateError):
-            continue
-        if identifiable(fit):
-            options.append(Option(f"{size.name}, {MOVING}", fit))
+    where the images do not tell it from the rest. Of `everything` that was seen, views that the central lens left out
+    and that agree with this one are taken back."""
+    start = found.chosen.fit
+    options = _with_every_size(found, start.state, start.kept)
+    if options and (more := _taken_back(found, everything, options)) is not None:
+        found, poses, kept = more
+        options = _with_every_size(found, poses, kept)
+        if options:
+            found = replace(found, observations=reweighted(found.observations, options))
     if not options:
         return None
+    observations = found.observations
     options = compared(observations, options, how.folds, how.progress)
     chosen = choose(options, SURELY)
     candidates = described(options, chosen, rivals=how.model == "auto")
@@ -60,10 +62,56 @@ def solved_with_pupil(found: Solved, how: How) -> Solved | None:
     )
 
 
+def _with_every_size(found: Solved, poses: State, kept: BoolArray) -> list[Option]:
+    """Return every size of the model with a pupil that moves, fitted to the corners `kept` of flat boards."""
+    observations, options = found.observations, []
+    for size in found.sizes:
+        lens = NearCamera.of(far_camera(size.fit.state.camera))
+        start = State.start(lens, poses.rotation, poses.translation_mm, observations)
+        try:
+            fit = fit_kept(observations, fit_other_lens(observations, start, kept).state, kept, settle=True)
+        except (InputError, DegenerateError):
+            continue
+        if identifiable(fit):
+            options.append(Option(f"{size.name}, {MOVING}", fit))
+    return options
+
+
+def _taken_back(
+    found: Solved, everything: Observations, options: Sequence[Option]
+) -> tuple[Solved, State, BoolArray] | None:
+    """Return the views used, with those of `everything` that were left out and agree with the best of lenses whose
+    pupil moves, the poses of all, and the corners kept; None where there is none."""
+    observations, left = found.observations, [everything.views[k] for k in np.flatnonzero(~found.used)]
+    if not left:
+        return None
+    fit = min((option.fit for option in options), key=lambda one: robust_sigma(one, observations))
+    others = Observations.from_views(left)
+    state, _ = posed(others, fit.state.camera)
+    norm = evaluate(state, others).weighted(others)
+    kept = inliers(norm, others, robust_sigma(fit, observations), fit.state.camera.size_px)
+    back = enough_agree(kept.sum(axis=1), others.present.sum(axis=1))
+    if not back.any():
+        return None
+    whole = Observations.from_views([*observations.views, *(left[k] for k in np.flatnonzero(back))])
+    kept_of_all = np.zeros(whole.present.shape, dtype=bool)
+    for rows, own in ((slice(None, len(fit.kept)), fit.kept), (slice(len(fit.kept), None), kept[back])):
+        kept_of_all[rows, : own.shape[1]] = own[:, : kept_of_all.shape[1]]
+    poses = replace(
+        fit.state,
+        rotation=np.concatenate([fit.state.rotation, state.rotation[back]]),
+        translation_mm=np.concatenate([fit.state.translation_mm, state.translation_mm[back]]),
+    )
+    reasons = tuple(reason for reason, ok in zip(found.reasons, back, strict=True) if not ok)
+    used = found.used.copy()
+    used[~used] = back
+    return replace(found, observations=whole, used=used, reasons=reasons), poses, kept_of_all
+
+
 def against_central(central: Solved, moving: Solved, how: How) -> tuple[bool, list[Candidate]]:
     """Return whether images that took no part are shown better with the pupil, on the same corners, and both as
     candidates."""
-    options = [replace(central.chosen, name=CENTRAL), replace(moving.chosen, name=MOVING)]
+    options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
         options = compared(central.observations, options, how.folds, how.progress)
     chosen = choose(options, SURELY)

@@ -51,8 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--pupil",
         choices=PUPILS,
         default="auto",
-        help="of one camera: whether the lens looks from one point (central), or its entrance pupil moves; default: "
-        "auto, moving where images show it",
+        help="whether lenses look from one point (central), or their entrance pupils move; default: auto, moving where "
+        "images show it",
     )
     parser.add_argument("--corners", type=Path, metavar="FILE", help="use these: corners.csv, corners.json, .vnl")
     parser.add_argument(

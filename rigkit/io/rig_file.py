@@ -15,6 +15,7 @@ import numpy as np
 from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.coverage import outline_of_corners
 from rigkit.calibration.displaced import LensModes, with_modes
+from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
@@ -34,6 +35,8 @@ from rigkit.io.calibration_file import (
     damage_named,
     findings_from_json,
     findings_to_json,
+    pupil_from_json,
+    pupil_to_json,
 )
 from rigkit.io.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
 from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
@@ -55,7 +58,8 @@ class SavedRig:
     degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
     are those it was calibrated with, none in a file that does not say; `outlines` by name are convex, (N, 2) px, around
     all corners that a camera saw, of those of which the file says it; `departures` are what each lens may do beyond its
-    model, none in a file that does not say; `verdicts` are what was said of it."""
+    model, none in a file that does not say; `pupils` are those that move, by name: `cameras` are exact far away;
+    `verdicts` are what was said of it."""
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -66,6 +70,7 @@ class SavedRig:
     boards: tuple[Board, ...] = ()
     outlines: Mapping[str, Pixels] = field(default_factory=dict)
     departures: tuple[LensModes, ...] = ()
+    pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
     verdicts: tuple[Finding, ...] = ()
 
     def stated(self, path: str | Path) -> tuple[tuple[Camera, ...], FloatArray, float]:
@@ -124,6 +129,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "rms_px": c.rms_px,
                 "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
                 **({} if own is None else {"departures": _rows_of(own)}),
+                **({} if c.calibration.pupil is None else {"pupil": pupil_to_json(c.calibration.pupil)}),
             }
             for c, own in zip_longest(rig.cameras, rig.departures)
         ],
@@ -153,9 +159,10 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     cameras: dict[str, tuple[Camera, Rigid3]] = {}
     outlines: dict[str, Pixels] = {}
     departures: dict[str, Any] = {}
+    pupils: dict[str, SolvedPupil] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) | {"outline_px", "departures"} != RIG_CAMERA_KEYS:
+            if set(entry) | {"outline_px", "departures", "pupil"} != RIG_CAMERA_KEYS:
                 raise InputError(
                     f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
                 )
@@ -166,6 +173,9 @@ def load_saved_rig(path: str | Path) -> SavedRig:
             cameras[name] = (camera, Rigid3.from_matrix(reals(entry["cam_from_rig"])))
             if "departures" in entry:
                 departures[name] = entry["departures"]
+            if "pupil" in entry:
+                pupils[name] = pupil_from_json(entry["pupil"])
+                require_of_frame(pupils[name], camera.parameters.size + 6)
             if "outline_px" in entry:
                 outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
         if not cameras:
@@ -191,6 +201,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
         boards=boards,
         outlines=outlines,
         departures=beyond,
+        pupils=pupils,
         verdicts=verdicts,
     )
 

@@ -87,6 +87,18 @@ _SHAPE = obj(
         "target?": DECLARED_BOARD,
     }
 )
+_PUPIL = said(
+    obj(
+        {
+            "mm_per_rad2": said(NUMBER, "e1"),
+            "mm_per_rad4": said(NUMBER, "e2"),
+            "covariance": said(matrix(rows=2, columns=2), "of both"),
+            "with_frame": said(matrix(columns=2), "of both with the camera's parameters and the boards' mean motion"),
+        }
+    ),
+    "how the entrance pupil moves: the ray at the angle t from the axis starts at e1 t^2 + e2 t^4 mm on it; missing: "
+    "all rays start at one point",
+)
 CALIBRATION_FILE = file(
     "rigkit.calibration/1",
     "A calibrated camera; with `camera` alone, a camera of another tool",
@@ -107,18 +119,7 @@ CALIBRATION_FILE = file(
         "outliers?": said(array(of_dataclass(Outlier)), "corners left out of views that were used"),
         "covariance?": said(matrix(), "of the parameters, in their order"),
         "frame_covariance?": said(matrix(), "of the parameters and the mean motion of the boards (rad, mm)"),
-        "pupil?": said(
-            obj(
-                {
-                    "mm_per_rad2": said(NUMBER, "e1"),
-                    "mm_per_rad4": said(NUMBER, "e2"),
-                    "covariance": said(matrix(rows=2, columns=2), "of both"),
-                    "with_frame": said(matrix(columns=2), "of both with what `frame_covariance` is of"),
-                }
-            ),
-            "how the entrance pupil moves: the ray at the angle t from the axis starts at e1 t^2 + e2 t^4 mm on it; "
-            "missing: all rays start at one point",
-        ),
+        "pupil?": _PUPIL,
         "boards?": said(array(_SHAPE), "boards as the solution has them"),
         "views?": said(array(_VIEW), "the views used"),
     },
@@ -140,6 +141,7 @@ RIG_FILE = file(
                     "what its lens may do beyond its model: independent displacements of the image of one sigma each, "
                     "and how much what `covariance` is of is off with them",
                 ),
+                "pupil?": _PUPIL,
             },
             "the first is the rig's frame",
             least=1,

@@ -53,8 +53,7 @@ class CalibrateOptions:
     known: Known = field(default_factory=Known)
     """Of a rig: files of lenses that stay as they are, or of a rig to which the others of the session are added."""
     pupil: str = "auto"
-    """Of one camera: whether its entrance pupil may move, as `rigkit.calibrate` has it. Cameras of a rig look from one
-    point each."""
+    """Whether entrance pupils may move, as `rigkit.calibrate` has it."""
     exports: tuple[str, ...] = ()
     """Other tools' formats to write the camera in, beside `output` (`rigkit.workflows.inputs.formats`)."""
 

@@ -96,8 +96,6 @@ def calibrate_session_file(
         raise InputError("one camera has no mounts to find; `rigkit pose` says where it is against a board")
     with about(options.corners) if options.corners else nullcontext():
         if isinstance(session, RigSession):
-            if options.pupil == "moving":
-                raise InputError("calibrate: --pupil moving is of one camera; those of a rig look from one point each")
             return calibrate_rig_session(session, options, progress=progress)
         return calibrate_session(session, options, progress=progress)
 

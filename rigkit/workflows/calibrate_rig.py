@@ -84,7 +84,7 @@ def calibrate_rig_session(
     ensure_writable(targets, force=options.force, inputs=session_inputs(session, options))
     with about(session.path):
         corners = {name: corners_of(own, options, progress=progress) for name, own in session.cameras.items()}
-        rig = rig_from(session, corners, progress=progress)
+        rig = rig_from(session, corners, pupil=options.pupil, progress=progress)
         checks = measured_checks(session, rig)
     files: dict[Path, str] = {}
     if options.output is not None:
@@ -172,9 +172,13 @@ def judged(calibration: Calibration) -> Calibration:
 
 
 def rig_from(
-    session: RigSession, corners: Mapping[str, SessionCorners], *, progress: Progress = silent
+    session: RigSession,
+    corners: Mapping[str, SessionCorners],
+    *,
+    pupil: str = "auto",
+    progress: Progress = silent,
 ) -> RigCalibration:
-    """Return the calibration of a rig's session from the corners of its cameras.
+    """Return the calibration of a rig's session from the corners of its cameras; `pupil` as of `calibrate_rig`.
 
     Raises InputError where a camera's images show no board or nothing says which were taken together, DegenerateError
     where the views do not determine a camera.
@@ -197,6 +201,7 @@ def rig_from(
             board=next(iter(session.cameras.values())).board_shape,
             rigid_boards=[group.boards for group in session.rigid_boards],
             known=known_cameras(session),
+            pupil=pupil,
             progress=progress,
         )
     except DegenerateError as error:

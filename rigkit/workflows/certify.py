@@ -13,13 +13,13 @@ from rigkit.core.printing import brief
 from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file
+from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.check import load_watched
-from rigkit.workflows.inputs.camera_files import called_bad, told_of_pupil
+from rigkit.workflows.inputs.camera_files import called_bad, told_of_pupil, told_of_pupils
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
@@ -66,8 +66,9 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
     if (bad := called_bad(path)) is not None:
         certificate = replace(certificate, findings=(bad, *certificate.findings))
-    if not is_rig_file(path) and (told := told_of_pupil(load_calibration(path))) is not None:
-        certificate = replace(certificate, findings=(*certificate.findings, Finding.look(told)))
+    told = told_of_pupils(load_saved_rig(path)) if is_rig_file(path) else [told_of_pupil(load_calibration(path))]
+    left_out = [Finding.look(words) for words in told if words is not None]
+    certificate = replace(certificate, findings=(*certificate.findings, *left_out))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}

@@ -181,6 +181,7 @@ def _watched_rig(known: SavedRig, source: Path) -> Watched:
         overdispersion=known.overdispersion,
         freedom=known.freedom,
         scale_sigma=known.scale_sigma,
+        pupils={k: known.pupils[name].terms for k, name in enumerate(known.cameras) if name in known.pupils},
     )
 
 
@@ -264,7 +265,7 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [counted_alike(watched, FreshView(name, c, watched.from_afar(view)), out) for view in views]
+            out += [counted_alike(watched, FreshView(name, c, watched.from_afar(view, c)), out) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out

@@ -26,7 +26,7 @@ from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure
-from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad
+from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad, warn_of_pupils
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 from rigkit.workflows.results import require_folder, write_results
@@ -101,6 +101,7 @@ def reconstruct_rig_views(options: RigSceneOptions, *, progress: Progress = sile
         require_folder(options.output, force=options.force)
     rig = saved_rig(options.rig)
     warn_if_bad(options.rig, rig.verdicts)
+    warn_of_pupils(options.rig, rig)
     views, known = _views(options, rig.cameras), rig.quoted
     pairs = near_pairs([v.cam_from_world for v in views])
     grown: dict[tuple[str, str], PosedCloud] = {}

@@ -19,6 +19,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.with_pupil import CENTRAL, MOVING
 from rigkit.cameras.compare import best_rotation, grid_pixels
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -215,3 +216,19 @@ def test_what_a_pupil_says_of_its_shift_is_propagated() -> None:
 def _rim(found: Calibration) -> float:
     points = found.corners.in_cam(np.flatnonzero(found.corners.kept))
     return float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())
+
+
+def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
+    """A board so near that its corners are pixels off where boards further away have put a central lens."""
+    rng, true = np.random.default_rng(1), NearCamera.of(lens("fish"), (3.0, -0.3))
+    views, nearer = (
+        random_views(true, count, rng, reach_deg=80.0, board=Board(name, 9, 6, mm, mm), noise_px=NOISE_PX)[0]
+        for name, count, mm in (("usual", 16, 16.0), ("nearer", 3, 4.0))
+    )
+    views += [replace(view, image=f"nearer {view.image}") for view in nearer]
+    central, moving = (
+        calibrate(views, SIZE, model="kannala_brandt", board="flat", pupil=pupil) for pupil in ("central", "auto")
+    )
+    assert len(central.dropped) == 2 and central.pupil is None
+    assert not moving.dropped and len(moving.views) == len(views)
+    assert moving.pupil is not None and moving.rms_px < 1.5 * np.sqrt(2.0) * NOISE_PX

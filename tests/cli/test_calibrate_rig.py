@@ -58,9 +58,10 @@ def keep_corners(path: Path, views: Views, *, named: bool = True) -> None:
         cache.save()
 
 
-def test_a_rig_has_no_moving_pupil(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["calibrate", str(session), "--pupil", "moving"]) == 2
-    assert "those of a rig look from one point each" in capsys.readouterr().err
+def test_pupils_of_a_rig_move_where_that_is_asked_for(session: Path) -> None:
+    for pupil, known in (("central", 0), ("moving", 2)):
+        assert main(["calibrate", str(session), "--pupil", pupil, "--force"]) == 0
+        assert (session.parent / "rig.json").read_text(encoding="utf-8").count('"pupil"') == known
 
 
 def test_rig_from_kept_corners(session: Path, capsys: pytest.CaptureFixture[str]) -> None:

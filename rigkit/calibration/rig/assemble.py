@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.clustered import Clustered, effective_freedom
 from rigkit.calibration.covariance import GlobalCovariance
+from rigkit.calibration.pupil import without_pupil
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.carried import carried, pose_products
@@ -19,8 +20,10 @@ from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import with_rig_priors
+from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.core.arrays import FloatArray
+from rigkit.cameras.moving_pupil import far_camera
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
@@ -51,7 +54,7 @@ def assemble_rig(
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
     cameras, squared = _cameras(joint, heldout[1], known, beside)
     everything = np.concatenate(squared)
-    last = layout.mounts[-1] or layout.cameras[-1]
+    told = _lenses_and_mounts(layout, state)
     # One ruler has measured all boards: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
     far = [FarProjection.of(camera.calibration) for camera in cameras]
@@ -59,7 +62,7 @@ def assemble_rig(
         cameras=tuple(cameras),
         rms_px=float(np.sqrt(everything.mean())),
         heldout_rms_px=heldout[0],
-        covariance=covariance[: last.stop, : last.stop],
+        covariance=covariance[np.ix_(told, told)],
         sigma_px=sigma,
         overdispersion=overdispersion,
         freedom=known.clustered.freedom,
@@ -69,10 +72,20 @@ def assemble_rig(
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
-        departures=lens_modes(observations, joint.solution, far, last.stop),
+        departures=lens_modes(observations, joint.solution, far, told),
         board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
     return rig, far
+
+
+def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
+    """Return where the parameters of central lenses and the mounts stand among the globals: what a rig's covariance is
+    of. Pupils that move have been solved for together with them."""
+    lenses = [
+        np.arange(run.start, run.start + far_camera(camera).parameters.size)
+        for run, camera in zip(layout.cameras, state.cameras, strict=True)
+    ]
+    return np.concatenate([*lenses, *(np.arange(run.start, run.stop) for run in layout.mounts if run is not None)])
 
 
 def _global_covariance(joint: JointRig, sigma_px: float) -> GlobalCovariance:
@@ -99,10 +112,12 @@ def _cameras(
         frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, beside)
         residuals, kept = joint.solution.normal.residuals[c], observations.weights[c] > 0.0
         squared.append((residuals.px**2).sum(axis=-1)[kept])
-        p = alone.camera.parameters.size
+        lens, frame, pupil = without_pupil(alone.camera, frame)
+        p = lens.parameters.size
         found = replace(
             joint.views.single[c],
-            camera=alone.camera,
+            camera=lens,
+            pupil=pupil,
             rms_px=float(np.sqrt(squared[c].mean())),
             heldout_rms_px=heldout[c],
             covariance=frame[:p, :p],
@@ -126,7 +141,7 @@ def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatAr
     for name, where, alone, (_, information) in held:
         if known is None or name not in known.cameras:
             through = unit[:, where] @ information
-            out += through @ alone.covariance @ through.T
+            out += through @ alone.near_covariance[:-6, :-6] @ through.T
     if known is not None and known.covariance is not None:
         index = known.index(names, layout)
         through = unit[:, index] * known.weights(joint.observations, layout)[index]

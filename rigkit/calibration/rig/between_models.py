@@ -18,6 +18,8 @@ from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.calibration.uncertainty import followed
+from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError
 
@@ -39,7 +41,7 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
         own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
         start = replace(
             here,
-            cameras=tuple(c if r is None else r.camera for c, r in zip(here.cameras, own, strict=True)),
+            cameras=tuple(c if r is None else _near(r.camera, c) for c, r in zip(here.cameras, own, strict=True)),
         )
         try:
             turns = _turns(here, start, rays, sigmas, joint)[1]
@@ -59,10 +61,19 @@ def _turns(
     steps, turns = [], []
     layout = here.layout(joint.observations)
     for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
-        step, turn = followed(camera, other, own, sigmas[run])
-        steps.append(step)
+        far, far_other = far_camera(camera), far_camera(other)
+        p = far.parameters.size
+        step, turn = followed(far, far_other, own, sigmas[run][:p])
+        # Terms of the pupil are along the axis of either lens.
+        pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
+        steps.append(np.concatenate([step, pupil]))
         turns.append(turn)
     return steps, turns
+
+
+def _near(lens: Camera, camera: Camera) -> Camera:
+    """Return another lens with the pupil of a camera, where that moves."""
+    return NearCamera.of(lens, camera.pupil) if isinstance(camera, NearCamera) else lens
 
 
 def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:

@@ -25,6 +25,7 @@ from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures
 from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
+from rigkit.calibration.with_pupil import require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -44,6 +45,7 @@ def calibrate_rig(
     rigid_boards: Sequence[Sequence[str]] = (),
     known: KnownCameras | None = None,
     folds: int = FOLDS,
+    pupil: str = "auto",
     progress: Progress = silent,
 ) -> RigCalibration:
     """Return the calibration of a rig.
@@ -59,12 +61,14 @@ def calibrate_rig(
         identified and oriented in any way; their arrangement sorts that out.
     known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
     folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
+    pupil : whether entrance pupils may move, as for `calibrate`: each camera alone decides, all are solved together.
 
     Raises
     ------
     InputError
         Fewer than two cameras and no rigid boards, cameras that share no board in any frame, a camera without views, or
-        rigid boards that are never seen together; two images of a frame by one camera; a camera without size or model.
+        rigid boards that are never seen together; two images of a frame by one camera; a camera without size or model;
+        an unknown pupil.
     DegenerateError
         As for `calibrate`, with the name of the camera; or the cameras disagree on most of what they share.
     """
@@ -74,7 +78,8 @@ def calibrate_rig(
     _require_one_image(views)
     _require_known(views, sizes_px, known)
     same = same_pictures(views)
-    options = _Options(sizes_px, model, degree, board, folds, known)
+    require_known(pupil)
+    options = _Options(sizes_px, model, degree, board, folds, known, pupil)
     every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
         boards, alone = _boards(views, rigid_boards), every
@@ -163,6 +168,7 @@ class _Options:
     board: str
     folds: int
     known: KnownCameras | None
+    pupil: str
 
     @property
     def in_force(self) -> list[str]:
@@ -198,6 +204,7 @@ class _Options:
                         board=self.board,
                         folds=self.folds,
                         progress=silent,
+                        pupil=self.pupil,
                     ),
                 )
             )

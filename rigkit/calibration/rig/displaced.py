@@ -19,30 +19,30 @@ from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
-from rigkit.core.arrays import FloatArray
+from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.geometry.rotation import skew
 from rigkit.kernels.departures import displacements
 
 
 def lens_modes(
-    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], count: int
+    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], told: IntArray
 ) -> tuple[LensModes, ...]:
-    """Return what each lens may do beyond its model, and how the first `count` globals, intrinsics and mounts, are off;
+    """Return what each lens may do beyond its model, and how the globals `told` (G,), intrinsics and mounts, are off;
     `far` are the cameras' projections as the rig has them."""
     n, normal = solution.state.layout(observations).shape.start, solution.normal
     if n < len(normal.g):
         normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
     each = (telling_modes(one) for one in far)
-    return tuple(_of_camera(observations, solution.state, normal, c, modes, count) for c, modes in enumerate(each))
+    return tuple(_of_camera(observations, solution.state, normal, c, modes, told) for c, modes in enumerate(each))
 
 
 def _of_camera(
-    observations: RigObservations, state: RigState, normal: NormalEquations, c: int, modes: FloatArray, count: int
+    observations: RigObservations, state: RigState, normal: NormalEquations, c: int, modes: FloatArray, told: IntArray
 ) -> LensModes:
-    """Return how the first `count` globals are off with the modes (J, M) of the lens of camera `c`; `normal` are the
+    """Return how the globals `told` are off with the modes (J, M) of the lens of camera `c`; `normal` are the
     rig's equations without the boards' shape."""
     if not modes.size:
-        return LensModes(modes, np.zeros((count, 0)))
+        return LensModes(modes, np.zeros((len(told), 0)))
     layout = state.layout(observations)
     alone, own = state.of_camera(c, observations), observations.cameras[c]
     n = layout.shape.start
@@ -50,12 +50,12 @@ def _of_camera(
     by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
     for part in carried(observations, state, c, alone.translation_mm):
-        told = by_own[part.views]
-        by_globals[part.index] += (np.swapaxes(part.globals, -1, -2) @ told).sum(axis=0)
-        by_pose[part.poses] += np.swapaxes(part.target, -1, -2) @ told
+        shown = by_own[part.views]
+        by_globals[part.index] += (np.swapaxes(part.globals, -1, -2) @ shown).sum(axis=0)
+        by_pose[part.poses] += np.swapaxes(part.target, -1, -2) @ shown
     inverse, back, _ = normal.covariance
     moves = -inverse @ (by_globals - np.tensordot(back, by_pose, axes=((0, 1), (0, 1))))
-    return LensModes(modes, moves[:count])
+    return LensModes(modes, moves[told])
 
 
 def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatArray) -> tuple[FloatArray, FloatArray]:

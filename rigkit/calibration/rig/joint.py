@@ -224,8 +224,8 @@ def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[t
     out = []
     for alone in single:
         # Of independent corners, in px^2 of the joint solution.
-        unit = alone.covariance / (sigma * alone.overdispersion) ** 2
-        out.append((alone.camera.parameters, weight * scaled_pinv(unit)))
+        unit = alone.near_covariance[:-6, :-6] / (sigma * alone.overdispersion) ** 2
+        out.append((alone.near.parameters, weight * scaled_pinv(unit)))
     return tuple(out)
 
 

@@ -78,8 +78,8 @@ class RigViews:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras, as each alone has been calibrated."""
-        return [alone.camera for alone in self.single]
+        """The cameras of points in mm, as each alone has been calibrated."""
+        return [alone.near for alone in self.single]
 
     def with_seen(self, seen: Sequence[FrameObservations]) -> RigViews:
         """Return the same where the cameras saw this."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
+from rigkit.calibration.judging.pupil import modelled_pupil
 from rigkit.calibration.judging.verdicts import UNSURE_PX, with_headline
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
@@ -35,7 +37,13 @@ def judge_rig(
         *_overdispersed(rig, in_force),
         *_few_shared(rig),
     ]
-    return tuple(with_headline(rig, causes, _unsure(rig, far)))
+    headline, *others = with_headline(rig, causes, _unsure(rig, far))
+    pupils = [
+        replace(said, message=f"camera '{camera.name}': {said.message}")
+        for camera in rig.cameras
+        for said in modelled_pupil(camera.calibration)
+    ]
+    return (headline, *pupils, *others)
 
 
 def _not_converged(rig: RigCalibration) -> list[Finding]:

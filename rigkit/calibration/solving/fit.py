@@ -28,6 +28,7 @@ and the least squares that follow begin where they end."""
 GOOD_ENOUGH = 1e-3
 """A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
 SETTLE_ROUNDS = 8
+START_MM = 1000.0
 MAX_SCATTER_OF_VIEW = 2.0
 """A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
 
@@ -149,6 +150,30 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
     fine = solve(observations, state, loss_px=CAUCHY_SIGMAS * sigma, max_iterations=30, cost_tolerance=FINE)
     norm = fine.data.residuals[0].weighted(observations)
     return _Found(fine.state, fine.data.residuals[0].px, norm, sigma_of(norm, present))
+
+
+def posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:
+    """Return the poses of all views under a camera that stays as it is, each at its own minimum, and which corners
+    (V, C) are no outliers there."""
+    count = len(observations.views)
+    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
+    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
+    state = find_poses(observations, start, observations.weight, None)
+    norm = evaluate(state, observations).weighted(observations)
+    sigma = sigma_of(norm, observations.present)
+    if norm.max() > OUTLIER_SIGMAS * sigma:
+        state = find_poses(observations, state, observations.weight, CAUCHY_SIGMAS * sigma)
+        norm = evaluate(state, observations).weighted(observations)
+        sigma = sigma_of(norm, observations.present)
+    kept = inliers(norm, observations, sigma, camera.size_px)
+    for _ in range(SETTLE_ROUNDS):
+        state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
+        norm = evaluate(state, observations).weighted(observations)
+        agree = inliers(norm, observations, sigma_of(norm, kept), camera.size_px)
+        if (agree == kept).all():
+            break
+        kept = agree
+    return state, kept
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:

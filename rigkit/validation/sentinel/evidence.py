@@ -53,7 +53,7 @@ class Watched:
     freedom : degrees of freedom of the covariance.
     boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
         that have the name, are as stated.
-    pupil : (2,) of one camera alone, how its entrance pupil moves; None: it looks from one point.
+    pupils : (2,) of each camera, by number, how its entrance pupil moves; others look from one point.
     """
 
     names: tuple[str, ...]
@@ -65,14 +65,14 @@ class Watched:
     freedom: float = float("inf")
     scale_sigma: float = 0.0
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
-    pupil: FloatArray | None = None
+    pupils: Mapping[int, FloatArray] = field(default_factory=dict)
 
-    def from_afar(self, view: BoardView) -> BoardView:
-        """Return a view as the central camera has it: with the pupil's motion taken out, as it was calibrated; raises
-        DegenerateError where the board has no pose."""
-        if self.pupil is None:
+    def from_afar(self, view: BoardView, c: int = 0) -> BoardView:
+        """Return a view of camera `c` as its central lens has it: with the pupil's motion taken out, as it was
+        calibrated; raises DegenerateError where the board has no pose."""
+        if c not in self.pupils:
             return view
-        near = NearCamera.of(self.cameras[0], self.pupil)
+        near = NearCamera.of(self.cameras[c], self.pupils[c])
         # Of a board that is bent by less than its squares: what that does to the pupil's part is next to nothing.
         return replace(view, pixels=board_from_afar(near, view.pixels, view.points()))
 

@@ -26,7 +26,7 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
         overdispersion=calibration.overdispersion,
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
-        pupil=None if calibration.pupil is None else calibration.pupil.terms,
+        pupils={} if calibration.pupil is None else {0: calibration.pupil.terms},
     )
 
 
@@ -42,4 +42,5 @@ def watched_rig(rig: RigCalibration) -> Watched:
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
         scale_sigma=rig.scale_sigma,
+        pupils={k: c.calibration.pupil.terms for k, c in enumerate(rig.cameras) if c.calibration.pupil is not None},
     )

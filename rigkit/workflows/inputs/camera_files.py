@@ -13,6 +13,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import pupil_shift_of_rays_mm
+from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
@@ -120,12 +121,31 @@ def told_of_pupil(calibration: Calibration) -> str | None:
     """Return what is to be said where a lens is taken for one that looks from one point; None where it does."""
     if calibration.pupil is None:
         return None
-    rays = calibration.camera.unproject(calibration.corners.used[0])[0]
-    off = pupil_shift_of_rays_mm(rays, calibration.pupil.terms) * np.hypot(rays[:, 0], rays[:, 1])
+    return _left_out("this lens", calibration.camera, calibration.pupil.terms, calibration.corners.used[0])
+
+
+def _left_out(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> str:
+    rays = camera.unproject(pixels)[0]
+    off = pupil_shift_of_rays_mm(rays, pupil) * np.hypot(rays[:, 0], rays[:, 1])
     return (
-        "the entrance pupil of this lens moves, which is left out here: what is far away is exact, near the camera "
+        f"the entrance pupil of {which} moves, which is left out here: what is far away is exact, near the camera "
         f"rays are off by up to {float(np.nanmax(np.abs(off))):.1f} mm"
     )
+
+
+def told_of_pupils(rig: SavedRig) -> list[str]:
+    """Return what is to be said where lenses of a rig are taken for ones that look from one point, and do not."""
+    return [
+        _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
+        for name, pupil in rig.pupils.items()
+        if name in rig.outlines
+    ]
+
+
+def warn_of_pupils(path: str | Path, rig: SavedRig) -> None:
+    """Say where lenses of a rig's file are taken for ones that look from one point, and do not."""
+    for told in told_of_pupils(rig):
+        _log.warning("'%s': %s", path, told)
 
 
 def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
@@ -155,12 +175,15 @@ def saved_rig(path: str | Path) -> SavedRig:
 
 def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     """Return camera and cam_from_rig (mm) by name: of our rig's file, Kalibr's camchain, OpenCV's or MATLAB's pair.
+    The cameras are central, with a warning where a pupil moves.
 
     Kalibr's cameras are called cam0, cam1 ..., those of a pair left and right. Raises InputError for any other file,
     and a damaged one.
     """
     if is_rig_file(path):
-        return load_rig(path)
+        rig = load_saved_rig(path)
+        warn_of_pupils(path, rig)
+        return rig.cameras
     text, name = camera_text(path), str(path)
     kind = camera_format(text)
     if kind == "kalibr":

@@ -24,6 +24,7 @@ from rigkit.workflows.inputs.camera_files import (
     saved_rig,
     warn_if_bad,
     warn_of_pupil,
+    warn_of_pupils,
 )
 from rigkit.workflows.inputs.folder_session import Known
 
@@ -127,6 +128,7 @@ def _places_in(cameras: Mapping[str, tuple[Camera, object]], mounted: Sequence[s
 def _saved(path: Path, names: Sequence[str]) -> SavedRig:
     """Return a rig of ours, or another tool's, whose cameras have numbers for names, with the first of `names`."""
     rig = saved_rig(path)
+    warn_of_pupils(path, rig)
     if is_rig_file(path) or set(rig.cameras) & set(names):
         return rig
     return replace(rig, cameras=dict(zip(names, rig.cameras.values(), strict=False)))

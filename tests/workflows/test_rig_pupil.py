@@ -1,0 +1,121 @@
+"""A rig of lenses whose pupils move: solved for together, in its file, and used or told of by what reads that."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import SIZE, lens
+from helpers.schemas import faults
+
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.result import RigCalibration
+from rigkit.cameras.moving_pupil import NearCamera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.io.rig_file import load_saved_rig, rig_text
+from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.sentinel.evidence import FreshView
+from rigkit.validation.sentinel.judge import check_views
+from rigkit.validation.sentinel.watch import watched_rig
+from rigkit.workflows.certify import certify_file
+from rigkit.workflows.check import load_watched
+from rigkit.workflows.inputs.camera_files import import_pair
+
+BOARD = Board("near", 9, 6, 12.0, 12.0)
+NOISE_PX = 0.03
+MOUNT = Rigid3(exp_so3(np.array([0.02, -0.05, 0.03])), [-60.0, 2.0, 3.0])
+CAMERAS = {
+    "left": (NearCamera.of(lens("fish"), (3.0, -0.3)), Rigid3.identity()),
+    "right": (NearCamera.of(lens("fish"), (2.0, -0.2)), MOUNT),
+}
+
+
+def frames(count: int, seed: int) -> dict[str, list[tuple[str, BoardView]]]:
+    """Return frames of boards 100 to 220 mm away, each seen by one camera or both."""
+    rng, points = np.random.default_rng(seed), BOARD.points()
+    views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in CAMERAS}
+    while (k := len({frame for own in views.values() for frame, _ in own})) < count:
+        angle, about = np.radians(70.0) * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+        facing = exp_so3(angle * np.array([-np.sin(about), np.cos(about), 0.0]))
+        rotation = facing @ exp_so3(rng.normal(size=3) * [0.4, 0.4, 1.5])
+        rig_from_board = Rigid3(rotation, rng.uniform(100.0, 220.0) * facing[:, 2] - rotation @ points.mean(axis=0))
+        for name, (camera, cam_from_rig) in CAMERAS.items():
+            pixels, valid = camera.project((cam_from_rig @ rig_from_board).apply(points))
+            if valid.all() and camera.lens.on_image(pixels).all():
+                noisy = np.clip(pixels + NOISE_PX * rng.normal(size=pixels.shape), 0.0, np.array(SIZE) - 1.0)
+                view = BoardView(f"{name}{k}.png", BOARD, BOARD.grid(), noisy, np.full(len(points), NOISE_PX))
+                views[name].append((f"{k:03d}", view))
+    return views
+
+
+@pytest.fixture(scope="module")
+def rig() -> RigCalibration:
+    return calibrate_rig(frames(14, 0), dict.fromkeys(CAMERAS, SIZE), model="kannala_brandt", folds=0)
+
+
+@pytest.fixture(scope="module")
+def saved(rig: RigCalibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rig") / "rig.json"
+    path.write_text(rig_text(rig), encoding="utf-8")
+    return path
+
+
+def test_pupils_are_solved_for_with_the_mounts(rig: RigCalibration) -> None:
+    length, sigma = rig.baseline_mm("left", "right")
+    true = float(np.linalg.norm(MOUNT.translation_mm))
+    assert abs(length - true) < 3.0 * sigma < 0.1
+    for found, (camera, _) in zip(rig.cameras, CAMERAS.values(), strict=True):
+        pupil = found.calibration.pupil
+        assert pupil is not None
+        off = (pupil.terms - camera.pupil) / np.sqrt(np.diag(pupil.covariance))
+        assert (np.abs(off) < 3.5).all()
+        assert any(f"camera '{found.name}': the lens does not look from one point" in str(v) for v in rig.verdicts)
+    assert rig.rms_px < 1.5 * np.sqrt(2.0) * NOISE_PX
+    assert len(rig.covariance) == 2 * rig.cameras[0].camera.parameters.size + 6
+
+
+def test_as_if_from_one_point_the_cameras_disagree() -> None:
+    central = calibrate_rig(
+        frames(14, 0), dict.fromkeys(CAMERAS, SIZE), model="kannala_brandt", folds=0, pupil="central"
+    )
+    length, _ = central.baseline_mm("left", "right")
+    assert abs(length - float(np.linalg.norm(MOUNT.translation_mm))) > 0.1 and central.rms_px > 0.1
+    assert all(camera.calibration.pupil is None for camera in central.cameras)
+
+
+def test_the_file_holds_them(rig: RigCalibration, saved: Path) -> None:
+    assert not faults(json.loads(saved.read_text(encoding="utf-8")))
+    known = load_saved_rig(saved)
+    for camera in rig.cameras:
+        assert camera.calibration.pupil is not None
+        np.testing.assert_array_equal(known.pupils[camera.name].terms, camera.calibration.pupil.terms)
+
+
+def test_a_damaged_pupil_is_named(saved: Path, tmp_path: Path) -> None:
+    data = json.loads(saved.read_text(encoding="utf-8"))
+    data["cameras"][1]["pupil"]["with_frame"] = data["cameras"][1]["pupil"]["with_frame"][:-1]
+    path = tmp_path / "spoilt.json"
+    path.write_text(json.dumps(data), encoding="utf-8")
+    with pytest.raises(InputError, match=r"spoilt\.json.*damaged.*calibrate again"):
+        load_saved_rig(path)
+
+
+def test_whoever_takes_its_lenses_for_central_says_so(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
+    import_pair(saved)
+    assert all(f"entrance pupil of camera '{name}' moves, which is left out here" in caplog.text for name in CAMERAS)
+    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=200.0)
+    said = certify_file(saved, task).certificate.findings
+    assert any("entrance pupil of camera 'right' moves" in finding.message for finding in said)
+
+
+def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) -> None:
+    fresh = [(c, frame, view) for c, own in enumerate(frames(4, 1).values()) for frame, view in own]
+    for watched in (load_watched(saved)[0], watched_rig(rig)):
+        assert check_views(watched, [FreshView(f, c, watched.from_afar(v, c)) for c, f, v in fresh]).rms_px < 0.06
+    assert check_views(watched, [FreshView(f, c, v) for c, f, v in fresh]).rms_px > 0.1
