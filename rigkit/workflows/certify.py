@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from rigkit.calibration.displaced import uncertain_camera
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
@@ -19,7 +21,7 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.check import load_watched
-from rigkit.workflows.inputs.camera_files import called_bad, told_of_pupil, told_of_pupils
+from rigkit.workflows.inputs.camera_files import called_bad, told_of_pupils
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
@@ -66,9 +68,10 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
         certificate = certify(load_instrument(path, options.cameras, options.sigma_px), task)
     if (bad := called_bad(path)) is not None:
         certificate = replace(certificate, findings=(bad, *certificate.findings))
-    told = told_of_pupils(load_saved_rig(path)) if is_rig_file(path) else [told_of_pupil(load_calibration(path))]
-    left_out = [Finding.look(words) for words in told if words is not None]
-    certificate = replace(certificate, findings=(*certificate.findings, *left_out))
+    told = [Finding.look(words) for words in told_of_pupils(load_saved_rig(path))] if is_rig_file(path) else []
+    if any(isinstance(camera, NearCamera) for camera in certificate.instrument.cameras):
+        told.append(Finding.good("the lens does not look from one point: how its entrance pupil moves is counted in"))
+    certificate = replace(certificate, findings=(*certificate.findings, *told))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}
@@ -84,7 +87,8 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
 def load_instrument(
     path: str | Path, cameras: tuple[str, str] | None = None, sigma_px: float | None = None
 ) -> Instrument:
-    """Return the camera of a calibration's file, or two cameras of a rig's, with what is known of their errors.
+    """Return the camera of points in mm of a calibration's file, or two central cameras of a rig's, with what is known
+    of their errors.
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
@@ -92,6 +96,9 @@ def load_instrument(
     if cameras is not None and not rig:
         raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
     known, _ = load_watched(Path(path))
+    if known.pupils and not rig:
+        near = uncertain_camera(load_calibration(path), quoted=False, near=True)
+        known = replace(known, cameras=(near.camera,), covariance=near.covariance)
     if rig and len(known.names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
     return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)

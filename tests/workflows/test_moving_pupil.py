@@ -14,12 +14,15 @@ from helpers.schemas import faults
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
-from rigkit.cameras.moving_pupil import NearCamera
+from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, pupil_shift_of_rays_mm
+from rigkit.core.arrays import Pixels, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import calibration_text, load_calibration, load_camera, save_calibration
 from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
 from rigkit.workflows.certify import certify_file
@@ -105,9 +108,36 @@ def test_whoever_takes_the_lens_for_central_says_so(
     assert isinstance(import_near_camera(saved), NearCamera) and LEFT_OUT not in caplog.text
     export_camera(saved, ExportCameraOptions(output=tmp_path / "camera.yaml", kind="opencv"))
     assert LEFT_OUT in caplog.text
-    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=200.0)
-    said = certify_file(saved, task).certificate.findings
-    assert any(LEFT_OUT in finding.message for finding in said)
+
+
+def test_a_certificate_is_of_the_lens_with_its_pupil(saved: Path) -> None:
+    """Lengths near the camera are within the bound, which as if from one point they are not."""
+    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=150.0)
+    found = certify_file(saved, task).certificate
+    assert not any(LEFT_OUT in finding.message for finding in found.findings)
+    (camera,) = found.instrument.cameras
+    assert isinstance(camera, NearCamera) and len(found.instrument.covariance) == camera.parameters.size
+    places = found.pixels[found.in_view]
+    points, _ = measured_points(camera.unproject(places)[0], task, is_rig=False)
+    # Of what is seen the first two are the ends of a level length.
+    ends = points[:, :2].reshape(-1, 3)
+    seen, bound = TRUE.project(ends)[0], found.bound[found.in_view]
+    off = {}
+    for name, one in (("near", camera), ("central", camera.lens)):
+        moved = at_their_distance(one, seen, ends).reshape(-1, 2, 3)
+        off[name] = np.abs(np.linalg.norm(moved[:, 1] - moved[:, 0], axis=1) - task.size_mm)
+    assert np.mean(off["near"] <= bound) > 0.9 > 0.5 > np.mean(off["central"] <= bound)
+
+
+def at_their_distance(camera: Camera, pixels: Pixels, points: Points) -> Points:
+    """Return where on the rays of pixels points as far away as these lie."""
+    rays = camera.unproject(pixels)[0]
+    starts = np.zeros_like(rays)
+    if isinstance(camera, NearCamera):
+        starts[:, 2] = pupil_shift_of_rays_mm(rays, camera.pupil)
+    ahead = np.sum(rays * starts, axis=1)
+    along = np.sqrt(ahead**2 + np.sum(points**2, axis=1) - np.sum(starts**2, axis=1)) - ahead
+    return starts + along[:, None] * rays
 
 
 def test_diff_compares_what_is_far_away(saved: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -135,8 +165,8 @@ def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path:
     watched, _ = load_watched(saved)
     zoomed = watched.cameras[0].parameters.copy()
     zoomed[:2] *= 1.01
-    assert watched.pupil is not None
-    changed = NearCamera.of(watched.cameras[0].with_parameters(zoomed), watched.pupil)
+    assert 0 in watched.pupils
+    changed = NearCamera.of(watched.cameras[0].with_parameters(zoomed), watched.pupils[0])
     views = random_views(changed, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
     check = check_views(watched, [FreshView(f"{k}", 0, watched.from_afar(v)) for k, v in enumerate(views)])
     assert not check.holds and check.change is not None
