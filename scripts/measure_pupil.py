@@ -5,32 +5,60 @@ that are waved (every corner off by 0.02 mm); every third session's lens looks f
 ten times as large and as far away: there a pupil does nothing, and none is to be found.
 
     python scripts/measure_pupil.py [--seeds 0:60] [--pupil 3.0 -0.3] [--waved] [--far] [--model kannala_brandt]
+    python scripts/measure_pupil.py --pairs [--seeds 0:10] [--pupil 3.0 -0.3]
+    python scripts/measure_pupil.py --rig [--seeds 0:12] [--pupil 3.0 -0.3]
 
 Of each session: whether the pupil was found, its terms and its shift at 80 degrees in stated sigmas, and how far the
 lens is off the truth far away (rms where boards were, after the best rotation) against what is stated.
+
+With --pairs what the session's camera then measures: four pairs, the camera moved by 40 to 80 mm, of three boards 110
+to 300 mm away; by a central calibration, by the far camera of one with a pupil, and by that with the pupil. With --rig
+two such lenses 60 mm apart, the second's pupil moving 0.8 times as far, in 20 frames: the baseline and the lenses.
+Errors are printed with what they are in stated sigmas.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.kannala_brandt import KannalaBrandt
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
+from rigkit.core.detections import BoardDetection, BoardView
+from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
+from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
+from rigkit.reconstruction.geometry import pair_geometry
+from rigkit.reconstruction.pairing import match_pair
+from rigkit.reconstruction.reconstruct import fit_planes, reconstruct_from
 
 SIZE = (1624, 1240)
 TRUTH = KannalaBrandt(SIZE, np.array([371.6, 371.2, 808.0, 615.0, 0.012, -0.006, 0.001, -2e-4]))
 SQUARE_MM, NEAREST_MM, FARTHEST_MM, REACH_DEG = 12.0, 90.0, 230.0, 88.0
 VIEWS, NOISE_PX, WAVES_MM, AT_DEG = 20, 0.05, 0.02, 80.0
+BOARD = Board("near", 9, 6, SQUARE_MM, SQUARE_MM)
+
+
+class Seen(NamedTuple):
+    """A camera of a pair: where it is, the boards before the first one, and their corners in its image."""
+
+    cam_from_first: Rigid3
+    poses: Sequence[Rigid3]
+    pixels: Sequence[FloatArray]
 
 
 def before_pupil(points: Points, pupil: FloatArray) -> Points:
@@ -75,6 +103,119 @@ def far_errors(found: Calibration) -> tuple[float, float]:
     return float(np.sqrt((error**2).sum(axis=1).mean())), float(np.sqrt((stated**2).mean()))
 
 
+def near_boards(
+    near: Sequence[NearCamera], poses: Sequence[Rigid3], rng: np.random.Generator, nearest: float, reach_deg: float
+) -> tuple[Rigid3, list[FloatArray | None]]:
+    """Return the pose of a board before the first camera, and its corners in each; None where one sees but a part."""
+    points = BOARD.points()
+    angle, about = np.radians(reach_deg) * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+    facing = exp_so3(angle * np.array([-np.sin(about), np.cos(about), 0.0]))
+    rotation = facing @ exp_so3(rng.normal(size=3) * [0.4, 0.4, 1.5])
+    centre = rng.uniform(nearest, 1.3 * FARTHEST_MM) * facing[:, 2]
+    pose = Rigid3(rotation, centre - rotation @ points.mean(axis=0))
+    out: list[FloatArray | None] = []
+    for camera, cam_from_first in zip(near, poses, strict=True):
+        pixels, valid = camera.project((cam_from_first @ pose).apply(points))
+        whole = bool(valid.all()) and bool(camera.lens.on_image(pixels).all())
+        noisy = pixels + NOISE_PX * rng.normal(size=pixels.shape)
+        out.append(np.clip(noisy, -0.5, np.array(SIZE) - 0.5) if whole else None)
+    return pose, out
+
+
+def measured_pair(found: Calibration, near: bool, boards: Sequence[Board], seen: Sequence[Seen]) -> list[FloatArray]:
+    """Return errors and errors over sigmas, (n, 2) each: of the baseline, mm, of points, mm, and of angles between the
+    boards' lattice planes, deg."""
+    camera, known = found.near if near else found.camera, uncertain_camera(found, near=near)
+    first, second = (
+        [
+            BoardDetection(b.board_id, *b.size, b.grid(), p, np.full(len(p), NOISE_PX))
+            for b, p in zip(boards, one, strict=True)
+        ]
+        for one in (seen[0].pixels, seen[1].pixels)
+    )
+    geometry = pair_geometry(match_pair("pair", camera, camera, first, second, boards), pose_type="general")
+    free = reconstruct_from(geometry)
+    shifts = calibration_shifts(free, known)
+    cloud = with_calibrations(free, shifts).cloud
+    true_mm = float(np.linalg.norm(seen[1].cam_from_first.translation_mm))
+    off = free.baseline_mm - true_mm
+    sigma = np.hypot(free.baseline_sigma_mm, np.sqrt(shifts.variance(lambda r: r.baseline_mm)))
+    by_id = dict(zip((b.board_id for b in boards), seen[0].poses, strict=True))
+    ids = [b.board_id for b in geometry.pair.boards]
+    truth = np.array(
+        [by_id[ids[b]].apply(BOARD.points(g[None]))[0] for b, g in zip(cloud.board_index, cloud.grid, strict=True)]
+    )
+    away = np.linalg.norm(cloud.points_mm - truth, axis=1)
+    planes = fit_planes(geometry, "lattice", known, one_camera=True)
+    angles = []
+    for a, b in combinations(ids, 2):
+        value, stated = planes.angle_deg(a, b)
+        cosine = by_id[a].rotation[:, 2] @ by_id[b].rotation[:, 2]
+        error = value - 180.0 + float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+        angles.append((error, error / stated))
+    return [np.array([(off, off / sigma)]), np.stack([away, away / cloud.sigma_mm], axis=1), np.array(angles)]
+
+
+def pairs(seeds: range, pupil: FloatArray, model: str) -> None:
+    """Print what pairs of one camera measure near by, with its pupil and without."""
+    true, boards = NearCamera.of(TRUTH, pupil), [replace(BOARD, board_id=f"board {k}") for k in range(3)]
+    found: dict[str, list[list[FloatArray]]] = {"central": [], "far camera of the pupil's": [], "with the pupil": []}
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        views = drawn_session(pupil, 1.0, 0.0, rng)
+        central, moving = (calibrate(views, SIZE, model=model, pupil=one) for one in ("central", "auto"))
+        for _ in range(4):
+            baseline = [rng.uniform(40.0, 80.0), *rng.normal(size=2) * 10.0]
+            poses = [Rigid3.identity(), Rigid3(exp_so3(0.1 * rng.normal(size=3)), baseline)]
+            shown: list[tuple[Rigid3, list[FloatArray | None]]] = []
+            while len(shown) < len(boards):
+                pose, pixels = near_boards([true, true], poses, rng, 110.0, 60.0)
+                shown += [(pose, pixels)] if all(p is not None for p in pixels) else []
+            seen = [Seen(poses[c], [pose for pose, _ in shown], [both[c] for _, both in shown]) for c in (0, 1)]
+            for name, one, near in zip(found, (central, moving, moving), (False, False, True), strict=True):
+                found[name].append(measured_pair(one, near, boards, seen))
+    for name, each in found.items():
+        for what, columns in zip(
+            ("baseline, mm", "points, mm", "lattice angles, deg"), zip(*each, strict=True), strict=True
+        ):
+            print(f"SIMULATED pairs, {name}, {what}: {in_words(np.concatenate(columns))}")
+
+
+def rigs(seeds: range, pupil: FloatArray, model: str) -> None:
+    """Print baselines and lenses of rigs whose pupils move, as found with them and without."""
+    lenses = {"left": NearCamera.of(TRUTH, pupil), "right": NearCamera.of(TRUTH, 0.8 * pupil)}
+    mounts = [Rigid3.identity(), Rigid3(exp_so3(np.array([0.02, -0.05, 0.03])), [-60.0, 2.0, 3.0])]
+    found: dict[str, list[list[tuple[float, float]]]] = {"central": [], "auto": []}
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in lenses}
+        for frame in range(VIEWS):
+            pixels: list[FloatArray | None] = [None]
+            while all(p is None for p in pixels):
+                _, pixels = near_boards(list(lenses.values()), mounts, rng, NEAREST_MM, 75.0)
+            for name, p in zip(lenses, pixels, strict=True):
+                if p is not None:
+                    view = BoardView(f"{name} {frame}", BOARD, BOARD.grid(), p, np.full(len(p), NOISE_PX))
+                    views[name].append((f"{frame:03d}", view))
+        for asked, rows in found.items():
+            rig = calibrate_rig(views, dict.fromkeys(lenses, SIZE), model=model, pupil=asked)
+            length, sigma = rig.baseline_mm("left", "right")
+            off = length - float(np.linalg.norm(mounts[1].translation_mm))
+            far = [far_errors(camera.calibration) for camera in rig.cameras]
+            rows.append([(off, off / sigma), *((error, error / stated) for error, stated in far)])
+            print(seed, asked, f"held-out {rig.heldout_rms_px:.3f} px", np.round(rows[-1], 3).tolist(), flush=True)
+    for asked, rows in found.items():
+        for k, what in enumerate(("baseline, mm", "left lens far away, px", "right lens far away, px")):
+            print(f"SIMULATED rigs, {asked}, {what}: {in_words(np.array(rows)[:, k])}")
+
+
+def in_words(errors: FloatArray) -> str:
+    """Return what errors and errors over sigmas (n, 2) come to."""
+    (rms, over), part = np.sqrt((errors**2).mean(axis=0)), np.abs(errors[:, 1])
+    within = [100.0 * float((part <= k).mean()) for k in (1, 2)]
+    return f"rms {rms:.4f}, over sigma {over:.2f}, within one {within[0]:.0f} %, two {within[1]:.0f} % of {len(part)}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", default="0:60")
@@ -82,8 +223,13 @@ def main() -> None:
     parser.add_argument("--waved", action="store_true")
     parser.add_argument("--far", action="store_true")
     parser.add_argument("--model", default="kannala_brandt")
+    parser.add_argument("--pairs", action="store_true")
+    parser.add_argument("--rig", action="store_true")
     args = parser.parse_args()
     first, last = map(int, args.seeds.split(":"))
+    if args.pairs or args.rig:
+        (pairs if args.pairs else rigs)(range(first, last), np.array(args.pupil), args.model)
+        return
     terms, off, before, found_of, angle = [], [], [], {True: 0, False: 0}, np.radians(AT_DEG)
     total = {True: 0, False: 0}
     for seed in range(first, last):
