@@ -7,6 +7,7 @@ ten times as large and as far away: there a pupil does nothing, and none is to b
     python scripts/measure_pupil.py [--seeds 0:60] [--pupil 3.0 -0.3] [--waved] [--far] [--model kannala_brandt]
     python scripts/measure_pupil.py --pairs [--seeds 0:10] [--pupil 3.0 -0.3]
     python scripts/measure_pupil.py --rig [--seeds 0:12] [--pupil 3.0 -0.3]
+    python scripts/measure_pupil.py --real FOLDER --board 8x6x32.5 --model scaramuzza
 
 Of each session: whether the pupil was found, its terms and its shift at 80 degrees in stated sigmas, and how far the
 lens is off the truth far away (rms where boards were, after the best rotation) against what is stated.
@@ -14,7 +15,9 @@ lens is off the truth far away (rms where boards were, after the best rotation) 
 With --pairs what the session's camera then measures: four pairs, the camera moved by 40 to 80 mm, of three boards 110
 to 300 mm away; by a central calibration, by the far camera of one with a pupil, and by that with the pupil. With --rig
 two such lenses 60 mm apart, the second's pupil moving 0.8 times as far, in 20 frames: the baseline and the lenses.
-Errors are printed with what they are in stated sigmas.
+Errors are printed with what they are in stated sigmas. --real takes REAL images of one board: by either half of them
+the camera is calibrated, and any two of the other half are a pair, whose epipolar geometry and whose board's shape from
+triangulated corners are held against the pixels and the lattice.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +43,11 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.arrays import FloatArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
+from rigkit.core.errors import RigkitError
+from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, nearest_rotation
+from rigkit.io.images import read_image, to_grey
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.geometry import pair_geometry
 from rigkit.reconstruction.pairing import match_pair
@@ -181,6 +188,47 @@ def pairs(seeds: range, pupil: FloatArray, model: str) -> None:
             print(f"SIMULATED pairs, {name}, {what}: {in_words(np.concatenate(columns))}")
 
 
+def real_pairs(folder: Path, size: str, model: str) -> None:
+    """Print how pairs of REAL images of one board, calibrated by the other half of the images, fit epipolar geometry
+    and the board's lattice, with the pupil and as if from one point."""
+    columns, rows, square = size.split("x")
+    board = Board("board", int(columns), int(rows), float(square), float(square))
+    views, size_px = [], (0, 0)
+    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".png", ".bmp")):
+        image = to_grey(read_image(path))
+        seen = [d for d in detect_boards(image, [board]) if {d.columns, d.rows} == set(board.size)]
+        if len(seen) == 1:
+            views.append(BoardView(path.name, board, seen[0].grid, seen[0].pixels, seen[0].sigma_px))
+            size_px = (image.shape[1], image.shape[0])
+    fits: dict[str, list[tuple[float, float]]] = {"central": [], "auto": []}
+    for half in (0, 1):
+        cameras = [calibrate(views[half::2], size_px, model=model, pupil=pupil).near for pupil in fits]
+        print(folder.name, f"{len(views)} images, half {half}:", getattr(cameras[1], "pupil", "no pupil"), flush=True)
+        for pair in combinations(views[1 - half :: 2], 2):
+            one, two = ([BoardDetection("board", *board.size, v.grid, v.pixels, v.sigma_px)] for v in pair)
+            try:
+                found = [
+                    pair_geometry(match_pair("pair", c, c, one, two, [board]), pose_type="general") for c in cameras
+                ]
+            except RigkitError:
+                continue
+            for name, geometry in zip(fits, found, strict=True):
+                points, true = geometry.points.points, board.points(geometry.pair.captured.grid)
+                points, true = (
+                    p[geometry.points.valid] - p[geometry.points.valid].mean(axis=0) for p in (points, true)
+                )
+                off = points - true @ nearest_rotation(points.T @ true).T
+                fits[name].append((geometry.refined.sampson_rms_px, float(np.sqrt((off**2).sum(axis=1).mean()))))
+    central, moving = (np.array(one) for one in fits.values())
+    for name, one in fits.items():
+        px, mm = np.median(one, axis=0)
+        print(
+            f"REAL, {folder.name}, {name}: {len(one)} pairs, Sampson {px:.4f} px, board's shape {mm:.3f} mm (medians)"
+        )
+    px, mm = 100.0 * (moving < central).mean(axis=0)
+    print(f"REAL, {folder.name}: smaller with the pupil in {px:.0f} % (Sampson) and {mm:.0f} % (shape) of the pairs")
+
+
 def rigs(seeds: range, pupil: FloatArray, model: str) -> None:
     """Print baselines and lenses of rigs whose pupils move, as found with them and without."""
     lenses = {"left": NearCamera.of(TRUTH, pupil), "right": NearCamera.of(TRUTH, 0.8 * pupil)}
@@ -225,14 +273,23 @@ def main() -> None:
     parser.add_argument("--model", default="kannala_brandt")
     parser.add_argument("--pairs", action="store_true")
     parser.add_argument("--rig", action="store_true")
+    parser.add_argument("--real", type=Path, metavar="FOLDER")
+    parser.add_argument("--board", metavar="COLUMNSxROWSxMM")
     args = parser.parse_args()
-    first, last = map(int, args.seeds.split(":"))
-    if args.pairs or args.rig:
-        (pairs if args.pairs else rigs)(range(first, last), np.array(args.pupil), args.model)
-        return
+    seeds = range(*map(int, args.seeds.split(":")))
+    if args.real:
+        real_pairs(args.real, args.board, args.model)
+    elif args.pairs or args.rig:
+        (pairs if args.pairs else rigs)(seeds, np.array(args.pupil), args.model)
+    else:
+        single_cameras(args, seeds)
+
+
+def single_cameras(args: argparse.Namespace, seeds: range) -> None:
+    """Print whether pupils are found, and whether their sigmas are true."""
     terms, off, before, found_of, angle = [], [], [], {True: 0, False: 0}, np.radians(AT_DEG)
     total = {True: 0, False: 0}
-    for seed in range(first, last):
+    for seed in seeds:
         moves = seed % 3 != 2
         pupil = np.array(args.pupil if moves else (0.0, 0.0))
         views = drawn_session(

@@ -20,6 +20,7 @@ from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainRig
 from rigkit.core.arrays import FloatArray, Pixels, as_array, as_covariance, without_nan
 from rigkit.core.boards import Board
@@ -79,6 +80,14 @@ class SavedRig:
         if covariance is None or self.sigma_px is None:
             raise InputError(f"'{path}': the file does not say how sure the rig is; calibrate it with rigkit")
         return cameras, covariance, self.sigma_px
+
+    @property
+    def near_cameras(self) -> dict[str, tuple[Camera, Rigid3]]:
+        """The cameras of points in mm: those whose pupil moves are `NearCamera`."""
+        return {
+            name: (NearCamera.of(camera, self.pupils[name].terms) if name in self.pupils else camera, pose)
+            for name, (camera, pose) in self.cameras.items()
+        }
 
     @property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray | None]:

@@ -8,6 +8,7 @@ unless the baseline is known.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from rigkit.affine.affinities import Affinities, EpipolarNormals
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.registry import affines_from_directions
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import DegenerateError, InputError
@@ -40,6 +42,8 @@ NO_DISTANCE = "no point's distance is known; the baseline is too short for this 
 SAME_ROW = 1e-9
 """Tangents of rows of two rectified images agree to rounding: they are computed, not measured."""
 PIXELS_A_SIDE = 9
+PUPIL_ROUNDS = 3
+"""Pupils move by a few hundredths of the points' distance: three rounds leave less than a thousandth of a pixel."""
 RECTIFIED_NOTE = (
     "the cameras and the matches are those of a rectified pair, whose pose is exact; for one camera moved sideways by "
     "hand declare the pose type 'general'"
@@ -132,6 +136,41 @@ def reconstruct_scene(
         level_sigma_rad=fit.level_sigma_rad,
     )
     return _with_scatter(reconstruction, fit, np.flatnonzero(seen), chosen, len(seen), metric=baseline_mm is not None)
+
+
+def with_pupils(
+    scene_of: Callable[[Correspondences], SceneReconstruction],
+    correspondences: Correspondences,
+    cameras: tuple[Camera, Camera],
+) -> SceneReconstruction:
+    """Return `scene_of` the correspondences as if the pupils of the cameras, `NearCamera`, did not move.
+
+    `scene_of` takes the lenses for central. Where its scene is in mm, its points say what a pupil's motion does to the
+    pixels; without that the points are others again: a fixed point, which each round comes nearer by as much as the
+    pupil moves over the points' distance.
+    """
+    scene, moving = scene_of(correspondences), [isinstance(camera, NearCamera) for camera in cameras]
+    if not (any(moving) and scene.metric):
+        return scene
+    lenses, found, largest = (far_camera(cameras[0]), far_camera(cameras[1])), correspondences, 0.0
+    for _ in range(PUPIL_ROUNDS):
+        pose, (matches, seen) = scene.reconstruction.cam2_from_cam1, found.matches(*lenses)
+        points = np.full((len(seen), 3), np.nan)
+        points[seen] = triangulate_matches(matches, pose).points
+        pixels = []
+        for camera, p, at in zip(
+            cameras, (points, pose.apply(points)), (correspondences.pixels1, correspondences.pixels2), strict=True
+        ):
+            moved = camera.as_from_afar(at, p) if isinstance(camera, NearCamera) else at
+            pixels.append(np.where(np.isfinite(moved), moved, at))
+        found = replace(correspondences, pixels1=pixels[0], pixels2=pixels[1])
+        scene = scene_of(found)
+        off = np.maximum(np.abs(pixels[0] - correspondences.pixels1), np.abs(pixels[1] - correspondences.pixels2))
+        largest = float(off[scene.kept].max())
+    words = "entrance pupils move; points are where lenses that look from one point would show them, up to "
+    note = f"{words}{largest:.1f} px away"
+    r = scene.reconstruction
+    return replace(scene, reconstruction=replace(r, notes=(note, *r.notes)))
 
 
 def _fit(

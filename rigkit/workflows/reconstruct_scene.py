@@ -16,6 +16,7 @@ from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.affine.from_points import are_rough, with_affinities
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import without_nan
 from rigkit.core.errors import DegenerateError, InputError
@@ -30,12 +31,18 @@ from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs
-from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
+from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene, with_pupils
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure, epipolar_figure
 from rigkit.report.scene_figure import normals_png
-from rigkit.workflows.inputs.camera_files import import_camera, import_pair, own_calibration, saved_rig
+from rigkit.workflows.inputs.camera_files import (
+    import_camera,
+    import_near_camera,
+    import_pair,
+    own_calibration,
+    saved_rig,
+)
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
@@ -151,8 +158,9 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
             raise InputError(f"'{name}': the {what} must be positive, got {value}")
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    camera1, camera2, known_pose, notes = _cameras(options)
-    of = _calibrations(options, camera1, camera2)
+    cameras, known_pose, notes = _cameras(options)
+    camera1, camera2 = far_camera(cameras[0]), far_camera(cameras[1])
+    of = _calibrations(options, cameras)
     if known_pose is not None and of is not None:
         moved = moved_pairs(PosedPair(camera1, camera2, known_pose.cam2_from_cam1), of)
         known_pose = replace(known_pose, moved=tuple(moved))
@@ -168,7 +176,7 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
             )
     told = (options.correspondences, options.rig, options.camera, options.camera2, options.pose)
     with about(*(path for path in told if path is not None)):
-        scene, found = _sparse(options, (camera1, camera2), known_pose, images, progress)
+        scene, found = _sparse(options, cameras, known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
     known = known_pose is not None
     if images and options.grow:
@@ -189,25 +197,31 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
     return SceneResult(name=name, scene=scene, correspondences=found, files=files)
 
 
-def _cameras(options: SceneOptions) -> tuple[Camera, Camera, KnownPose | None, list[str]]:
-    """Return the cameras of both images, the pose between them where it is known, and what to say of them."""
+def _cameras(options: SceneOptions) -> tuple[tuple[Camera, Camera], KnownPose | None, list[str]]:
+    """Return the cameras of both images, the pose between them where it is known, and what to say of them.
+
+    They are those of points in mm where there will be such, and correspondences alone: surfaces grow through central
+    lenses."""
+    metric = options.rig is not None or options.pose is not None or options.baseline_mm is not None
+    near = metric and not (options.images and options.grow)
     if options.rig is not None:
         if options.camera or options.camera2 or options.pose:
             raise InputError("a scene of a rig: the rig's file has the cameras and their pose; leave the others out")
-        _, cameras, cam2_from_cam1 = import_pair(options.rig, options.rig_names)
-        return *cameras, KnownPose(cam2_from_cam1), []
+        _, cameras, cam2_from_cam1 = import_pair(options.rig, options.rig_names, near=near)
+        return cameras, KnownPose(cam2_from_cam1), []
     if options.camera is None:
         raise InputError("a scene needs a calibration: of its camera, or of the rig that took both images")
-    camera1 = import_camera(options.camera)
-    camera2 = import_camera(options.camera2) if options.camera2 else camera1
+    read = import_near_camera if near else import_camera
+    camera1 = read(options.camera)
+    camera2 = read(options.camera2) if options.camera2 else camera1
     known = None if options.pose is None else KnownPose(_read_pose(options.pose))
     notes = []
     if options.camera2 is None:
         notes.append("one calibration is used for both images: right if one camera was moved, else name the other's")
-    return camera1, camera2, known, notes
+    return (camera1, camera2), known, notes
 
 
-def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Calibrations | None:
+def _calibrations(options: SceneOptions, cameras: tuple[Camera, Camera]) -> Calibrations | None:
     """Return the cameras as their files know them, exact where one does not say; None where none does."""
     if options.rig is not None:
         rig = saved_rig(options.rig)
@@ -216,14 +230,16 @@ def _calibrations(options: SceneOptions, camera1: Camera, camera2: Camera) -> Ca
         known_rig = rig.quoted
         return None if known_rig is None else known_rig.pair(*(names.index(name) for name in chosen))
     found = [
-        None if path is None or (known := own_calibration(path)) is None else uncertain_camera(known)
-        for path in (options.camera, options.camera2)
+        None
+        if path is None or (known := own_calibration(path)) is None
+        else uncertain_camera(known, near=isinstance(camera, NearCamera))
+        for path, camera in zip((options.camera, options.camera2), cameras, strict=True)
     ]
     if all(known is None for known in found):
         return None
     first, second = (
         known or UncertainCamera(camera, np.zeros((camera.parameters.size,) * 2))
-        for camera, known in zip((camera1, camera2), found, strict=True)
+        for camera, known in zip(cameras, found, strict=True)
     )
     return first, None if options.camera2 is None else second
 
@@ -259,10 +275,12 @@ def _sparse(
     Where those of plain features do not determine the pose, those of tilted views might.
     """
 
+    lenses = far_camera(cameras[0]), far_camera(cameras[1])
+
     def scene_of(found: Correspondences) -> SceneReconstruction:
         return reconstruct_scene(
             found,
-            *cameras,
+            *lenses,
             pair_id=options.name,
             pose_type=options.pose_type,
             level_sigma_rad=None if options.level_sigma_deg is None else float(np.deg2rad(options.level_sigma_deg)),
@@ -275,14 +293,14 @@ def _sparse(
         found = read_correspondences(options.correspondences, [path.name for path in options.images or ()])
         if images and are_rough(found):
             found = with_affinities(found, *images)
-        return scene_of(found), found
+        return with_pupils(scene_of, found, cameras), found
     assert images is not None
     for k, tilts in enumerate((None, TILTS)):
         progress("matching affine features", 0, 1)
         found = match_affine_features(*images, tilts=tilts)
         progress("matching affine features", 1, 1)
         try:
-            return scene_of(found), found
+            return with_pupils(scene_of, found, cameras), found
         except DegenerateError as error:
             if not k:
                 continue

@@ -7,7 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.board_scenes import fisheye_camera
+from helpers.epipolar_scenes import FISHEYE, pair
 
+from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
@@ -19,6 +21,7 @@ from rigkit.reconstruction.calibration_shifts import calibration_shifts
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import fit_planes, reconstruct_from
+from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene, with_pupils
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 
 BOARDS = tuple(Board(name, 8, 6, 10.0, 10.0) for name in ("plane1", "plane2", "plane3"))
@@ -91,3 +94,29 @@ def test_and_the_planes_of_boards(planes: str) -> None:
         change = there.normal(board.board_id) - n
         assert angle_between(n, there.normal(board.board_id)) > 1e-6
         np.testing.assert_allclose(np.cross(turn, n), change, atol=PART_OF_SHARE * np.linalg.norm(change))
+
+
+def test_points_of_a_scene_in_mm_say_what_the_pupils_do_to_them(rng: np.random.Generator) -> None:
+    clean, pose, points = pair(rng, 120, "general", noise_px=0.05, sigma_A=0.01, camera=FISHEYE)
+    # As far away, in movements of the pupil, as near boards are.
+    near = NearCamera.of(FISHEYE, (30.0, -3.0))
+    moved = [
+        at + near.project(p)[0] - FISHEYE.project(p)[0]
+        for at, p in ((clean.pixels1, points), (clean.pixels2, pose.apply(points)))
+    ]
+    found = Correspondences(moved[0], moved[1], clean.A21)
+    baseline = float(np.linalg.norm(pose.translation_mm))
+
+    def off(camera: Camera, baseline_mm: float | None) -> tuple[float, SceneReconstruction]:
+        def scene_of(one: Correspondences) -> SceneReconstruction:
+            return reconstruct_scene(one, FISHEYE, FISHEYE, baseline_mm=baseline_mm)
+
+        scene = with_pupils(scene_of, found, (camera, camera))
+        away = scene.reconstruction.cloud.points_mm - points[scene.kept]
+        return float(np.median(np.linalg.norm(away, axis=1))), scene
+
+    (as_central, _), (with_pupil, scene) = off(FISHEYE, baseline), off(near, baseline)
+    assert with_pupil < 0.2 * as_central
+    assert "entrance pupils move" in scene.reconstruction.notes[0] and len(scene.kept) > 110
+    _, without_scale = off(near, None)
+    assert not any("pupil" in words for words in without_scale.reconstruction.notes)

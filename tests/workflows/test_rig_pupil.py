@@ -106,6 +106,15 @@ def test_a_damaged_pupil_is_named(saved: Path, tmp_path: Path) -> None:
         load_saved_rig(path)
 
 
+def test_cameras_of_points_in_mm_have_them(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
+    _, cameras, _ = import_pair(saved, near=True)
+    pupils = load_saved_rig(saved).pupils
+    for name, camera in zip(CAMERAS, cameras, strict=True):
+        assert isinstance(camera, NearCamera)
+        np.testing.assert_array_equal(camera.pupil, pupils[name].terms)
+    assert "pupil" not in caplog.text
+
+
 def test_whoever_takes_its_lenses_for_central_says_so(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
     import_pair(saved)
     assert all(f"entrance pupil of camera '{name}' moves, which is left out here" in caplog.text for name in CAMERAS)

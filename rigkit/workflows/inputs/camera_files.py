@@ -201,13 +201,14 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
 
 
 def import_pair(
-    path: str | Path, names: tuple[str, str] | None = None
+    path: str | Path, names: tuple[str, str] | None = None, *, near: bool = False
 ) -> tuple[tuple[str, str], tuple[Camera, Camera], Rigid3]:
-    """Return the names of two cameras of a rig (None: its first two), the cameras, and cam2_from_cam1 (mm).
+    """Return the names of two cameras of a rig (None: its first two), the cameras, and cam2_from_cam1 (mm); with `near`
+    cameras of points in mm, `NearCamera` where a pupil moves.
 
     Raises InputError as `import_rig`, and for a camera that is not there.
     """
-    rig = import_rig(path)
+    rig = saved_rig(path).near_cameras if near else import_rig(path)
     chosen = names or tuple(rig)[:2]
     missing = [name for name in chosen if name not in rig]
     if missing or len(chosen) != 2:
