@@ -174,10 +174,11 @@ def pairs(seeds: range, pupil: FloatArray, model: str) -> None:
         for _ in range(4):
             baseline = [rng.uniform(40.0, 80.0), *rng.normal(size=2) * 10.0]
             poses = [Rigid3.identity(), Rigid3(exp_so3(0.1 * rng.normal(size=3)), baseline)]
-            shown: list[tuple[Rigid3, list[FloatArray | None]]] = []
+            shown: list[tuple[Rigid3, list[FloatArray]]] = []
             while len(shown) < len(boards):
                 pose, pixels = near_boards([true, true], poses, rng, 110.0, 60.0)
-                shown += [(pose, pixels)] if all(p is not None for p in pixels) else []
+                whole = [p for p in pixels if p is not None]
+                shown += [(pose, whole)] if len(whole) == len(poses) else []
             seen = [Seen(poses[c], [pose for pose, _ in shown], [both[c] for _, both in shown]) for c in (0, 1)]
             for name, one, near in zip(found, (central, moving, moving), (False, False, True), strict=True):
                 found[name].append(measured_pair(one, near, boards, seen))

@@ -21,7 +21,8 @@ class SolvedPupil:
     ----------
     terms : (2,) e1 and e2, mm rad^-2 and mm rad^-4.
     covariance : (2, 2) of them, Student's like that of the camera's parameters.
-    with_frame : (P + 6, 2) their covariance with the camera's parameters and the mean motion of the boards.
+    with_frame : (P + 6, 2) their covariance with the camera's parameters and the mean motion of the boards; of a rig
+        (G, 2) with all that its covariance is of.
     """
 
     terms: FloatArray
@@ -73,7 +74,7 @@ def without_pupil(camera: Camera, joint: FloatArray) -> tuple[Camera, FloatArray
 
 
 def require_of_frame(pupil: SolvedPupil | None, frame: int) -> None:
-    """Raise InputError where a pupil does not go with a camera of which `frame` numbers are P + 6."""
+    """Raise InputError where a pupil's `with_frame` does not have `frame` rows."""
     if pupil is not None and len(pupil.with_frame) != frame:
         raise InputError(f"pupil: with_frame must have {frame} rows, has {len(pupil.with_frame)}; calibrate again")
 

@@ -95,8 +95,8 @@ def _taken_back(
         return None
     whole = Observations.from_views([*observations.views, *(left[k] for k in np.flatnonzero(back))])
     kept_of_all = np.zeros(whole.present.shape, dtype=bool)
-    for rows, own in ((slice(None, len(fit.kept)), fit.kept), (slice(len(fit.kept), None), kept[back])):
-        kept_of_all[rows, : own.shape[1]] = own[:, : kept_of_all.shape[1]]
+    # Corners stand in the order of each view, padded to the longest.
+    kept_of_all[whole.present] = np.concatenate([fit.kept[observations.present], kept[back][others.present[back]]])
     poses = replace(
         fit.state,
         rotation=np.concatenate([fit.state.rotation, state.rotation[back]]),

@@ -138,7 +138,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "rms_px": c.rms_px,
                 "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
                 **({} if own is None else {"departures": _rows_of(own)}),
-                **({} if c.calibration.pupil is None else {"pupil": pupil_to_json(c.calibration.pupil)}),
+                **({} if c.name not in rig.pupils else {"pupil": pupil_to_json(rig.pupils[c.name])}),
             }
             for c, own in zip_longest(rig.cameras, rig.departures)
         ],
@@ -184,12 +184,13 @@ def load_saved_rig(path: str | Path) -> SavedRig:
                 departures[name] = entry["departures"]
             if "pupil" in entry:
                 pupils[name] = pupil_from_json(entry["pupil"])
-                require_of_frame(pupils[name], camera.parameters.size + 6)
             if "outline_px" in entry:
                 outlines[name] = as_array(reals(entry["outline_px"]), (None, 2), "outline_px")
         if not cameras:
             raise InputError(f"'{path}': no camera in it; calibrate again")
         size = Layout.of_cameras(camera for camera, _ in cameras.values()).count
+        for pupil in pupils.values():
+            require_of_frame(pupil, size)
         beyond = tuple(_modes(departures.get(name, _NO_MODES), size) for name in cameras) if departures else ()
         covariance = None
         if "covariance" in data:

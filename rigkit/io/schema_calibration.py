@@ -93,7 +93,7 @@ _PUPIL = said(
             "mm_per_rad2": said(NUMBER, "e1"),
             "mm_per_rad4": said(NUMBER, "e2"),
             "covariance": said(matrix(rows=2, columns=2), "of both"),
-            "with_frame": said(matrix(columns=2), "of both with the camera's parameters and the boards' mean motion"),
+            "with_frame": said(matrix(columns=2), "of both with what `frame_covariance`, in a rig `covariance`, is of"),
         }
     ),
     "how the entrance pupil moves: the ray at the angle t from the axis starts at e1 t^2 + e2 t^4 mm on it; missing: "

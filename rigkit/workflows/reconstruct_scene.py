@@ -158,9 +158,9 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
             raise InputError(f"'{name}': the {what} must be positive, got {value}")
     if options.output is not None:
         require_folder(options.output, force=options.force)
-    cameras, known_pose, notes = _cameras(options)
-    camera1, camera2 = far_camera(cameras[0]), far_camera(cameras[1])
-    of = _calibrations(options, cameras)
+    near, known_pose, notes = _cameras(options)
+    camera1, camera2 = far_camera(near[0]), far_camera(near[1])
+    of = _calibrations(options, near)
     if known_pose is not None and of is not None:
         moved = moved_pairs(PosedPair(camera1, camera2, known_pose.cam2_from_cam1), of)
         known_pose = replace(known_pose, moved=tuple(moved))
@@ -176,7 +176,7 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
             )
     told = (options.correspondences, options.rig, options.camera, options.camera2, options.pose)
     with about(*(path for path in told if path is not None)):
-        scene, found = _sparse(options, cameras, known_pose, images, progress)
+        scene, found = _sparse(options, near, known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
     known = known_pose is not None
     if images and options.grow:

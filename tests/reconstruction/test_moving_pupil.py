@@ -15,6 +15,7 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
+from rigkit.core.planes import Planes
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
@@ -83,17 +84,16 @@ def test_how_sure_the_pupil_is_counts_in_as_far_as_it_moves_the_pair() -> None:
     assert np.sqrt(shifts.variance(lambda one: one.baseline_mm)) == pytest.approx(abs(baseline), rel=PART_OF_SHARE)
 
 
-@pytest.mark.parametrize("planes", ["coplanar", "lattice"])
-def test_and_the_planes_of_boards(planes: str) -> None:
+@pytest.mark.parametrize("kind", ["coplanar", "lattice"])
+def test_and_the_planes_of_boards(kind: Planes) -> None:
     known, moved = moved_by_one_sigma()
-    kind = "lattice" if planes == "lattice" else "coplanar"
     here, there = fit_planes(geometry(NEAR), kind, known, one_camera=True), fit_planes(geometry(moved), kind)
     for board in BOARDS:
         turn = here.calibration_moves[0, here.rotation_of(board.board_id)]
         n = here.normal(board.board_id)
         change = there.normal(board.board_id) - n
         assert angle_between(n, there.normal(board.board_id)) > 1e-6
-        np.testing.assert_allclose(np.cross(turn, n), change, atol=PART_OF_SHARE * np.linalg.norm(change))
+        np.testing.assert_allclose(np.cross(turn, n), change, atol=PART_OF_SHARE * float(np.linalg.norm(change)))
 
 
 def test_points_of_a_scene_in_mm_say_what_the_pupils_do_to_them(rng: np.random.Generator) -> None:

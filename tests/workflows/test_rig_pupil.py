@@ -20,6 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.rig_file import load_saved_rig, rig_text
 from rigkit.validation.certificate.contracts import Quantity, Task
+from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
 from rigkit.validation.sentinel.watch import watched_rig
@@ -95,6 +96,7 @@ def test_the_file_holds_them(rig: RigCalibration, saved: Path) -> None:
     for camera in rig.cameras:
         assert camera.calibration.pupil is not None
         np.testing.assert_array_equal(known.pupils[camera.name].terms, camera.calibration.pupil.terms)
+        assert known.pupils[camera.name].with_frame.shape == (len(rig.covariance), 2)
 
 
 def test_a_damaged_pupil_is_named(saved: Path, tmp_path: Path) -> None:
@@ -118,9 +120,37 @@ def test_cameras_of_points_in_mm_have_them(saved: Path, caplog: pytest.LogCaptur
 def test_whoever_takes_its_lenses_for_central_says_so(saved: Path, caplog: pytest.LogCaptureFixture) -> None:
     import_pair(saved)
     assert all(f"entrance pupil of camera '{name}' moves, which is left out here" in caplog.text for name in CAMERAS)
-    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=200.0)
-    said = certify_file(saved, task).certificate.findings
-    assert any("entrance pupil of camera 'right' moves" in finding.message for finding in said)
+
+
+def test_a_certificate_is_of_cameras_with_their_pupils(saved: Path) -> None:
+    """Lengths that both cameras see near by are within the bound, and as if from one point few are."""
+    task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=150.0)
+    found = certify_file(saved, task).certificate
+    instrument = found.instrument
+    assert any("its entrance pupil moves is counted in" in finding.message for finding in found.findings)
+    assert (np.linalg.eigvalsh(instrument.covariance) > -1e-12).all()
+    true, (left, right) = CAMERAS["left"][0], instrument.cameras
+    assert isinstance(left, NearCamera) and isinstance(right, NearCamera)
+    # Not at the rim, where an end may leave the view of a central lens.
+    inner = found.in_view & (true.unproject(found.pixels.reshape(-1, 2))[0][:, 2] > 0.3).reshape(found.in_view.shape)
+    rays = true.unproject(found.pixels[inner])[0]
+    ends = measured_points(rays, task, is_rig=True)[0][:, :2].reshape(-1, 3)
+    seen = [camera.project(pose.apply(ends))[0] for camera, pose in CAMERAS.values()]
+    bound, pose = found.bound[inner], instrument.cam_from_rig[1]
+    off = []
+    for cameras in ((left, right), (left.lens, right.lens)):
+        points = ends.copy()
+        for _ in range(6):
+            rows, residuals = [], []
+            for camera, moved, pixels in zip(cameras, (Rigid3.identity(), pose), seen, strict=True):
+                shown, _, by_point, _ = camera.project_with_jacobians(moved.apply(points))
+                rows.append(by_point @ moved.rotation)
+                residuals.append(pixels - shown)
+            step = np.linalg.pinv(np.concatenate(rows, axis=1)) @ np.concatenate(residuals, axis=1)[..., None]
+            points = points + step[..., 0]
+        both = points.reshape(-1, 2, 3)
+        off.append(np.abs(np.linalg.norm(both[:, 1] - both[:, 0], axis=1) - task.size_mm))
+    assert np.mean(off[0] <= bound) > 0.9 > 0.5 > np.mean(off[1] <= bound)
 
 
 def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.clustered import Clustered, effective_freedom
 from rigkit.calibration.covariance import GlobalCovariance
-from rigkit.calibration.pupil import without_pupil
+from rigkit.calibration.pupil import SolvedPupil, without_pupil
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.carried import carried, pose_products
@@ -22,7 +22,7 @@ from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.cameras.moving_pupil import far_camera
+from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -63,6 +63,7 @@ def assemble_rig(
         rms_px=float(np.sqrt(everything.mean())),
         heldout_rms_px=heldout[0],
         covariance=covariance[np.ix_(told, told)],
+        pupils=_pupils(joint, layout, covariance, told),
         sigma_px=sigma,
         overdispersion=overdispersion,
         freedom=known.clustered.freedom,
@@ -86,6 +87,16 @@ def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
         for run, camera in zip(layout.cameras, state.cameras, strict=True)
     ]
     return np.concatenate([*lenses, *(np.arange(run.start, run.stop) for run in layout.mounts if run is not None)])
+
+
+def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, told: IntArray) -> dict[str, SolvedPupil]:
+    """Return the pupils that move, by name, with their covariance with the globals `told`."""
+    out = {}
+    for name, run, camera in zip(joint.views.names, layout.cameras, joint.solution.state.cameras, strict=True):
+        if isinstance(camera, NearCamera):
+            own = np.arange(run.stop - PUPIL_TERMS, run.stop)
+            out[name] = SolvedPupil(camera.pupil, covariance[np.ix_(own, own)], covariance[np.ix_(told, own)])
+    return out
 
 
 def _global_covariance(joint: JointRig, sigma_px: float) -> GlobalCovariance:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
 from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.displaced import LensModes, with_modes
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
@@ -69,6 +71,7 @@ class RigCalibration:
     verdicts : what is good and what is not, the headline first.
     departures : of each camera what its lens may do beyond its model, and how the rest of the rig is off with it; empty
         where that is not known.
+    pupils : by name those that move, solved for with all else; their `with_frame` is with what `covariance` is of.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -87,6 +90,7 @@ class RigCalibration:
     board_rigs: tuple[BoardRig, ...] = ()
     verdicts: tuple[Finding, ...] = ()
     departures: tuple[LensModes, ...] = ()
+    pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
 
     _repr_html_ = drawn
 

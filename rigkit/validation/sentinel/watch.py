@@ -42,5 +42,5 @@ def watched_rig(rig: RigCalibration) -> Watched:
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
         scale_sigma=rig.scale_sigma,
-        pupils={k: c.calibration.pupil.terms for k, c in enumerate(rig.cameras) if c.calibration.pupil is not None},
+        pupils={k: rig.pupils[c.name].terms for k, c in enumerate(rig.cameras) if c.name in rig.pupils},
     )

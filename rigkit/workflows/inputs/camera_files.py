@@ -133,19 +133,12 @@ def _left_out(which: str, camera: Camera, pupil: FloatArray, pixels: Pixels) -> 
     )
 
 
-def told_of_pupils(rig: SavedRig) -> list[str]:
-    """Return what is to be said where lenses of a rig are taken for ones that look from one point, and do not."""
-    return [
-        _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
-        for name, pupil in rig.pupils.items()
-        if name in rig.outlines
-    ]
-
-
 def warn_of_pupils(path: str | Path, rig: SavedRig) -> None:
     """Say where lenses of a rig's file are taken for ones that look from one point, and do not."""
-    for told in told_of_pupils(rig):
-        _log.warning("'%s': %s", path, told)
+    for name, pupil in rig.pupils.items():
+        if name in rig.outlines:
+            told = _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
+            _log.warning("'%s': %s", path, told)
 
 
 def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
