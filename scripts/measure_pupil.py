@@ -221,10 +221,10 @@ def real_pairs(folder: Path, size: str, model: str) -> None:
                 off = points - true @ nearest_rotation(points.T @ true).T
                 fits[name].append((geometry.refined.sampson_rms_px, float(np.sqrt((off**2).sum(axis=1).mean()))))
     central, moving = (np.array(one) for one in fits.values())
-    for name, one in fits.items():
-        px, mm = np.median(one, axis=0)
+    for name, each in fits.items():
+        px, mm = np.median(each, axis=0)
         print(
-            f"REAL, {folder.name}, {name}: {len(one)} pairs, Sampson {px:.4f} px, board's shape {mm:.3f} mm (medians)"
+            f"REAL, {folder.name}, {name}: {len(each)} pairs, Sampson {px:.4f} px, board's shape {mm:.3f} mm (medians)"
         )
     px, mm = 100.0 * (moving < central).mean(axis=0)
     print(f"REAL, {folder.name}: smaller with the pupil in {px:.0f} % (Sampson) and {mm:.0f} % (shape) of the pairs")

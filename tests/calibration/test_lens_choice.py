@@ -258,6 +258,7 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
     def found(images: np.ndarray, squares: np.ndarray) -> Solved:
         return Solved(
             observations=observations.subset(images),
+            used=np.isin(np.arange(len(observations.views)), images),
             reasons=(),
             chosen=Option("ucm", fit, squares[images]),
             candidates=[],

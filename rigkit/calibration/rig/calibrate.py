@@ -79,7 +79,9 @@ def calibrate_rig(
     _require_known(views, sizes_px, known)
     same = same_pictures(views)
     require_known(pupil)
-    options = _Options(sizes_px, model, degree, board, folds, known, pupil)
+    options = _Options(
+        sizes_px=sizes_px, model=model, degree=degree, board=board, folds=folds, known=known, pupil=pupil
+    )
     every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
         boards, alone = _boards(views, rigid_boards), every
@@ -158,7 +160,7 @@ def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known:
         raise InputError(f"rig: camera '{known.mounted[0]}', in whose frame the mounts are known, has to be the first")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Options:
     """How every camera is calibrated alone."""
 
