@@ -10,6 +10,7 @@ import pytest
 from helpers.calibration_scenes import SIZE, lens
 from helpers.schemas import faults
 
+from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.moving_pupil import NearCamera
@@ -88,6 +89,18 @@ def test_as_if_from_one_point_the_cameras_disagree() -> None:
     length, _ = central.baseline_mm("left", "right")
     assert abs(length - float(np.linalg.norm(MOUNT.translation_mm))) > 0.1 and central.rms_px > 0.1
     assert all(camera.calibration.pupil is None for camera in central.cameras)
+
+
+def test_a_camera_whose_images_tell_less_has_one_where_another_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Calibration] = []
+
+    def of_the_first(calibration: Calibration) -> bool:
+        asked.append(calibration)
+        return len(asked) == 1
+
+    monkeypatch.setattr("rigkit.calibration.calibrate.may_move", of_the_first)
+    rig = calibrate_rig(frames(14, 0), dict.fromkeys(CAMERAS, SIZE), model="kannala_brandt", folds=0)
+    assert len(asked) == 2 and set(rig.pupils) == set(CAMERAS)
 
 
 def test_the_file_holds_them(rig: RigCalibration, saved: Path) -> None:

@@ -25,7 +25,7 @@ from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures
 from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import judge_rig
-from rigkit.calibration.with_pupil import require_known
+from rigkit.calibration.with_pupil import require_known, surely_moves
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -181,7 +181,7 @@ class _Options:
     def each_alone(self, views: Views, progress: Progress) -> RigViews:
         """Return the views as each camera alone is calibrated with them; errors name the camera."""
         found: dict[str, Calibration] = {}
-        asked = []
+        asked: list[tuple[str, Sequence[BoardView], How]] = []
         for name, own in views.items():
             alone = [view for _, view in own]
             if self.known is not None and name in self.known.cameras:
@@ -212,8 +212,24 @@ class _Options:
             )
         names = [name for name, _, _ in asked]
         found |= dict(zip(names, calibrate_together(asked, progress=progress), strict=True))
+        if self.pupil == "auto" and any(found[name].pupil is not None for name in names):
+            found |= _with_pupils_too([one for one in asked if found[one[0]].pupil is None])
         seen = [frame_observations(own, found[name]) for name, own in views.items()]
         return RigViews(list(views), seen, tuple(found[name] for name in views), {})
+
+
+def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], How]]) -> dict[str, Calibration]:
+    """Return those of the cameras, beside others of the rig whose pupil moves, whose images agree that theirs does too:
+    they need not show it so well as where nothing else speaks for it."""
+    out = {}
+    for name, views, how in cameras:
+        try:
+            (moving,) = calibrate_together([(name, views, replace(how, pupil="moving"))])
+        except DegenerateError:
+            continue
+        if surely_moves(moving):
+            out[name] = moving
+    return out
 
 
 def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:
