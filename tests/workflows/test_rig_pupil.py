@@ -135,7 +135,7 @@ def test_whoever_takes_its_lenses_for_central_says_so(saved: Path, caplog: pytes
     assert all(f"entrance pupil of camera '{name}' moves, which is left out here" in caplog.text for name in CAMERAS)
 
 
-def test_a_certificate_is_of_cameras_with_their_pupils(saved: Path) -> None:
+def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, saved: Path) -> None:
     """Lengths that both cameras see near by are within the bound, and as if from one point few are."""
     task = Task(quantity=Quantity.LENGTH, size_mm=30.0, distance_mm=150.0)
     found = certify_file(saved, task).certificate
@@ -144,6 +144,9 @@ def test_a_certificate_is_of_cameras_with_their_pupils(saved: Path) -> None:
     assert (np.linalg.eigvalsh(instrument.covariance) > -1e-12).all()
     true, (left, right) = CAMERAS["left"][0], instrument.cameras
     assert isinstance(left, NearCamera) and isinstance(right, NearCamera)
+    known, own = rig.pupils["left"], slice(left.parameters.size - 2, left.parameters.size)
+    np.testing.assert_allclose(instrument.covariance[own, own], known.covariance, rtol=1e-6)
+    np.testing.assert_allclose(instrument.covariance[-6:, own], known.with_frame[-6:], rtol=1e-5, atol=1e-12)
     # Not at the rim, where an end may leave the view of a central lens.
     inner = found.in_view & (true.unproject(found.pixels.reshape(-1, 2))[0][:, 2] > 0.3).reshape(found.in_view.shape)
     rays = true.unproject(found.pixels[inner])[0]
