@@ -7,11 +7,11 @@ lenses to themselves: lenses are compared on flat boards first, and again on boa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from rigkit.calibration.assemble import assemble, require_determined
+from rigkit.calibration.begun import Begun, about_camera, begin
 from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
 from rigkit.calibration.judging.moved import moved_lens
@@ -22,17 +22,12 @@ from rigkit.calibration.lens_choice import (
     Lenses,
     best_sizes,
     choose_lenses,
-    lenses_on_boards,
-    lenses_on_flat_boards,
     twins,
 )
-from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
-from rigkit.calibration.one_model import Solved, on_same_images, only, solved
+from rigkit.calibration.models_tried import How
+from rigkit.calibration.one_model import Solved, on_same_images
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection
-from rigkit.calibration.views.observations import Observations
-from rigkit.calibration.views.repeats import cluster_numbers
-from rigkit.calibration.views.usable import usable_views
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,
@@ -43,7 +38,7 @@ from rigkit.calibration.with_pupil import (
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import Progress, silent
 
@@ -91,15 +86,19 @@ def calibrate(
 
 
 def calibrate_together(
-    cameras: Sequence[tuple[str, Sequence[BoardView], How]], *, progress: Progress = silent
+    cameras: Sequence[tuple[str, Sequence[BoardView], How]],
+    *,
+    known: Sequence[Begun] = (),
+    progress: Progress = silent,
 ) -> list[Calibration]:
     """Return the calibration of each of the cameras of a rig, (name, views, what is asked for) each: alone, but the
-    models that "auto" asks for are chosen together where cameras are alike. Errors as of `calibrate`, with the name
-    (none for "")."""
+    models that "auto" asks for are chosen together where cameras are alike. What was `known` before of the same views
+    is not done again. Errors as of `calibrate`, with the name (none for "")."""
     begun = []
     for k, (name, views, how) in enumerate(cameras):
         progress("cameras", k, len(cameras))
-        begun.append(_begin(name, views, how))
+        done = (one.asked(name, views, how) for one in known)
+        begun.append(next((one for one in done if one is not None), None) or begin(name, views, how))
     out: dict[int, Calibration] = {}
     for group in twins([one.tried.alone.fit.state.camera for one in begun]):
         out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
@@ -107,67 +106,7 @@ def calibrate_together(
     return [out[k] for k in range(len(begun))]
 
 
-@contextmanager
-def _about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
-    """Name the camera in errors; where its images repeat each other, nothing else needs to be looked for."""
-    try:
-        yield
-    except (InputError, DegenerateError) as error:
-        words = str(error)
-        images = [view.image for view in views]
-        if isinstance(error, DegenerateError) and len(set(images)) > 1:
-            place = cluster_numbers(images, [v.board.board_id for v in views], [v.pixels for v in views])
-            if not place.any():
-                words = (
-                    f"calibration: all {len(set(images))} images show the board in one and the same place, and "
-                    f"count as one; move it from image to image ({words})"
-                )
-        if not name and words == str(error):
-            raise
-        raise type(error)(f"camera '{name}': {words}" if name else words) from error
-
-
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class _Begun:
-    """A camera (`name` in messages, "" for one alone) with all models in question fitted to its views; `tried` are
-    compared on flat boards where there are several."""
-
-    name: str
-    how: How
-    dropped: tuple[tuple[str, str], ...]
-    observations: Observations
-    wanted: Wanted
-    options: list[Option]
-    failed: list[Candidate]
-    tried: Lenses
-
-    def solved(self, model: str) -> Solved:
-        """Return what a camera model comes to."""
-        with _about_camera(self.name, self.observations.views):
-            return solved(self.observations, *only(self.options, self.wanted, model), self.failed, self.how)
-
-
-def _begin(name: str, views: Sequence[BoardView], how: How) -> _Begun:
-    with _about_camera(name, views):
-        wanted = wanted_models(how)
-        used, dropped = usable_views(views, how.size_px)
-        observations = Observations.from_views(used)
-        options, failed = fit_all(observations, how.size_px, wanted, how.progress)
-        several = len({option.fit.state.camera.model for option in options}) > 1
-        tried = lenses_on_flat_boards(observations, options, how) if several else Lenses(observations, options)
-    return _Begun(
-        name=name,
-        how=how,
-        dropped=dropped,
-        observations=observations,
-        wanted=wanted,
-        options=options,
-        failed=failed,
-        tried=tried,
-    )
-
-
-def _finish(group: Sequence[_Begun]) -> list[Calibration]:
+def _finish(group: Sequence[Begun]) -> list[Calibration]:
     """Return the calibrations of cameras that are alike, or of one."""
     tried = [one.tried for one in group]
     choices = choose_lenses(tried)
@@ -176,10 +115,7 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
     if several and any(one.chosen.fit.state.shape.kind != "flat" for one in found):
         # Boards that are not flat bend the lenses to themselves: as they were found, another one may be the better.
         names = best_sizes(tried)
-        on_boards = [
-            lenses_on_boards(one, lenses, names, begun.how)
-            for one, lenses, begun in zip(found, tried, group, strict=True)
-        ]
+        on_boards = [begun.on_boards(choice.model, names) for begun, choice in zip(group, choices, strict=True)]
         others = choose_lenses(on_boards)
         for model in dict.fromkeys(other.model for other in others):
             changed = [k for k, c in enumerate(choices) if others[k].model == model != c.model]
@@ -195,7 +131,7 @@ def _finish(group: Sequence[_Begun]) -> list[Calibration]:
         choices = [Choice(c.model, HeldOut.of([r.options]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
     for begun, one, lenses, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
-        with _about_camera(begun.name, begun.observations.views):
+        with about_camera(begun.name, begun.observations.views):
             out.append(_result(begun, one, lenses, compared.options, choice.likely))
     return out
 
@@ -211,7 +147,7 @@ def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
 
 
 def _result(
-    begun: _Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
+    begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
 ) -> Calibration:
     """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
     central, how = _judged(begun, found, tried, rivals, likely), begun.how
@@ -239,7 +175,7 @@ def _result(
 
 
 def _judged(
-    begun: _Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
+    begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
 ) -> Calibration:
     """Return the result of a camera as it was solved for, with its verdicts."""
     how, fit = begun.how, found.chosen.fit

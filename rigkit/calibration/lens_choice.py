@@ -73,24 +73,27 @@ def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
     return sizes
 
 
-def lenses_on_boards(found: Solved, tried: Lenses, names: Sequence[str], how: How) -> Lenses:
+def lenses_on_boards(
+    found: Solved, tried: Lenses, names: Sequence[str], how: How, done: dict[str, Option] | None = None
+) -> Lenses:
     """Return the lenses tried, those of the `names`, fitted to boards with their corners as they were found and warps
-    that are free again."""
+    that are free again. `done` are those that were fitted before, by name; what is fitted now comes to them."""
     observations, kept = found.observations, found.chosen.fit.kept
     state = found.chosen.fit.state.with_corners_held()
-    options = []
+    done = {} if done is None else done
     for option in tried.options:
-        if option.name not in names:
-            continue
-        start = replace(state, camera=option.fit.state.camera)
-        fit = fit_other_lens(observations, start, kept)
-        options.append(replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None))
+        if option.name in names and option.name not in done:
+            start = replace(state, camera=option.fit.state.camera)
+            fit = fit_other_lens(observations, start, kept)
+            done[option.name] = replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None)
     # What does not even show the images that it was fitted to as well as another one predicts them is no better.
-    options.sort(key=lambda o: o.fit.rms_px)
+    order = sorted((o.name for o in tried.options if o.name in names), key=lambda name: done[name].fit.rms_px)
     judged: list[Option] = []
-    for option in options:
-        if all(option.fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
-            judged.append(replace(option, heldout=heldout_squares(observations, option.fit, how.folds)))
+    for name in order:
+        if all(done[name].fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
+            if done[name].heldout is None:
+                done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, how.folds))
+            judged.append(done[name])
     return Lenses(observations, list(settled(judged)))
 
 

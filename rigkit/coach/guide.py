@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from rigkit.calibration.begun import Begun
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
@@ -154,6 +155,16 @@ class CaptureGuide:
     def has_many(self) -> bool:
         """Whether there are frames enough to tell whether the lens model fits."""
         return _distinct(self.views) >= ENOUGH_FRAMES
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether all of `calibrate` has been asked of all frames, and answered."""
+        return not self._whole.is_new(self.views)
+
+    @property
+    def begun(self) -> Begun | None:
+        """What the latest of these calibrations found, for a rig's."""
+        return None if self._whole.latest is None else self._whole.latest.begun
 
     def _go_on(self) -> None:
         """Take what has been calibrated meanwhile, and have calibrated what has come."""

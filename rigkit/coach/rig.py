@@ -183,9 +183,13 @@ class RigGuide:
             return False
 
     def _go_on(self) -> None:
-        """Take what has been calibrated meanwhile, and have calibrated what has come."""
+        """Take what has been calibrated meanwhile, and have calibrated what has come, once each lens is: the rig need
+        not find it again."""
+        if not all(lens.is_calibrated for lens in self.lenses):
+            return
         frames = [[glance.view for glance in frame] for frame in self.frames]
-        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses]):
+        begun = [lens.begun for lens in self.lenses if lens.begun is not None]
+        if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], begun):
             self._known = None
 
     def _known_by(self, whole: WholeRig) -> RigKnown:

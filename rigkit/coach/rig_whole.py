@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 
+from rigkit.calibration.begun import Begun
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
@@ -44,16 +45,22 @@ class WholeRig:
         return self.rig.heldout_rms_px
 
 
-def whole_rig(frames: Sequence[Views], names: Sequence[str], sizes_px: Sequence[tuple[int, int]]) -> WholeRig | None:
-    """Return what `calibrate` makes of frames of the cameras `names`; None where they do not determine the rig."""
+def whole_rig(
+    frames: Sequence[Views],
+    names: Sequence[str],
+    sizes_px: Sequence[tuple[int, int]],
+    begun: Sequence[Begun] = (),
+) -> WholeRig | None:
+    """Return what `calibrate` makes of frames of the cameras `names`; None where they do not determine the rig. `begun`
+    are the cameras as `whole_calibration` found them: most of the time goes by there."""
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
     for k, frame in enumerate(frames):
         for name, view in zip(names, frame, strict=True):
             if view is not None:
-                views[name].append((f"{k:04d}", replace(view, image=f"{name}-{k:04d}")))
+                views[name].append((f"{k:04d}", replace(view, image=f"{len(views[name]):04d}")))
     sizes = dict(zip(names, sizes_px, strict=True))
     try:
-        return WholeRig(calibrate_rig(views, sizes, model="auto", board="auto"))
+        return WholeRig(calibrate_rig(views, sizes, model="auto", board="auto", begun=begun))
     except (InputError, DegenerateError):
         return None
 

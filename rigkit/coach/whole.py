@@ -13,13 +13,16 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.begun import Begun, begin
+from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.models_tried import How
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.processes import Here
+from rigkit.core.progress import silent
 from rigkit.planning.information import Knowledge
 
 STEADY = 0.15
@@ -39,11 +42,13 @@ Found = TypeVar("Found", bound=WithHeldOut)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Whole:
-    """A calibration, what is known by it, for what is to be taken next, and how sure it says that the lens is."""
+    """A calibration, what is known by it, for what is to be taken next, how sure it says that the lens is, and what its
+    rig need not find again."""
 
     calibration: Calibration
     knowledge: Knowledge
     stated: UncertainCamera
+    begun: Begun | None = None
 
     @property
     def heldout_px(self) -> float | None:
@@ -53,9 +58,11 @@ class Whole:
 def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Whole | None:
     """Return what `calibrate` makes of frames, each of which is an image; None where they do not determine the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
+    how = How(size_px=size_px, model="auto", degree=None, board="auto", folds=FOLDS, progress=silent, pupil="auto")
     try:
-        found = calibrate(named, size_px, model="auto")
-        return Whole(found, Knowledge.beyond_model(found), uncertain_camera(found))
+        begun = begin("", named, how)
+        (found,) = calibrate_together([("", named, how)], known=[begun])
+        return Whole(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
     except (InputError, DegenerateError):
         return None
 

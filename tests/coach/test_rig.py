@@ -12,8 +12,8 @@ import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 from helpers.calibration_scenes import noisy_view
 
-from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.models_tried import How
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.coach.coach import Coach, Take
@@ -86,12 +86,10 @@ def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[Glance]:
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     # Fourteen calibrations: which model the lens has is told, not found each time.
-    monkeypatch.setattr(
-        "rigkit.coach.whole.calibrate", lambda views, size_px, model: calibrate(views, size_px, model="brown")
-    )
+    monkeypatch.setattr("rigkit.coach.whole.How", lambda **how: How(**(how | {"model": "brown"})))
     monkeypatch.setattr(
         "rigkit.coach.rig_whole.calibrate_rig",
-        lambda views, sizes, model, board: calibrate_rig(views, sizes, model="brown", degree=5),
+        lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5),
     )
     guide = RigGuide(("left", "right"), GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.3, reach=REACH))
     empty = [Glance(size_px=SIZE, view=None)] * 2

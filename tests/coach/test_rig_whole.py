@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -65,14 +66,23 @@ class Later(Executor):
 
     rig: RigCalibration
     asked: list[tuple[int, Future[WholeRig | None]]] = field(default_factory=list)
+    begun: list[Any] = field(default_factory=list)
+    lenses: list[Callable[[], None]] = field(default_factory=list)
+    """Calibrations of lenses that are not done: those of so many as are `slow`."""
+    slow: int = 0
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
         if fn is whole_rig:
             self.asked.append((len(args[0]), future))
+            self.begun.append(args[3])
         else:
             own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
-            future.set_result(Whole(own, Knowledge.beyond_model(own), uncertain_camera(own)))
+            known = f"begun {len(args[0])}"
+            found = Whole(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
+            self.lenses.append(partial(future.set_result, found))
+            if len(self.lenses) > self.slow:
+                self.lenses.pop()()
         return future
 
     def tell(self, found: RigCalibration) -> int:
@@ -115,6 +125,18 @@ def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
         assert own.error == pytest.approx(stated, rel=0.1)
     state = guide.state(EMPTY, now)
     assert state["error"].startswith("left ") and state["share"] <= 1.0 and state["mount_px"] is None
+
+
+def test_a_rig_is_asked_with_what_its_lenses_found(frames: list[list[Glance]], rig: RigCalibration) -> None:
+    later = Later(rig, slow=1)
+    guide = guide_of(frames, later)
+    for _ in range(3):
+        assert not guide.advise(EMPTY).enough
+    assert len(later.lenses) == 1 and not later.asked, "the first lens is not done"
+    later.slow = 0
+    later.lenses.pop()()
+    guide.advise(EMPTY)
+    assert later.begun == [[f"begun {FRAMES}"] * 2]
 
 
 def test_what_the_rig_is_less_sure_of_is_asked_for(
@@ -199,7 +221,7 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
 ) -> None:
     monkeypatch.setattr(
         "rigkit.coach.rig_whole.calibrate_rig",
-        lambda views, sizes, model, board: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
+        lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
     )
     views = [[glance.view for glance in seen] for seen in frames]
     found = whole_rig([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])

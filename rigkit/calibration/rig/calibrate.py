@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+from rigkit.calibration.begun import Begun
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.models_tried import How
 from rigkit.calibration.posed import posed_calibration
@@ -46,6 +47,7 @@ def calibrate_rig(
     known: KnownCameras | None = None,
     folds: int = FOLDS,
     pupil: str = "auto",
+    begun: Sequence[Begun] = (),
     progress: Progress = silent,
 ) -> RigCalibration:
     """Return the calibration of a rig.
@@ -62,6 +64,7 @@ def calibrate_rig(
     known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
     folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
     pupil : whether entrance pupils may move, as for `calibrate`: each camera alone decides, all are solved together.
+    begun : cameras alone, as far as they are found already: what is known of the same views is not done again.
 
     Raises
     ------
@@ -80,7 +83,14 @@ def calibrate_rig(
     same = same_pictures(views)
     require_known(pupil)
     options = _Options(
-        sizes_px=sizes_px, model=model, degree=degree, board=board, folds=folds, known=known, pupil=pupil
+        sizes_px=sizes_px,
+        model=model,
+        degree=degree,
+        board=board,
+        folds=folds,
+        known=known,
+        pupil=pupil,
+        begun=begun,
     )
     every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
@@ -171,6 +181,7 @@ class _Options:
     folds: int
     known: KnownCameras | None
     pupil: str
+    begun: Sequence[Begun]
 
     @property
     def in_force(self) -> list[str]:
@@ -211,7 +222,7 @@ class _Options:
                 )
             )
         names = [name for name, _, _ in asked]
-        found |= dict(zip(names, calibrate_together(asked, progress=progress), strict=True))
+        found |= dict(zip(names, calibrate_together(asked, known=self.begun, progress=progress), strict=True))
         if self.pupil == "auto" and any(found[name].pupil is not None for name in names):
             found |= _with_pupils_too([one for one in asked if found[one[0]].pupil is None])
         seen = [frame_observations(own, found[name]) for name, own in views.items()]

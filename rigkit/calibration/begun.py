@@ -1,0 +1,112 @@
+"""One camera with all models in question fitted: what `calibrate` of it alone and that of its rig have in common.
+
+Steps that are done are kept: whoever asks of the same images once more does not wait for them again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from rigkit.calibration.choice import Option
+from rigkit.calibration.lens_choice import Lenses, lenses_on_boards, lenses_on_flat_boards
+from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
+from rigkit.calibration.one_model import Solved, only, solved
+from rigkit.calibration.result import Candidate
+from rigkit.calibration.views.observations import Observations
+from rigkit.calibration.views.repeats import cluster_numbers
+from rigkit.calibration.views.usable import usable_views
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import DegenerateError, InputError
+
+
+@contextmanager
+def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
+    """Name the camera in errors; where its images repeat each other, nothing else needs to be looked for."""
+    try:
+        yield
+    except (InputError, DegenerateError) as error:
+        words = str(error)
+        images = [view.image for view in views]
+        if isinstance(error, DegenerateError) and len(set(images)) > 1:
+            place = cluster_numbers(images, [v.board.board_id for v in views], [v.pixels for v in views])
+            if not place.any():
+                words = (
+                    f"calibration: all {len(set(images))} images show the board in one and the same place, and "
+                    f"count as one; move it from image to image ({words})"
+                )
+        if not name and words == str(error):
+            raise
+        raise type(error)(f"camera '{name}': {words}" if name else words) from error
+
+
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class Begun:
+    """A camera (`name` in messages, "" for one alone) with all models in question fitted to its `views`; `tried` are
+    compared on flat boards where there are several. What each model comes to is found once."""
+
+    name: str
+    how: How
+    views: Sequence[BoardView]
+    dropped: tuple[tuple[str, str], ...]
+    observations: Observations
+    wanted: Wanted
+    options: list[Option]
+    failed: list[Candidate]
+    tried: Lenses
+    _solved: dict[str, Solved] = field(default_factory=dict)
+    _on_boards: dict[str, dict[str, Option]] = field(default_factory=dict)
+
+    def solved(self, model: str) -> Solved:
+        """Return what a camera model comes to."""
+        if model not in self._solved:
+            with about_camera(self.name, self.observations.views):
+                own, wanted = only(self.options, self.wanted, model)
+                self._solved[model] = solved(self.observations, own, wanted, self.failed, self.how)
+        return self._solved[model]
+
+    def on_boards(self, model: str, names: Sequence[str]) -> Lenses:
+        """Return the lenses tried, those of the `names`, on boards as a camera model found them."""
+        done = self._on_boards.setdefault(model, {})
+        return lenses_on_boards(self.solved(model), self.tried, names, self.how, done)
+
+    def asked(self, name: str, views: Sequence[BoardView], how: How) -> Self | None:
+        """Return it as a camera of another name, or alone, with the pupil asked for; None where it is of other views,
+        or was begun otherwise. What is found of either is kept for both."""
+        then, now = ((h.size_px, h.model, h.degree, h.board, h.folds) for h in (self.how, how))
+        if then != now or len(views) != len(self.views) or not all(map(_same, self.views, views)):
+            return None
+        return replace(self, name=name, how=how)
+
+
+def _same(a: BoardView, b: BoardView) -> bool:
+    """Say whether two views are one; they may have come from another process."""
+    arrays = ((a.grid, b.grid), (a.pixels, b.pixels), (a.sigma_px, b.sigma_px), (a.points(), b.points()))
+    named = (a.image, a.board.board_id) == (b.image, b.board.board_id)
+    return named and all(np.array_equal(x, y) for x, y in arrays)
+
+
+def begin(name: str, views: Sequence[BoardView], how: How) -> Begun:
+    """Return a camera with all models fitted that `how` asks for; errors as of `calibrate`, with its name."""
+    with about_camera(name, views):
+        wanted = wanted_models(how)
+        used, dropped = usable_views(views, how.size_px)
+        observations = Observations.from_views(used)
+        options, failed = fit_all(observations, how.size_px, wanted, how.progress)
+        several = len({option.fit.state.camera.model for option in options}) > 1
+        tried = lenses_on_flat_boards(observations, options, how) if several else Lenses(observations, options)
+    return Begun(
+        name=name,
+        how=how,
+        views=views,
+        dropped=dropped,
+        observations=observations,
+        wanted=wanted,
+        options=options,
+        failed=failed,
+        tried=tried,
+    )

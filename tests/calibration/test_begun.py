@@ -1,0 +1,56 @@
+"""What was found of a camera alone is not found again for its rig, and the rig's result is the same to the last bit."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
+
+from rigkit.calibration.begun import begin
+from rigkit.calibration.calibrate import calibrate_together
+from rigkit.calibration.models_tried import How
+from rigkit.core.detections import BoardView
+from rigkit.core.progress import silent
+
+HOW = How(size_px=SIZE, model="auto", degree=None, board="auto", folds=2, progress=silent, pupil="auto")
+
+
+@pytest.fixture(scope="module")
+def views() -> list[BoardView]:
+    x, y = (BOARD.points()[:, :2] / BOARD.points()[:, :2].max(axis=0)).T
+    bowed = BOARD.points() + np.stack([0.0 * x, 0.0 * x, 4.0 * x * (1.0 - x) + 0.0 * y], axis=-1)
+    rng = np.random.default_rng(4)
+    return random_views(lens("reg"), 8, rng, reach_deg=REACH_DEG["reg"], noise_px=0.1, points_mm=bowed)[0]
+
+
+def test_what_is_known_of_a_camera_is_not_found_again(views: list[BoardView], monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = begin("", views, HOW)
+    (alone,) = calibrate_together([("", views, HOW)], known=[begun])
+    in_rig = [("left", views, replace(HOW, pupil="central"))]
+    (expected,) = calibrate_together(in_rig)
+    assert alone.boards[0].kind != "flat", "lenses are compared on boards as they were found, too"
+    # As it comes from the process in which the camera was calibrated.
+    known = pickle.loads(pickle.dumps(begun))
+
+    def again(*_: object) -> None:
+        raise AssertionError("done again")
+
+    for step in ("begun.fit_all", "begun.solved", "lens_choice.fit_other_lens", "lens_choice.heldout_squares"):
+        monkeypatch.setattr(f"rigkit.calibration.{step}", again)
+    (found,) = calibrate_together(in_rig, known=[known])
+    np.testing.assert_array_equal(found.camera.parameters, expected.camera.parameters)
+    np.testing.assert_array_equal(found.frame_covariance, expected.frame_covariance)
+    assert found.heldout_rms_px == expected.heldout_rms_px
+
+
+def test_of_other_views_or_another_question_nothing_is_known(views: list[BoardView]) -> None:
+    known = begin("", views, replace(HOW, model="brown", degree=5, board="flat", folds=0))
+    assert known.asked("left", views, known.how) is not None
+    moved = [*views[:-1], replace(views[-1], pixels=views[-1].pixels + 0.1)]
+    for other in (moved, views[:-1], [*views[:-1], replace(views[-1], image="other")]):
+        assert known.asked("left", other, known.how) is None
+    for how in (replace(known.how, folds=2), replace(known.how, board="auto"), HOW):
+        assert known.asked("left", views, how) is None
