@@ -41,7 +41,8 @@ def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") 
 
 
 def checked(known: Calibration, views: Sequence[BoardView]) -> SentinelCheck:
-    return check_views(watched_camera(known, "camera", **COUNTED), [FreshView(v.image, 0, v) for v in views])
+    watched = watched_camera(known, "camera", **COUNTED)
+    return check_views(watched, [FreshView(v.image, 0, watched.from_afar(v)) for v in views])
 
 
 def unchanged(
