@@ -16,6 +16,7 @@ import numpy as np
 
 from rigkit.coach.guide import (
     CHECKING,
+    ENOUGH_FRAMES,
     WORTH_GOING_ON,
     Advice,
     CaptureGuide,
@@ -274,7 +275,7 @@ class RigGuide:
 
     def state(self, glances: Sequence[Glance] | None, advice: RigAdvice | None) -> dict[str, Any]:
         """Return what the page shows."""
-        out: dict[str, Any] = {"frames": len(self.frames)}
+        out: dict[str, Any] = {"frames": len(self.frames), "least_frames": ENOUGH_FRAMES}
         if advice is not None:
             left = advice.left or advice.lenses[advice.speaks].left
             out |= {

@@ -81,6 +81,13 @@ navigator.mediaDevices.getUserMedia = async (want) => {
 """Chromium plays one film for all cameras: two of them are its halves."""
 
 
+FLASHES = """
+(() => { const flash = document.getElementById("flash"); flash.style.pointerEvents = "auto";
+  const top = document.elementFromPoint(innerWidth / 2, 99); flash.style.pointerEvents = "none"; return top === flash; })()
+"""
+"""Whether what lights up when a frame is taken is before the picture."""
+
+
 @contextmanager
 def _guided(video: Path | None, folder: Path, profile: Path, *more: str, before: str = "") -> Iterator[DrivenPage]:
     """Run the coach and its page, and kill both in the end; nothing may be complained of in the browser's console."""
@@ -115,6 +122,12 @@ def test_the_page_finds_a_board_and_takes_a_frame_and_obeys_keys(tmp_path: Path)
         for key, button in (("m", "mapped"), ("s", "quiet")):
             page.press(key)
             assert page.evaluate(f'document.getElementById("{button}").ariaPressed') == "true"
+        # Of one frame nobody says how near the goal is; the map's scale leaves the picture as large as it was.
+        assert page.evaluate('document.getElementById("least").textContent') == "of at least 8"
+        assert page.evaluate('document.getElementById("meter").value') < 0.2
+        assert page.evaluate('document.getElementById("stage").contains(document.getElementById("scale"))')
+        # The flash is over the picture, not behind it.
+        assert page.evaluate(FLASHES)
         # One pose is all there is: what is taken now is taken because somebody asked for it.
         page.press(" ")
         page.wait("coach.state.frames >= 2", PATIENCE_S)
@@ -176,6 +189,7 @@ def test_a_capture_from_beginning_to_end(tmp_path: Path) -> None:
         page.wait("coach.state.finished", PATIENCE_S)
         assert _words(page).startswith("Done: ") and "calibration.json written" in _words(page)
         assert page.evaluate('["take", "undo", "done"].every((id) => document.getElementById(id).hidden)')
+        assert page.evaluate('["left", "meter"].every((id) => document.getElementById(id).hidden)')
         # The camera is let go.
         assert page.evaluate('document.querySelector("video").srcObject.getTracks()[0].readyState') == "ended"
         frames = page.evaluate("coach.state.frames")
