@@ -51,24 +51,28 @@ def unchanged(
     draws: int,
     solve: Callable[[list[BoardView]], Calibration],
 ) -> list[SentinelCheck]:
-    """Check images of a camera that did not change: three, and halves, against calibrations from the others; return the
-    checks."""
+    """Check images of a camera that did not change, three, halves, and these in threes, against calibrations from the
+    others; return the checks."""
     every: list[SentinelCheck] = []
     for fresh in (FRESH, len(images) // 2):
-        rng, checks = np.random.default_rng([fresh, 3]), []
+        rng, checks, threes = np.random.default_rng([fresh, 3]), [], []
         for _ in range(draws):
             order = rng.permutation(len(images)).tolist()
             try:
                 known = solve([v for i in order[fresh:] for v in images[i]])
                 checks.append(checked(known, [v for i in order[:fresh] for v in images[i]]))
+                for first in range(0, fresh - FRESH + 1, FRESH) if fresh > FRESH else ():
+                    threes.append(checked(known, [v for i in order[first : first + FRESH] for v in images[i]]))
             except RigkitError as error:
                 print(f"{title}: {error}")
         tell(f"{title}: unchanged, {fresh} of {len(images)}", checks, "nothing")
-        for c in checks:
+        if threes:
+            tell(f"{title}: unchanged, {fresh} of {len(images)} in threes", threes, "nothing")
+        for c in (*checks, *threes):
             if not c.holds:
                 print(f"   chance {c.chance:.2g}, {c.change}, size {c.change.size_px if c.change else 0.0:.3f} px, "
                       f"rms {c.rms_px:.3f} -> {c.rms_fixed_px:.3f}, expected {c.expected_px:.3f}")  # fmt: skip
-        every += checks
+        every += [*checks, *threes]
     return every
 
 
