@@ -83,7 +83,8 @@ navigator.mediaDevices.getUserMedia = async (want) => {
 
 FLASHES = """
 (() => { const flash = document.getElementById("flash"); flash.style.pointerEvents = "auto";
-  const top = document.elementFromPoint(innerWidth / 2, 99); flash.style.pointerEvents = "none"; return top === flash; })()
+  const top = document.elementFromPoint(innerWidth / 2, 99); flash.style.pointerEvents = "none";
+  return top === flash; })()
 """
 """Whether what lights up when a frame is taken is before the picture."""
 
