@@ -10,9 +10,9 @@ typedef struct {
 
 /* looks.c */
 
-EXPORT int64_t square_ratios(
+EXPORT int64_t has_mosaic(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t step, double least,
-    ARRAY(double, scratch, 3 * (height / 2 / step) * (width / 2 / step) + 1), ARRAY(double, out, 4));
+    double share, ARRAY(double, scratch, 2 * (height / 2 / step) * (width / 2 / step)));
 
 EXPORT int64_t count_bad_pixels(
     ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart,
@@ -26,29 +26,26 @@ EXPORT void shrink_floats(
 EXPORT void shrink_bytes(
     ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, int64_t factor,
     ARRAY(uint16_t, sums, 2 * width), ARRAY(float, out, height / factor, width / factor));
-EXPORT void smooth_floats(
-    ARRAY(const float, image, height, width), int64_t height, int64_t width, ARRAY(const float, kernel, 5),
-    ARRAY(float, column, width + 4), ARRAY(float, out, height, width),
-    ARRAY(float, half, (height + 1) / 2, (width + 1) / 2));
-EXPORT void smooth_bytes(
-    ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, ARRAY(const float, kernel, 5), float whole,
-    ARRAY(uint16_t, column, width + 4), ARRAY(float, out, height, width),
-    ARRAY(float, half, (height + 1) / 2, (width + 1) / 2));
-
-/* peaks.c */
+/* What levels are smoothed with, a kernel of multiples of 1 / whole, and what their thresholds follow from
+ * (detection.saddles.response). */
+typedef struct {
+    ARRAY(const float, kernel, 5);
+    double whole, extreme, least_span, noise_factor, floor, ceiling;
+} level_rules_t;
 
 /* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. Each such
  * strip of STRIP_ROWS rows has a threshold of its own: strip (u - STRIPS_FROM) / STRIP of band v / STRIP_ROWS. */
 enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 
-EXPORT void typical_values(
-    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, int64_t step,
-    int64_t few, ARRAY(float, response, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
-    ARRAY(float, brightness, ((height - 3) / step + 1) * ((width - 3) / step + 1)),
-    ARRAY(float, room, ((height - 3) / step + 1) * ((width - 3) / step + 1)), ARRAY(float, out, 3));
-EXPORT void fill_thresholds(
-    ARRAY(const float, smooth, height, width), int64_t height, int64_t width, float floor, float least, float darkest,
-    float brightest, ARRAY(float, out, height / STRIP_ROWS + 1, width / STRIP + 1));
+EXPORT void make_level(
+    ARRAY(const void, image, height, width), int64_t bytes, int64_t width, int64_t height, int64_t step,
+    const level_rules_t *rules,
+    ARRAY(float, scratch, width + 4 + 3 * ((height - 3) / step + 1) * ((width - 3) / step + 1)),
+    ARRAY(float, smooth, height, width), ARRAY(float, half, (height + 1) / 2, (width + 1) / 2),
+    ARRAY(float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1));
+
+/* peaks.c */
+
 EXPORT int64_t find_peaks(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width,
     ARRAY(const float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1),
@@ -75,10 +72,12 @@ typedef struct {
 } ring_rules_t;
 
 EXPORT int64_t find_corners(
-    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp,
-    ARRAY(const int32_t, peaks, count, 2), ARRAY(const float, response, count), int64_t count,
-    ARRAY(double, saddles, count, 2), ARRAY(int64_t, which, count), ARRAY(double, angles, count + 1, 2),
-    ARRAY(double, contrast, count + 1), ARRAY(uint8_t, smeared, count + 1), ARRAY(int64_t, found, 1));
+    ARRAY(const float, smooth, height, width), int64_t width, int64_t height, ARRAY(const int32_t, peaks, count, 2),
+    ARRAY(const float, response, count), int64_t count, double radius, double most_step, double most_sharp,
+    const ring_rules_t *rules, double scale, double offset, ARRAY(const double, known, known_count, 2), int64_t known_count,
+    double reach, ARRAY(double, saddles, count, 2), ARRAY(double, pixels, count, 2), ARRAY(double, angles, count, 2),
+    ARRAY(double, contrast, count), ARRAY(uint8_t, smeared, count), ARRAY(uint8_t, repeated, count),
+    ARRAY(int64_t, found, 2));
 EXPORT int64_t mark_known(
     ARRAY(const double, fresh, count, 2), int64_t count, ARRAY(const double, known, known_count, 2), int64_t known_count,
     double reach, ARRAY(uint8_t, mark, count));

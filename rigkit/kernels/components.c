@@ -9,7 +9,7 @@ static int compare(const void *one, const void *two)
     return (a > b) - (a < b);
 }
 
-/* Keep the links that bound a closed square on either side (reference.front.quads). */
+/* Keep the links that bound a closed square on either side (reference.links.quads). */
 static void keep_quads(int64_t count, int64_t *to, uint8_t *bound)
 {
     memset(bound, 0, (size_t)(4 * count));

@@ -51,13 +51,14 @@ INLINE void fetch_ring(const image_t image, int64_t u, int64_t v, int64_t reach)
         __builtin_prefetch(image.brightness + row * image.width + left);
 }
 
-/* The corners of one level among `count` peaks of `response`: `saddles` (count, 2) gets those with a saddle nearby,
- * `which`, `angles` (count, 2) and `contrast` those of them that are corners: their ring is valid and they are no sharper
- * than `most_sharp`; `smeared` says which of these only motion explains. Returns the number of saddles and, in `found`, of corners. */
-FOR_EACH_PROCESSOR int64_t find_corners(
-    image_t image, const ring_rules_t *rules, double radius, double most_step, double most_sharp, const int32_t *peaks,
-    const float *response, int64_t count, double *saddles, int64_t *which, double *angles, double *contrast,
-    uint8_t *smeared, int64_t *found)
+/* Which of the `count` peaks of a level, of that response, are corners (reference.front.corners): `saddles` gets the saddles next to
+ * them, in pixels of the full image (`scale`, `offset`), `pixels`, `angles` and `contrast` those that are corners: their ring is valid
+ * and they are no sharper than `most_sharp`; `smeared` says which of these only motion explains. Sets `found` to how many saddles
+ * and corners there are. */
+static FOR_EACH_PROCESSOR void read_peaks(
+    const image_t image, const int32_t *peaks, const float *response, int64_t count, double radius, double most_step,
+    double most_sharp, const ring_rules_t *rules, double scale, double offset, double *saddles, double *pixels, double *angles,
+    double *contrast, uint8_t *smeared, int64_t *found)
 {
     enum { AHEAD = 6 };
     const int64_t reach = (int64_t)radius + 1;
@@ -65,21 +66,39 @@ FOR_EACH_PROCESSOR int64_t find_corners(
     for (int64_t k = 0; k < count; k++) {
         if (k + AHEAD < count)
             fetch_ring(image, peaks[2 * (k + AHEAD)], peaks[2 * (k + AHEAD) + 1], reach);
-        double *pixel = saddles + 2 * near;
+        double pixel[2];
         if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
             continue;
-        near++;
+        double *saddle = saddles + 2 * near++;
+        saddle[0] = scale * pixel[0] + offset;
+        saddle[1] = scale * pixel[1] + offset;
         if (!may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]))
             continue;
         const int ring = read_ring(
             image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
             angles + 2 * corners, contrast + corners);
         smeared[corners] = ring == 2;
-        if (ring)
-            which[corners++] = near - 1;
+        pixels[2 * corners] = saddle[0];
+        pixels[2 * corners + 1] = saddle[1];
+        corners += ring != 0;
     }
-    *found = corners;
-    return near;
+    found[0] = near;
+    found[1] = corners;
+}
+
+/* The same; `repeated` says which corners lie within `reach` of one of `known`. Returns 0 without memory. */
+int64_t find_corners(
+    const float *smooth, int64_t width, int64_t height, const int32_t *peaks, const float *response, int64_t count, double radius,
+    double most_step, double most_sharp, const ring_rules_t *rules, double scale, double offset, const double *known,
+    int64_t known_count, double reach, double *saddles, double *pixels, double *angles, double *contrast, uint8_t *smeared,
+    uint8_t *repeated, int64_t *found)
+{
+    const image_t image = {smooth, width, height};
+    read_peaks(
+        image, peaks, response, count, radius, most_step, most_sharp, rules, scale, offset, saddles, pixels, angles, contrast,
+        smeared, found);
+    memset(repeated, 0, (size_t)found[1]);
+    return known_count == 0 || mark_known(pixels, found[1], known, known_count, reach, repeated);
 }
 
 /* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */

@@ -3,6 +3,8 @@ callers'."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +23,16 @@ MAX_SUMMED = 256
 """Bytes whose sum fits 16 bits."""
 
 Image = NDArray[np.float32]
+
+
+@structure("level_rules_t")
+class LevelRules(Struct):
+    """How levels are smoothed, and what their thresholds follow from."""
+
+    @classmethod
+    def make(cls, kernel: Image, **numbers: float) -> LevelRules:
+        """Return the rules; `kernel` (5,) is symmetric, of multiples of 1/WHOLE."""
+        return cls.of(kernel=np.ascontiguousarray(kernel, np.float32), whole=WHOLE, **numbers)
 
 
 @structure("ring_rules_t")
@@ -60,13 +72,13 @@ class _CornerArrays(Struct):
     """The corners that links are sought for."""
 
 
-def square_ratios(image: GreyImage, step: int, least: float) -> tuple[FloatArray, int]:
-    """Return the upper medians (4,) of how bright the pixels of squares of 2 x 2 are (row by row), beside the mean of
-    their square, and of how many squares: of every `step`-th both ways those brighter than the upper median of all, and
-    than `least`."""
+def has_mosaic(image: GreyImage, step: int, least: float, share: float) -> bool:
+    """Return whether a place in squares of 2 x 2 pixels is brighter or darker than the mean of its square by `share` of
+    that: in the upper median over those squares, of every `step`-th both ways, that are brighter than the upper median
+    of all, and than `least`."""
     grey, bytewise, width, height = image_arguments(image)
-    scratch, out = np.empty(3 * (height // 2 // step) * (width // 2 // step) + 1), np.empty(4)
-    return out, kernels().square_ratios(grey, bytewise, width, height, step, least, scratch, out)
+    scratch = np.empty(2 * (height // 2 // step) * (width // 2 // step))
+    return bool(kernels().has_mosaic(grey, bytewise, width, height, step, least, share, scratch))
 
 
 def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
@@ -90,45 +102,22 @@ def shrunk(image: GreyImage, factor: int) -> Image:
     return out
 
 
-def smoothed(image: GreyImage, kernel: Image) -> tuple[Image, Image]:
-    """Return `image` smoothed with the symmetric `kernel` (5,), of multiples of 1/WHOLE, both ways, and every second of
-    its pixels both ways."""
+def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[Image, Image, Image]:
+    """Return `image` smoothed, every second of its pixels both ways, and the smallest response of a peak in each STRIP
+    pixels of STRIP_ROWS rows: as the light there, and every `step`-th inner pixel both ways, have it."""
     height, width = image.shape
     half_height, half_width = (height + 1) // 2, (width + 1) // 2
     # One block of memory: the allocator keeps it for the next image, as it would not two.
     block = np.empty(height * width + half_height * half_width, np.float32)
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
-    if image.dtype == np.uint8:
-        column = np.empty(width + 4, np.uint16)
-        kernels().smooth_bytes(np.ascontiguousarray(image), height, width, kernel, WHOLE, column, smooth, half)
-    else:
-        sums = np.empty(width + 4, np.float32)
-        kernels().smooth_floats(np.ascontiguousarray(image), height, width, kernel, sums, smooth, half)
-    return smooth, half
-
-
-def typical(smooth: Image, step: int, extreme: float) -> tuple[float, float, float]:
-    """Return the upper median of |response|, and how bright all but the part `extreme` at either end are, at least and
-    at most: at every `step`-th inner pixel of every `step`-th inner row."""
-    height, width = smooth.shape
-    seen = np.empty((3, -(-(height - 2) // step) * -(-(width - 2) // step)), np.float32)
-    out, few = np.empty(3, np.float32), int(extreme * seen.shape[1])
-    kernels().typical_values(smooth, height, width, step, few, *seen, out)
-    response, darkest, brightest = out.tolist()
-    return response, darkest, brightest
-
-
-def thresholds(smooth: Image, floor: float, least: float, darkest: float, brightest: float) -> Image:
-    """Return for each STRIP pixels of STRIP_ROWS rows `floor` times the square of how bright they get, `darkest` being
-    0 and `brightest` 1, but `least` at least."""
-    height, width = smooth.shape
-    out = np.empty((height // STRIP_ROWS + 1, width // STRIP + 1), np.float32)
-    kernels().fill_thresholds(smooth, height, width, floor, least, darkest, brightest, out)
-    return out
+    above = np.empty((height // STRIP_ROWS + 1, width // STRIP + 1), np.float32)
+    scratch = np.empty(width + 4 + 3 * ((height - 3) // step + 1) * ((width - 3) // step + 1), np.float32)
+    kernels().make_level(*image_arguments(image), step, rules, scratch, smooth, half, above)
+    return smooth, half, above
 
 
 def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
-    """Return (u, v) and response of the peaks above their `thresholds`, row by row.
+    """Return (u, v) and response of the peaks above their thresholds (`level`), row by row.
 
     Of more than `limit` peaks, about so many are kept: those strongest beside the strongest in their square of `side`
     pixels, to one part in `finest`.
@@ -146,28 +135,56 @@ def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tu
     return at[:found], response[:found]
 
 
+class CornersOfLevel(NamedTuple):
+    """What lies next to the peaks of a level, in pixels of the full image.
+
+    Attributes
+    ----------
+    saddles : (N, 2)
+    pixels, angles, contrast : (M, 2), (M, 2) and (M,), of the corners among these.
+    smeared : (M,) only motion explains their middle.
+    repeated : (M,) there is a known one nearby.
+    """
+
+    saddles: FloatArray
+    pixels: FloatArray
+    angles: FloatArray
+    contrast: FloatArray
+    smeared: BoolArray
+    repeated: BoolArray
+
+
 def corners(
     smooth: Image,
     at: NDArray[np.signedinteger],
     response: Image,
-    radius: float,
-    most_step: float,
-    most_sharp: float,
+    tests: tuple[float, float, float],
     rules: RingRules,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return the saddles next to the peaks `at` (N, 2); of the corners among them: which, angles (M, 2), contrast, and
-    whether only motion explains their middle."""
+    to_full: tuple[float, float],
+    known: FloatArray,
+    reach: float,
+) -> CornersOfLevel:
+    """Return what lies next to the peaks `at` (P, 2) of a level.
+
+    Parameters
+    ----------
+    tests : radius of the rings, largest step to a saddle, largest response relative to the square of the contrast.
+    to_full : scale and offset of the level.
+    known : (K, 2) corners that are known; one within `reach` of these is repeated.
+    """
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
-    count, found = len(at), np.zeros(1, np.int64)
-    pixels, which = np.empty((count, 2)), np.empty(count, np.int64)
-    # A ring is read before it is known whether it is kept.
-    angles, contrast, smeared = np.empty((count + 1, 2)), np.empty(count + 1), np.empty(count + 1, np.uint8)
-    near = kernels().find_corners(
-        *(ImageOf.make(smooth), rules, radius, most_step, most_sharp),
-        *(at, response, count, pixels, which, angles, contrast, smeared, found),
+    count, (height, width), found = len(at), smooth.shape, np.empty(2, np.int64)
+    (saddles, pixels, angles), contrast = np.empty((3, count, 2)), np.empty(count)
+    smeared, repeated = np.empty((2, count), np.bool_)
+    if not kernels().find_corners(
+        *(smooth, width, height, at, response, count, *tests, rules, *to_full, known, len(known), reach),
+        *(saddles, pixels, angles, contrast, smeared, repeated, found),
+    ):
+        raise MemoryError
+    near, good = found.tolist()
+    return CornersOfLevel(
+        saddles[:near], pixels[:good], angles[:good], contrast[:good], smeared[:good], repeated[:good]
     )
-    size = int(found[0])
-    return pixels[:near], which[:size], angles[:size], contrast[:size], smeared[:size] > 0
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:

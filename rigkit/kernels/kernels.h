@@ -77,7 +77,7 @@ INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int6
 
 /* Return whether at `most` or more of the `places` `along` the edge from (u, v) to (end_u, end_v) the side that should be
  * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
- * (reference.front.edge_contrast). */
+ * (reference.links.edge_contrast). */
 INLINE int edge_seen(
     const image_t image, const double *along, int64_t places, int64_t most, double u, double v, double end_u,
     double end_v, double sign, double offset, double weakest)

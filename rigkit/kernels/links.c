@@ -1,4 +1,4 @@
-/* Which corners are neighbours along the edges between squares. The definitions in numpy are in tests/kernels/reference/front.py,
+/* Which corners are neighbours along the edges between squares. The definitions in numpy are in tests/kernels/reference/links.py,
  * the numbers in rigkit.detection.lattice.links. */
 #include "kernels.h"
 
@@ -118,7 +118,7 @@ INLINE int64_t arm_along(double a, double b)
     return fabs(b) > fabs(a) ? (b < 0.0 ? 3 : 1) : (a < 0.0 ? 2 : 0);
 }
 
-/* Whether the edge from corner i is there (reference.front._edge_seen). */
+/* Whether the edge from corner i is there (reference.links._edge_seen). */
 INLINE int link_seen(
     const corners_t *corners, const image_t image, double scale, double offset, const link_rules_t *rules, int64_t i,
     const candidate_t *link)
@@ -190,7 +190,7 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
     return sqrt(du * du + dv * dv);
 }
 
-/* reference.front.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
+/* reference.links.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
  * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
  * `nearest` (count, 4) is scratch. Returns 0 without memory. */
 FOR_EACH_PROCESSOR int64_t find_links(

@@ -7,15 +7,15 @@ INLINE double level_at(const void *grey, int64_t bytes, int64_t at)
     return bytes ? (double)((const uint8_t *)grey)[at] : (double)((const float *)grey)[at];
 }
 
-/* Set `out` to the upper medians of the ratios of the four pixels of squares (0 0, 0 1, 1 0, 1 1: row, column) to the mean of
- * their square, over those squares, every `step`-th both ways, whose mean is above the upper median of all, and above `least`.
- * Return how many these are. */
-int64_t square_ratios(
-    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t step, double least, double *scratch, double *out)
+/* Return whether one of the four pixels of squares of 2 x 2, at least, is brighter or darker than the mean of its square by `share` of
+ * that, in the upper median over those squares, of every `step`-th both ways, whose mean is above the upper median of all and above
+ * `least`. */
+int64_t has_mosaic(
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t step, double least, double share, double *scratch)
 {
+    enum { PLACES = 4 };
     const int64_t down = height / 2 / step, across = width / 2 / step, count = down * across;
-    double *mean = scratch, *ranked_mean = scratch + count, *ratio = scratch + 2 * count;
-    int64_t bright = 0;
+    double *mean = scratch, *ranked_mean = scratch + count;
     for (int64_t row = 0, k = 0; row < down; row++)
         for (int64_t column = 0; column < across; column++, k++) {
             const int64_t at = 2 * step * (row * width + column);
@@ -24,17 +24,24 @@ int64_t square_ratios(
             mean[k] = ranked_mean[k] = (upper + lower) / 4.0;
         }
     const double middle = ranked(ranked_mean, count, count / 2), above = middle > least ? middle : least;
-    for (int64_t place = 0; place < 4; place++) {
-        bright = 0;
-        for (int64_t row = 0, k = 0; row < down; row++)
-            for (int64_t column = 0; column < across; column++, k++) {
+    /* Which side of a bound a median lies on is counted sooner than the median is found. */
+    int64_t bright = 0, low[PLACES] = {0}, high[PLACES] = {0};
+    for (int64_t row = 0, k = 0; row < down; row++)
+        for (int64_t column = 0; column < across; column++, k++) {
+            if (!(mean[k] > above))
+                continue;
+            bright++;
+            for (int64_t place = 0; place < PLACES; place++) {
                 const int64_t at = 2 * step * (row * width + column) + place / 2 * width + place % 2;
-                ratio[bright] = level_at(grey, bytes, at) / mean[k];
-                bright += mean[k] > above;
+                const double off = level_at(grey, bytes, at) / mean[k] - 1.0;
+                low[place] += off <= -share;
+                high[place] += off >= share;
             }
-        out[place] = bright > 0 ? ranked(ratio, bright, bright / 2) : 1.0;
-    }
-    return bright;
+        }
+    int64_t uneven = 0;
+    for (int64_t place = 0; place < PLACES; place++)
+        uneven |= low[place] > bright / 2 || high[place] >= bright - bright / 2;
+    return bright > 0 && uneven;
 }
 
 /* Return how many inner pixels of every `apart`-th row, from `first` on, are brighter than all of their eight neighbours, or darker,

@@ -1,6 +1,6 @@
 /* The saddle response of an image and its peaks. The definitions in numpy are in tests/kernels/reference/front.py,
  * the numbers in rigkit.detection.saddles. */
-#include "kernels.h"
+#include "front.h"
 
 /* Numbers are counted in so many bins to rank them, those of so many bits. */
 enum { RANK_BITS = 11, RANKS = 1 << RANK_BITS };

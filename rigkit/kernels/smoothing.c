@@ -1,5 +1,5 @@
 /* From an image as it was read to one that saddles are sought in: smaller, smoother. The definitions in numpy are in tests/kernels/reference/front.py. */
-#include "kernels.h"
+#include "front.h"
 
 /* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
 FOR_EACH_PROCESSOR void shrink_floats(
@@ -84,7 +84,7 @@ INLINE rows_t rows_around(int64_t v, int64_t height, int64_t width)
 
 /* Smooth with the kernel (outer, inner, centre, inner, outer) both ways, the border repeated; `half` gets every second
  * pixel of every second row. `column` (width + 4) is scratch. */
-FOR_EACH_PROCESSOR void smooth_floats(
+static FOR_EACH_PROCESSOR void smooth_floats(
     const float *restrict image, int64_t height, int64_t width, const float *restrict kernel, float *restrict column,
     float *restrict out, float *restrict half)
 {
@@ -111,7 +111,7 @@ FOR_EACH_PROCESSOR void smooth_floats(
 }
 
 /* The same of bytes with a kernel of small integers over `whole`: exact, as long as whole^2 * 255 fits 16 bits. */
-FOR_EACH_PROCESSOR void smooth_bytes(
+static FOR_EACH_PROCESSOR void smooth_bytes(
     const uint8_t *restrict image, int64_t height, int64_t width, const float *restrict kernel, float whole,
     uint16_t *restrict column, float *restrict out, float *restrict half)
 {
@@ -139,4 +139,27 @@ FOR_EACH_PROCESSOR void smooth_bytes(
             for (int64_t u = 0; u < half_width; u++)
                 half[v / 2 * half_width + u] = to[2 * u];
     }
+}
+
+/* One level of the pyramid from the `image` that the level before has left (reference.front.level): smoothed, every second of its
+ * pixels both ways for the next one, and its thresholds, by every `step`-th pixel both ways. */
+void make_level(
+    const void *image, int64_t bytes, int64_t width, int64_t height, int64_t step, const level_rules_t *rules, float *scratch,
+    float *smooth, float *half, float *thresholds)
+{
+    const int64_t seen = ((height - 3) / step + 1) * ((width - 3) / step + 1);
+    float *room = scratch + width + 4, typical[3];
+    if (bytes)
+        smooth_bytes(image, height, width, rules->kernel, (float)rules->whole, (uint16_t *)scratch, smooth, half);
+    else
+        smooth_floats(image, height, width, rules->kernel, scratch, smooth, half);
+    typical_values(
+        smooth, height, width, step, (int64_t)(rules->extreme * (double)seen), room, room + seen, room + 2 * seen, typical);
+    double span = (double)typical[2] - (double)typical[1];
+    span = (span > rules->least_span ? span : rules->least_span) / 200.0;
+    const double contrast = span * span;
+    const double noise = rules->noise_factor * (double)typical[0], most = rules->ceiling * contrast;
+    fill_thresholds(
+        smooth, height, width, (float)(rules->floor * contrast), (float)(noise < most ? noise : most), typical[1], typical[2],
+        thresholds);
 }

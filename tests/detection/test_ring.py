@@ -11,7 +11,7 @@ from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image, pyramid
 from rigkit.detection.saddles.ring import ring_rules
-from rigkit.detection.saddles.saddle import MAX_STEP, RING_RADIUS, find_corners
+from rigkit.detection.saddles.saddle import MAX_STEP, NOWHERE, RING_RADIUS, find_corners
 from rigkit.kernels import front
 
 DIRECTION_DEG = 3.0
@@ -35,7 +35,8 @@ def ideal_corner(first_deg: float, opening_deg: float, blur_px: float) -> np.nda
 def corner_at(image: np.ndarray, at: tuple[int, int], radius: float) -> np.ndarray:
     """Return the angles (N, 2) of the corner next to the pixel `at`, N = 0 for none."""
     place, response = np.array([at], np.int32), np.zeros(1, np.float32)
-    return front.corners(image, place, response, radius, MAX_STEP, np.inf, ring_rules())[2]
+    rules, tests = ring_rules(), (radius, MAX_STEP, np.inf)
+    return front.corners(image, place, response, tests, rules, (1.0, 0.0), NOWHERE, 0.0).angles
 
 
 @pytest.mark.parametrize("opening", [25.0, 50.0, 90.0, 130.0, 155.0])

@@ -12,6 +12,7 @@ from helpers.detection_scenes import corner_scene, fisheye, printed_text, regula
 from helpers.opencv import exact_interpolation
 from helpers.real_images import real_images
 from kernels.reference import front as reference
+from kernels.reference import links as linked
 
 from rigkit.detection.lattice import links
 from rigkit.detection.lattice.links import find_links
@@ -53,8 +54,9 @@ NAMES = ("boards", "fisheye", "noise", "small", "text", "black", *real_images())
 def in_numpy(monkeypatch: pytest.MonkeyPatch) -> Callable[..., object]:
     def run(function: Callable[..., object], *args: object) -> object:
         with monkeypatch.context() as patch:
-            for name in ("shrunk", "smoothed", "typical", "thresholds", "peaks", "corners", "near_any", "links"):
+            for name in ("shrunk", "level", "peaks", "corners", "near_any"):
                 patch.setattr(front, name, getattr(reference, name))
+            patch.setattr(front, "links", linked.links)
             return function(*args)
 
     return run

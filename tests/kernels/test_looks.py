@@ -17,11 +17,14 @@ from rigkit.kernels import front
 def test_ratios_within_squares(step: int, dtype: type, rng: np.random.Generator) -> None:
     image: NDArray[Any] = rng.uniform(0.0, 255.0, (61, 84)).astype(dtype)
     image[1::2, ::2] = 0.7 * image[1::2, ::2]
-    ours, theirs = front.square_ratios(image, step, 12.0), reference.square_ratios(image, step, 12.0)
-    assert ours[1] == theirs[1] > 60
-    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-12)
-    assert ours[0].argmin() == 2
-    assert front.square_ratios(np.minimum(image, dtype(9)), step, 12.0)[1] == 0
+    for one in (image, np.asarray(255 - image, dtype), np.roll(image, 1)):
+        most = float(np.abs(reference.square_ratios(one, step, 12.0) - 1.0).max())
+        assert most > 0.01
+        # The median itself, and what is hardly more and hardly less.
+        for share in (0.0, 0.5 * most, most - 1e-12, most, most + 1e-12, 2.0 * most):
+            assert front.has_mosaic(one, step, 12.0, share) == reference.has_mosaic(one, step, 12.0, share)
+            assert front.has_mosaic(one, step, 12.0, share) == (share <= most)
+    assert not front.has_mosaic(np.minimum(image, dtype(9)), step, 12.0, 0.0)
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])

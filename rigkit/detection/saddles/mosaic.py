@@ -29,8 +29,7 @@ MIN_LEVELS = 12.0
 
 def without_mosaic(grey: GreyImage) -> GreyImage:
     """Return `grey` with the four places of its squares of 2 x 2 pixels on one scale; as it is where they are so."""
-    ratios, count = front.square_ratios(grey, _step(grey, GLANCE), MIN_LEVELS)
-    if count == 0 or float(np.abs(ratios - 1.0).max()) < MOSAIC_SHARE:
+    if not front.has_mosaic(grey, _step(grey, GLANCE), MIN_LEVELS, MOSAIC_SHARE):
         return grey
     values = _squares(grey, LOOK)
     mean = values.mean(axis=0)

@@ -8,6 +8,7 @@ its noise.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray
 from rigkit.core.arrays import GreyImage as GreyImage
 from rigkit.core.errors import InputError
 from rigkit.kernels import front
@@ -66,7 +66,7 @@ class Level:
     Attributes
     ----------
     smooth : (H, W) float32, 0..255.
-    thresholds : (bands, strips) float32, smallest D of a peak in each part of the level (`front.thresholds`).
+    thresholds : (bands, strips) float32, smallest D of a peak in each part of the level (`front.level`).
     scale, offset : full-resolution pixel = scale * level pixel + offset.
     """
 
@@ -74,10 +74,6 @@ class Level:
     thresholds: FloatImage
     scale: float
     offset: float
-
-    def to_full(self, pixels: FloatArray) -> FloatArray:
-        """Return pixels of this level in full-resolution pixels."""
-        return pixels * self.scale + self.offset
 
 
 def grey_image(image: NDArray[np.generic]) -> GreyImage:
@@ -141,8 +137,8 @@ def each_level(grey: GreyImage) -> Iterator[Level]:
     for _ in range(OCTAVES):
         if min(base.shape) < 16:
             return
-        smooth, base = front.smoothed(base, SMOOTH)
-        yield Level(smooth, _thresholds(smooth), float(scale), offset)
+        smooth, base, thresholds = front.level(base, _level_rules(), max(1, int(np.sqrt(base.size / TYPICAL))))
+        yield Level(smooth, thresholds, float(scale), offset)
         scale *= 2
 
 
@@ -153,13 +149,17 @@ def _shrunk(grey: GreyImage, factor: int) -> GreyImage:
     return front.shrunk(grey, factor)
 
 
-def _thresholds(smooth: FloatImage) -> FloatImage:
-    """Return the smallest D of a peak in each part of a level."""
-    step = max(1, int(np.sqrt(smooth.size / TYPICAL)))
-    response, darkest, brightest = front.typical(smooth, step, EXTREME)
-    contrast = (max(brightest - darkest, MIN_SPAN) / 200.0) ** 2
-    noise = min(NOISE_FACTOR * response, THRESHOLD_CEILING * contrast)
-    return front.thresholds(smooth, THRESHOLD_FLOOR * contrast, noise, darkest, brightest)
+@functools.cache
+def _level_rules() -> front.LevelRules:
+    """Return the constants of this module for the kernels."""
+    return front.LevelRules.make(
+        SMOOTH,
+        extreme=EXTREME,
+        least_span=MIN_SPAN,
+        noise_factor=NOISE_FACTOR,
+        floor=THRESHOLD_FLOOR,
+        ceiling=THRESHOLD_CEILING,
+    )
 
 
 def peaks(level: Level) -> tuple[NDArray[np.signedinteger], FloatImage]:

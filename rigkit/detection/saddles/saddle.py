@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import Level, peaks
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.kernels import front
@@ -27,6 +27,10 @@ KNOWN_PX = 2.0
 
 MAX_STEP = 1.5
 """A Newton step to the saddle that leads further than this from the peak of the response went wrong, level px."""
+
+
+NOWHERE: FloatArray = np.zeros((0, 2))
+"""The pixels of no corners."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -92,12 +96,11 @@ def find_corners(levels: Iterable[Level], finer: Corners | None = None) -> tuple
     smeared: list[BoolArray] = []
     saddles: list[FloatArray] = []
     for level in levels:
-        local, which, angles, contrast, moved = _corners_of(level)
-        full = level.to_full(local)
-        saddles.append(full)
-        own.append(Corners(full[which], angles, contrast, np.full(len(which), level.scale)))
-        smeared.append(moved)
-        kept.append(_without_known(own[-1], ~moved, kept))
+        found = _corners_of(level, kept)
+        saddles.append(found.saddles)
+        own.append(Corners(found.pixels, found.angles, found.contrast, np.full(len(found.pixels), level.scale)))
+        smeared.append(found.smeared)
+        kept.append(own[-1].of(~(found.smeared | found.repeated)))
     return joined(kept), Saddles(np.concatenate(saddles), tuple(own), tuple(smeared), tuple(kept))
 
 
@@ -109,11 +112,17 @@ def each_once(by_level: Iterable[Corners]) -> Corners:
     return joined(kept)
 
 
-def _corners_of(level: Level) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
-    """Return the saddles of `level` in its own pixels, and of those that are corners: which, angles, contrast, and
-    whether only motion explains their middle."""
-    at, response = peaks(level)
-    return front.corners(level.smooth, at, response, RING_RADIUS, MAX_STEP, MAX_SHARPNESS, ring_rules())
+def _corners_of(level: Level, known: Sequence[Corners]) -> front.CornersOfLevel:
+    """Return the saddles and corners of `level`; those that are `known`, of finer levels, are repeated."""
+    return front.corners(
+        level.smooth,
+        *peaks(level),
+        (RING_RADIUS, MAX_STEP, MAX_SHARPNESS),
+        ring_rules(),
+        (level.scale, level.offset),
+        np.concatenate([NOWHERE, *(k.pixels for k in known)]),
+        KNOWN_PX * level.scale,
+    )
 
 
 def _without_known(found: Corners, which: BoolArray, known: list[Corners]) -> Corners:

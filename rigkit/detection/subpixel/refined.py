@@ -96,5 +96,5 @@ class RefinedLattice:
 
     def _of(self, lattice: Lattice, values: Iterable[FloatArray]) -> RefinedLattice:
         """Return this of another lattice, with `values` as `_values`."""
-        sigma_px, blur_px, residual, noise = values
-        return replace(self, lattice=lattice, sigma_px=sigma_px, blur_px=blur_px, residual=residual, noise=noise)
+        # `replace` takes twice as long.
+        return RefinedLattice(lattice, *values, scatter=self.scatter, correlated=self.correlated, picture=self.picture)

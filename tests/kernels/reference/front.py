@@ -12,30 +12,32 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
-from rigkit.detection.lattice.links import (
-    ARM_COSINE,
-    ASIDE_LENGTHS,
-    CONTRAST_RATIO,
-    EDGE_PLACES,
-    LENGTH_RATIO,
-    MAX_ASIDE_PX,
-    MIN_ASIDE_PX,
-    MIN_EDGE_PLACES,
-    NEIGHBOURS,
-    Links,
-    _bounds,
-)
 from rigkit.detection.saddles import ring
-from rigkit.detection.saddles.response import FloatImage, GreyImage, Level, sample
-from rigkit.detection.saddles.ring import CIRCLE, GAINS, MAX_CENTRE, MAX_COSINE, MAX_ODD, _gains, arm_vectors
-from rigkit.detection.saddles.saddle import MAX_STEP, Corners
-from rigkit.kernels.front import HALF, STRIP, STRIP_ROWS, STRIPS_FROM, LinkRules, RingRules
+from rigkit.detection.saddles.response import (
+    EXTREME,
+    MIN_SPAN,
+    NOISE_FACTOR,
+    SMOOTH,
+    THRESHOLD_CEILING,
+    THRESHOLD_FLOOR,
+    FloatImage,
+    GreyImage,
+    sample,
+)
+from rigkit.detection.saddles.ring import CIRCLE, GAINS, MAX_CENTRE, MAX_COSINE, MAX_ODD, _gains
+from rigkit.detection.saddles.saddle import MAX_STEP
+from rigkit.kernels.front import (
+    HALF,
+    STRIP,
+    STRIP_ROWS,
+    STRIPS_FROM,
+    CornersOfLevel,
+    LevelRules,
+    RingRules,
+)
 
 QUICK = 4
 """Every so many samples of a ring are looked at before it is read."""
-
-NO_THRESHOLDS = np.zeros((0, 0), np.float32)
-"""Of a level whose peaks nobody asks for."""
 
 
 def shrunk(image: GreyImage, factor: int) -> FloatImage:
@@ -48,6 +50,14 @@ def shrunk(image: GreyImage, factor: int) -> FloatImage:
 def smoothed(image: GreyImage, kernel: FloatImage) -> tuple[FloatImage, FloatImage]:
     smooth = np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, kernel, kernel, borderType=cv2.BORDER_REPLICATE), np.float32)
     return smooth, np.ascontiguousarray(smooth[::2, ::2])
+
+
+def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[FloatImage, FloatImage, FloatImage]:
+    smooth, half = smoothed(image, SMOOTH)
+    usual, darkest, brightest = typical(smooth, step, EXTREME)
+    contrast = (max(brightest - darkest, MIN_SPAN) / 200.0) ** 2
+    noise = min(NOISE_FACTOR * usual, THRESHOLD_CEILING * contrast)
+    return smooth, half, thresholds(smooth, THRESHOLD_FLOOR * contrast, noise, darkest, brightest)
 
 
 def thresholds(smooth: FloatImage, floor: float, least: float, darkest: float, brightest: float) -> FloatImage:
@@ -95,39 +105,28 @@ def corners(
     smooth: FloatImage,
     at: IntArray,
     response: FloatImage,
-    radius: float,
-    most_step: float,
-    most_sharp: float,
+    tests: tuple[float, float, float],
     rules: RingRules,
-) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, BoolArray]:
+    to_full: tuple[float, float],
+    known: FloatArray,
+    reach: float,
+) -> CornersOfLevel:
+    radius, most_step, most_sharp = tests
     assert most_step == MAX_STEP and rules.most_odd == MAX_ODD
     found, near = saddle_step(smooth, at)
     found, response = found[near], response[near]
     which = np.flatnonzero(may_be_corners(smooth, found, radius, response))
     rings = read_rings(smooth, found[which], radius)
     good = rings.valid & (response[which] <= most_sharp * rings.contrast**2)
-    return found, which[good], rings.angles[good], rings.contrast[good], rings.smeared[good]
+    scale, offset = to_full
+    full = scale * found + offset
+    pixels = full[which[good]]
+    repeated = near_any(pixels, known, reach) if len(known) else np.zeros(len(pixels), np.bool_)
+    return CornersOfLevel(full, pixels, rings.angles[good], rings.contrast[good], rings.smeared[good], repeated)
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
     return np.asarray(cKDTree(known).query(fresh)[0] <= reach, dtype=np.bool_)
-
-
-def links(
-    pixels: FloatArray,
-    lines: FloatArray,
-    contrast: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-    reach: FloatArray,
-    image: FloatImage,
-    scale: float,
-    offset: float,
-    rules: LinkRules,
-) -> IntArray:
-    assert np.array_equal(bounds, _bounds(contrast)) and rules.neighbours == NEIGHBOURS
-    angles = np.arctan2(lines[..., 1], lines[..., 0])
-    given = Corners(pixels, angles, contrast, reach * scale / MAX_ASIDE_PX)
-    return _without_long(_mutual(given, Level(image, NO_THRESHOLDS, scale, offset)), pixels).reshape(-1, 4)
 
 
 def _response(smooth: FloatImage) -> FloatImage:
@@ -263,131 +262,3 @@ def _angles(image: FloatImage, pixels: FloatArray, radius: FloatImage, even: Flo
     half = 0.5 * np.arccos(np.clip(cosine, -MAX_COSINE, MAX_COSINE))
     first = (-0.5 * np.angle(phase) - half) % np.pi
     return np.stack([first, first + 2.0 * half], axis=-1)
-
-
-def edge_contrast(
-    image: FloatImage, start: FloatArray, end: FloatArray, sign: FloatArray, offset_px: FloatArray
-) -> FloatArray:
-    """Return how much brighter the expected side of the edges `start` -> `end` (M, 2) is, (M, 5) at EDGE_PLACES.
-
-    `sign` is +1 where brightness grows with the angle (from u to v) around the start; `offset_px` (M,) is how far from
-    the chord both sides are sampled.
-    """
-    chord = end - start
-    length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
-    normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
-    along = start[:, None] + EDGE_PLACES[:, None] * chord[:, None]
-    aside = (sign * offset_px)[:, None, None] * normal[:, None]
-    return np.asarray(sample(image, along + aside) - sample(image, along - aside), dtype=np.float64)
-
-
-def _mutual(corners: Corners, level: Level) -> IntArray:
-    """Return the mutual links, 4 * the neighbour + its arm, before the long ones are dropped; flat."""
-    count = len(corners)
-    start, arm, end, back, distance = _candidates(corners)
-    seen = _edge_seen(corners, level, start, arm, end)
-    start, arm, end, back, distance = start[seen], arm[seen], end[seen], back[seen], distance[seen]
-    state = 4 * start + arm
-    order = np.lexsort((distance, state))
-    state, first = np.unique(state[order], return_index=True)
-    chosen = order[first]
-    to = np.full(4 * count, -1)
-    to[state] = 4 * end[chosen] + back[chosen]
-    linked = np.flatnonzero(to >= 0)
-    mutual = linked[to[to[linked]] == linked]
-    both = np.full(4 * count, -1)
-    both[mutual] = to[mutual]
-    return both
-
-
-def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArray, FloatArray]:
-    """Return (start, its arm, end, its arm, distance) of the pairs whose arms point at each other."""
-    pixels = corners.pixels
-    length, other = _nearest_alike(pixels, corners.contrast)
-    chord_u = (pixels[other, 0] - pixels[:, :1]) / length
-    chord_v = (pixels[other, 1] - pixels[:, 1:]) / length
-    lines = arm_vectors(corners.angles)[:, :2]
-    along = [chord_u * lines[:, k, :1] + chord_v * lines[:, k, 1:] for k in (0, 1)]
-    ratio = corners.contrast[:, None] / corners.contrast[other]
-    alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO) & (other != np.arange(len(pixels))[:, None])
-    start, slot = np.nonzero(alike & ((np.abs(along[0]) > ARM_COSINE) | (np.abs(along[1]) > ARM_COSINE)))
-    end, distance = other[start, slot], length[start, slot]
-    arm = _arm(along[0][start, slot], along[1][start, slot])
-    chord = np.stack([chord_u[start, slot], chord_v[start, slot]], axis=-1)
-    home = -(lines[end] * chord[:, None]).sum(axis=2)
-    back = _arm(home[:, 0], home[:, 1])
-    good = (np.abs(home).max(axis=1) > ARM_COSINE) & ((arm + back) % 2 == 1)
-    return start[good], arm[good], end[good], back[good], distance[good]
-
-
-def _nearest_alike(pixels: FloatArray, contrast: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return distance and index of the NEIGHBOURS nearest corners of like contrast, (N, K); the corner itself fills up.
-
-    Noise makes hundreds of faint corners: they must not crowd out the neighbours of the clear ones. So each half octave
-    of contrast is looked up among those that it may be linked with.
-    """
-    near = min(NEIGHBOURS + 1, len(pixels))
-    length = np.ones((len(pixels), near))
-    other = np.repeat(np.arange(len(pixels))[:, None], near, axis=1)
-    least, most = _bounds(contrast)
-    for low in np.unique(least):
-        mine = np.flatnonzero(least == low)
-        pool = np.flatnonzero((contrast > low) & (contrast < most[mine[0]]))
-        distance, found = cKDTree(pixels[pool]).query(pixels[mine], k=np.arange(1, near + 1))
-        there = np.isfinite(distance)
-        length[mine] = np.where(there, np.maximum(distance, 1e-6), 1.0)
-        other[mine] = np.where(there, pool[np.where(there, found, 0)], mine[:, None])
-    return length, other
-
-
-def _arm(along_a: FloatArray, along_b: FloatArray) -> IntArray:
-    """Return the arm (A, B, -A, -B) that points most along, given the cosines to A and B."""
-    second = np.abs(along_b) > np.abs(along_a)
-    backwards = np.where(second, along_b, along_a) < 0.0
-    return second.astype(np.int64) + 2 * backwards.astype(np.int64)
-
-
-def to_level(level: Level, pixels: FloatArray) -> FloatArray:
-    """Return full-resolution `pixels` in pixels of the level."""
-    return (pixels - level.offset) / level.scale
-
-
-def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, end: IntArray) -> BoolArray:
-    """Return whether the edge between the corners is there, with the polarity of the arm."""
-    first, last = to_level(level, corners.pixels[start]), to_level(level, corners.pixels[end])
-    length = np.linalg.norm(last - first, axis=1)
-    offset = np.clip(ASIDE_LENGTHS * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
-    sign = np.where(arm % 2 == 0, 1.0, -1.0)
-    difference = edge_contrast(level.smooth, first, last, sign, offset)
-    weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])
-    return np.asarray((difference > weakest[:, None]).sum(axis=1) >= MIN_EDGE_PLACES, dtype=np.bool_)
-
-
-def _without_long(to: IntArray, pixels: FloatArray) -> IntArray:
-    """Drop links more than LENGTH_RATIO times as long as the link of the opposite arm."""
-    there = to >= 0
-    length = np.where(
-        there, np.linalg.norm(pixels[np.where(there, to, 0) // 4] - np.repeat(pixels, 4, axis=0), axis=1), 0
-    )
-    opposite = np.roll(length.reshape(-1, 4), 2, axis=1).ravel()
-    drop = there & (opposite > 0) & (length > LENGTH_RATIO * opposite)
-    out = to.copy()
-    out[to[drop]] = -1
-    out[drop] = -1
-    return out
-
-
-def quads(links: Links) -> BoolArray:
-    """Return which links (N, 4) bound a closed square of four corners, on either side."""
-    count = len(links.state)
-    there = links.state >= 0
-    state = links.state.ravel()
-    turned = np.where(there, 4 * links.corner + (links.arm - 1) % 4, -1).ravel()
-    start = np.arange(4 * count)
-    walk = start
-    for _ in range(4):
-        walk = np.where(walk >= 0, turned[walk], -1)
-    closed = (walk == start) & there.ravel()
-    other = np.zeros_like(closed)
-    other[state[closed]] = True
-    return np.asarray((closed | other).reshape(-1, 4), dtype=np.bool_)

@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from kernels.reference.front import NO_THRESHOLDS, edge_contrast, quads, read_rings, to_level
+from kernels.reference.front import read_rings
+from kernels.reference.links import NO_THRESHOLDS, edge_contrast, quads, to_level
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree

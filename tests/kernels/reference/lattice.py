@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from math import comb
 
 import numpy as np
-from kernels.reference.front import NO_THRESHOLDS, to_level
+from kernels.reference.links import NO_THRESHOLDS, to_level
 
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import Lattice

@@ -7,15 +7,18 @@ import numpy as np
 from rigkit.core.arrays import FloatArray, GreyImage, upper_median
 
 
-def square_ratios(image: GreyImage, step: int, least: float) -> tuple[FloatArray, int]:
+def square_ratios(image: GreyImage, step: int, least: float) -> FloatArray:
+    """Return the upper medians (4,) of how bright the pixels of bright squares are beside the mean of their square."""
     down, across = (side // 2 // step for side in image.shape)
     places = [image[v::2, u::2][: down * step : step, : across * step : step] for v in (0, 1) for u in (0, 1)]
     values = np.stack([part.astype(np.float64).ravel() for part in places])
     mean = values.mean(axis=0)
     bright = mean > max(upper_median(mean), least)
-    if not bright.any():
-        return np.ones(4), 0
-    return np.array([upper_median(own[bright] / mean[bright]) for own in values]), int(np.count_nonzero(bright))
+    return np.array([upper_median(own[bright] / mean[bright]) for own in values]) if bright.any() else np.ones(4)
+
+
+def has_mosaic(image: GreyImage, step: int, least: float, share: float) -> bool:
+    return bool(np.abs(square_ratios(image, step, least) - 1.0).max() >= share)
 
 
 def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
