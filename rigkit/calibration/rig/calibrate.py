@@ -57,8 +57,7 @@ def calibrate_rig(
     views : camera name -> (frame, view) pairs; what was taken at the same moment has the same frame.
     sizes_px : camera name -> (width, height).
     model, degree : as for `calibrate`, one for all cameras or one for each.
-    board : as for `calibrate`; where a camera alone finds boards that are warped or released, their shape is part of
-        the joint solution, one for all cameras.
+    board : as for `calibrate`; where a camera alone finds boards warped or released, their shape is solved for jointly.
     rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may be
         identified and oriented in any way; their arrangement sorts that out.
     known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
@@ -69,19 +68,13 @@ def calibrate_rig(
     Raises
     ------
     InputError
-        Fewer than two cameras and no rigid boards, cameras that share no board in any frame, a camera without views, or
-        rigid boards that are never seen together; two images of a frame by one camera; a camera without size or model;
-        an unknown pupil.
+        Fewer than two cameras and no rigid boards, cameras that share no board in any frame, rigid boards never seen
+        together; two images of a frame by one camera; a camera without views, size or model; an unknown pupil.
     DegenerateError
         As for `calibrate`, with the name of the camera; or the cameras disagree on most of what they share.
     """
     if not views or (len(views) < 2 and not rigid_boards):
         raise InputError(f"rig: {len(views)} camera; a rig has at least two, or boards that are mounted to each other")
-    _require_entries(views, sizes_px=sizes_px, model=model, degree=degree)
-    _require_one_image(views)
-    _require_known(views, sizes_px, known)
-    same = same_pictures(views)
-    require_known(pupil)
     options = _Options(
         sizes_px=sizes_px,
         model=model,
@@ -92,19 +85,28 @@ def calibrate_rig(
         pupil=pupil,
         begun=begun,
     )
+    _require_sound(views, options)
     every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
-        boards, alone = _boards(views, rigid_boards), every
-        every, notes = board_places(rigid_boards, alone, boards)
-        if board != "flat" and _renamed(alone.seen, every.seen):
-            # The boards' shapes were those of mixtures.
-            views = {n: [(e.frame, e.view) for e in own.values()] for n, own in zip(views, every.seen, strict=True)}
-            every, notes = board_places(rigid_boards, options.each_alone(views, progress), boards)
+        every, notes = _on_rigid_boards(every, views, rigid_boards, options, progress)
     with _mistakes_named(every):
         joint = solve_jointly(every, progress, known)
     rig, far = assemble_rig(joint, heldout_rms(joint, folds))
-    notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
+    notes = (*same_pictures(views), *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
     return replace(rig, verdicts=judge_rig(rig, far, notes, in_force=options.in_force))
+
+
+def _on_rigid_boards(
+    alone: RigViews, views: Views, groups: Sequence[Sequence[str]], options: _Options, progress: Progress
+) -> tuple[RigViews, tuple[Finding, ...]]:
+    """Return the views with boards identified and oriented by how they are mounted to each other, and what to say."""
+    boards = _boards(views, groups)
+    every, notes = board_places(groups, alone, boards)
+    if options.board != "flat" and _renamed(alone.seen, every.seen):
+        # The boards' shapes were those of mixtures.
+        views = {n: [(e.frame, e.view) for e in own.values()] for n, own in zip(views, every.seen, strict=True)}
+        every, notes = board_places(groups, options.each_alone(views, progress), boards)
+    return every, notes
 
 
 @contextmanager
@@ -124,6 +126,13 @@ def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
     return put_together_wrongly(views, mounts, left_out)
+
+
+def _require_sound(views: Views, options: _Options) -> None:
+    require_known(options.pupil)
+    _require_entries(views, sizes_px=options.sizes_px, model=options.model, degree=options.degree)
+    _require_one_image(views)
+    _require_known(views, options.sizes_px, options.known)
 
 
 def _require_entries(views: Views, **given: object) -> None:

@@ -39,7 +39,8 @@ def fitted_planes(
     return (
         plane,
         np.where(valid[..., None, None], normal, np.nan),
-        *(np.where(valid, v, np.nan) for v in (support, squares)),
+        np.where(valid, support, np.nan),
+        np.where(valid, squares, np.nan),
     )
 
 
