@@ -145,16 +145,21 @@ def _products(
         centre = calibration.near.seen((lever + centre).T).T - lever
     lever = turn @ lever
     x, y, z = lever + turn @ centre
-    by_point, by_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
-    u, v, valid = camera.derivatives(x, y, z, by_point, by_parameters)
+    d_pixels_d_point, d_pixels_d_parameters = np.zeros((2, 3, len(used))), np.zeros((2, len(sigmas), len(used)))
+    u, v, valid = camera.derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters)
     if fields is not None:
-        of_lens = by_parameters[:, : calibration.camera.parameters.size]
-        more = fields(np.concatenate([of_lens, turned_rays(np.stack([x, y, z]), by_point)], axis=1))
-        by_parameters, sigmas = np.concatenate([by_parameters, more], axis=1), np.append(sigmas, np.ones(more.shape[1]))
+        of_lens = d_pixels_d_parameters[:, : calibration.camera.parameters.size]
+        more = fields(np.concatenate([of_lens, turned_rays(np.stack([x, y, z]), d_pixels_d_point)], axis=1))
+        d_pixels_d_parameters, sigmas = (
+            np.concatenate([d_pixels_d_parameters, more], axis=1),
+            np.append(sigmas, np.ones(more.shape[1])),
+        )
     residuals = corners.residuals_px[used]
     # Corners that do not project tell nothing.
     told = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
-    rows = LensCorners.make(by_point, by_parameters, sigmas, lever, (u, v), residuals, told, count, camera.size_px)
+    rows = LensCorners.make(
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, (u, v), residuals, told, count, camera.size_px
+    )
     with_pose, out = rows.products()
     coupling = with_pose[:, POSE:]
     back = pose_inverses(with_pose[:, :POSE]) @ np.swapaxes(coupling, 1, 2)
@@ -162,12 +167,12 @@ def _products(
     return out, 2 * len(used) - POSE * len(count)
 
 
-def turned_rays(along: FloatArray, by_point: FloatArray) -> FloatArray:
+def turned_rays(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
     """Return d pixel / d W (2, 3, N) of a turn W of the rays to points `along` (3, N), from d pixel / d point there."""
-    out = np.empty_like(by_point)
+    out = np.empty_like(d_pixels_d_point)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        out[:, k] = along[i] * by_point[:, j] - along[j] * by_point[:, i]
+        out[:, k] = along[i] * d_pixels_d_point[:, j] - along[j] * d_pixels_d_point[:, i]
     return out
 
 

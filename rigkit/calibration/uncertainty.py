@@ -370,8 +370,8 @@ def pose_covariance_of_lens(
     points_in_cam, origin_in_cam, sigma_px : (N, 3) and (3,) the board's points and its origin, mm, and (N,) the
         standard deviations that weighted them.
     """
-    _, _, by_point, by_lens = camera.project_with_jacobians(points_in_cam)
-    by_pose = np.concatenate([-by_point @ skew(points_in_cam - origin_in_cam), by_point], axis=-1)
+    _, _, d_pixels_d_point, by_lens = camera.project_with_jacobians(points_in_cam)
+    by_pose = np.concatenate([-d_pixels_d_point @ skew(points_in_cam - origin_in_cam), d_pixels_d_point], axis=-1)
     weight, count = 1.0 / sigma_px[:, None, None], 2 * len(points_in_cam)
     step = np.linalg.lstsq((by_pose * weight).reshape(count, -1), (by_lens * weight).reshape(count, -1), rcond=None)[0]
     return np.asarray(step @ covariance @ step.T)

@@ -25,8 +25,8 @@ def fault_of_lens(camera: Camera) -> str | None:
     seen at all: by a ray that comes back to its pixel.
     """
     with np.errstate(all="ignore"):
-        pixels, valid, by_point, _ = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
-        scales = by_point[0, :, :2]
+        pixels, valid, d_pixels_d_point, _ = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))
+        scales = d_pixels_d_point[0, :, :2]
         if not valid[0] or not np.isfinite(scales).all() or not np.isfinite(pixels).all():
             return "its numbers overflow on the optical axis, as no lens's do"
         if np.abs(pixels).max() > MAX_SIDE_PX:

@@ -67,16 +67,16 @@ class ViewSums:
     def add(
         self,
         first: int,
-        by_point: FloatArray,
-        by_parameters: FloatArray,
+        d_pixels_d_point: FloatArray,
+        d_pixels_d_parameters: FloatArray,
         projected: tuple[FloatArray, FloatArray, BoolArray],
         lever: FloatArray,
     ) -> None:
-        """Add the views from `first` on, of N corners in all: `by_point` (2, 3, N), `by_parameters` (2, P, N) and what
-        `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
-        count, parameters = lever.shape[1], by_parameters.shape[1]
+        """Add the views from `first` on, of N corners in all: `d_pixels_d_point` (2, 3, N), `d_pixels_d_parameters`
+        (2, P, N) and what `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
+        count, parameters = lever.shape[1], d_pixels_d_parameters.shape[1]
         kernels().add_views(
-            *(self.seen, first, count, parameters, by_point, by_parameters, *projected, lever),
+            *(self.seen, first, count, parameters, d_pixels_d_point, d_pixels_d_parameters, *projected, lever),
             *(self._memory, self._struct),
         )
 

@@ -49,15 +49,15 @@ def _design(
     motion of the world."""
     turned = points @ cam_from_rig.rotation.T
     in_cam = turned + cam_from_rig.translation_mm
-    by_point = np.zeros((2, 3, len(points)))
-    by_parameters = np.zeros((2, camera.parameters.size, len(points)))
-    u, v, valid = camera.derivatives(in_cam[:, 0], in_cam[:, 1], in_cam[:, 2], by_point, by_parameters)
+    d_pixels_d_point = np.zeros((2, 3, len(points)))
+    d_pixels_d_parameters = np.zeros((2, camera.parameters.size, len(points)))
+    u, v, valid = camera.derivatives(in_cam[:, 0], in_cam[:, 1], in_cam[:, 2], d_pixels_d_point, d_pixels_d_parameters)
     seen = valid & camera.on_image(np.stack([u, v], axis=-1))
     if field_deg is not None:
         seen &= in_cam[:, 2] >= np.cos(np.radians(0.5 * field_deg)) * np.linalg.norm(in_cam, axis=-1)
-    slope = by_point[..., seen].transpose(2, 0, 1)
+    slope = d_pixels_d_point[..., seen].transpose(2, 0, 1)
     out = np.zeros((len(slope), 2, layout.count + 6))
-    out[..., layout.cameras[k]] = by_parameters[..., seen].transpose(2, 0, 1)
+    out[..., layout.cameras[k]] = d_pixels_d_parameters[..., seen].transpose(2, 0, 1)
     # x = exp(w) R X + t + v of the mount; R (exp(W) X + T) + t of the world.
     mount = layout.mounts[k]
     if mount is not None:

@@ -56,15 +56,15 @@ def test_a_displaced_camera_is_a_camera(name: str, rng: np.random.Generator) -> 
     assert camera.project(rays)[0] == pytest.approx(pixels, abs=1e-8)
     assert np.abs(camera.project(rays)[0] - lens(name).project(rays)[0]).max() > 1.0
     points = rays * rng.uniform(300.0, 900.0, (len(rays), 1))
-    _, _, by_point, by_parameters = camera.project_with_jacobians(points)
+    _, _, d_pixels_d_point, d_pixels_d_parameters = camera.project_with_jacobians(points)
     for k in range(3):
         step = 1e-3 * np.eye(3)[k]
         moved = (camera.project(points + step)[0] - camera.project(points - step)[0]) / 2e-3
-        assert by_point[..., k] == pytest.approx(moved, abs=1e-6)
+        assert d_pixels_d_point[..., k] == pytest.approx(moved, abs=1e-6)
     for k, value in enumerate(camera.parameters):
         change = 1e-6 * max(abs(float(value)), 1.0) * np.eye(camera.parameters.size)[k]
         one, two = (camera.with_parameters(camera.parameters + s * change).project(points)[0] for s in (1.0, -1.0))
-        assert by_parameters[..., k] == pytest.approx((one - two) / (2.0 * change[k]), rel=1e-5, abs=1e-5)
+        assert d_pixels_d_parameters[..., k] == pytest.approx((one - two) / (2.0 * change[k]), rel=1e-5, abs=1e-5)
     as_lens = displaced(name, amounts=(0.0, 0.0))
     assert (as_lens.project(points)[0] == lens(name).project(points)[0]).all()
     assert (as_lens.unproject(pixels)[0] == lens(name).unproject(pixels)[0]).all()

@@ -44,17 +44,17 @@ def test_a_point_lies_on_the_ray_of_its_pixel_which_starts_at_the_pupil(name: st
 def test_derivatives_are_those_of_the_projection(name: str, rng: np.random.Generator) -> None:
     near = NearCamera.of(sample_cameras()[name], PUPIL)
     points = points_before(near, rng)
-    _, _, by_point, by_parameters = near.project_with_jacobians(points)
+    _, _, d_pixels_d_point, d_pixels_d_parameters = near.project_with_jacobians(points)
     for k in range(3):
         step = 1e-4 * np.eye(3)[k]
         found = (near.project(points + step)[0] - near.project(points - step)[0]) / 2e-4
-        np.testing.assert_allclose(by_point[..., k], found, atol=1e-6 * np.abs(by_point).max())
+        np.testing.assert_allclose(d_pixels_d_point[..., k], found, atol=1e-6 * np.abs(d_pixels_d_point).max())
     for k in (-2, -1):
         step = np.zeros(near.parameters.size)
         step[k] = 1e-4
         more, less = (near.with_parameters(near.parameters + sign * step) for sign in (1.0, -1.0))
         found = (more.project(points)[0] - less.project(points)[0]) / 2e-4
-        np.testing.assert_allclose(by_parameters[..., k], found, atol=1e-6 * np.abs(found).max())
+        np.testing.assert_allclose(d_pixels_d_parameters[..., k], found, atol=1e-6 * np.abs(found).max())
 
 
 def test_far_away_it_is_the_lens(rng: np.random.Generator) -> None:

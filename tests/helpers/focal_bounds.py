@@ -38,8 +38,8 @@ def focal_sigmas(name: str, corners_px: float, images_px: float, seed: int) -> F
     information, normal, scatter = np.zeros((p, p)), np.zeros((p, p)), np.zeros((p, p))
     for rotation, translation in zip(rotations, translations, strict=True):
         turned = BOARD.points() @ rotation.T
-        _, _, by_point, by_camera = camera.project_with_jacobians(turned + translation)
-        by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=2).reshape(-1, 6)
+        _, _, d_pixels_d_point, by_camera = camera.project_with_jacobians(turned + translation)
+        by_pose = np.concatenate([-d_pixels_d_point @ skew(turned), d_pixels_d_point], axis=2).reshape(-1, 6)
         by_lens = by_camera.reshape(len(noise), -1)
         left = _without(whiten @ by_lens, whiten @ by_pose)
         information += left.T @ left

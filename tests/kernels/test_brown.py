@@ -20,7 +20,7 @@ def test_pixels_and_derivatives_are_as_defined(count: int, within: bool, rng: np
     larger arrays; without parameters where only the points matter."""
     points = rng.normal(size=(200, 3)) * [0.5, 0.5, 0.4] + [0.0, 0.0, 0.6]
     points[7] = np.nan
-    pixels, valid, by_point, by_parameters = reference.derivatives(points, PARAMETERS[:count], 0.9)
+    pixels, valid, d_pixels_d_point, d_pixels_d_parameters = reference.derivatives(points, PARAMETERS[:count], 0.9)
     assert 0.2 < valid.mean() < 0.9
     margin = 2 if within else 0
     one, other = np.zeros((2, 3 + margin, 200)), np.zeros((2, count + margin, 200))
@@ -30,8 +30,8 @@ def test_pixels_and_derivatives_are_as_defined(count: int, within: bool, rng: np
     assert (seen == valid).all()
     for found, expected in (
         (np.stack([u, v], axis=-1), pixels),
-        (np.moveaxis(d_point, -1, 0), by_point),
-        (np.moveaxis(d_parameters, -1, 0), by_parameters),
+        (np.moveaxis(d_point, -1, 0), d_pixels_d_point),
+        (np.moveaxis(d_parameters, -1, 0), d_pixels_d_parameters),
     ):
         np.testing.assert_allclose(found[valid], expected[valid], rtol=ROUNDING, atol=ROUNDING)
     assert not one[:, :margin].any() and not other[:, :margin].any()

@@ -49,14 +49,18 @@ def test_products_are_as_defined(parameters: int, rng: np.random.Generator) -> N
     """Views of fewer and of more corners than are worked on at a time, with some that tell nothing, NaN among them."""
     counts = np.array([1, 31, 32, 33, 140])
     count = int(counts.sum())
-    by_point, by_parameters = rng.normal(size=(2, 3, count)), rng.normal(size=(2, parameters, count))
+    d_pixels_d_point, d_pixels_d_parameters = rng.normal(size=(2, 3, count)), rng.normal(size=(2, parameters, count))
     lever, pixels = rng.normal(size=(3, count)), rng.uniform(0.0, 640.0, (count, 2))
     residuals, sigmas, told = rng.normal(size=(count, 2)), rng.uniform(0.1, 2.0, parameters), rng.random(count) < 0.8
-    residuals[~told] = by_point[..., ~told] = np.nan
+    residuals[~told] = d_pixels_d_point[..., ~told] = np.nan
     uv = (pixels[:, 0], pixels[:, 1])
-    corners = LensCorners.make(by_point, by_parameters, sigmas, lever, uv, residuals, told, counts, SIZE)
+    corners = LensCorners.make(
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, uv, residuals, told, counts, SIZE
+    )
     ours = corners.products()
     view = np.repeat(np.arange(len(counts)), counts)
-    theirs = reference.products(by_point, by_parameters, sigmas, lever, pixels, residuals, told, view, SIZE)
+    theirs = reference.products(
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, pixels, residuals, told, view, SIZE
+    )
     for one, other in zip(ours, theirs, strict=True):
         assert np.abs(one - other).max() < ROUNDING * np.abs(other).max()

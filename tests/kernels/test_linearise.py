@@ -38,11 +38,11 @@ def test_sums_are_as_defined(
     }
     sizes = {"views": VIEWS, "corners": CORNERS, "points": POINTS, "warps": warps, "released": released}
     views = BoardViews.of(**seen, **sizes)
-    by_point, by_parameters = (rng.normal(size=(VIEWS, CORNERS, 2, k)) for k in (3, parameters))
+    d_pixels_d_point, d_pixels_d_parameters = (rng.normal(size=(VIEWS, CORNERS, 2, k)) for k in (3, parameters))
     pixels, valid = rng.normal(size=(VIEWS, CORNERS, 2)), rng.random((VIEWS, CORNERS)) < 0.9
-    by_point[~valid] = np.nan
+    d_pixels_d_point[~valid] = np.nan
     pixels[~valid] = np.nan
-    theirs = reference.sums(seen, by_point, by_parameters, pixels, valid)
+    theirs = reference.sums(seen, d_pixels_d_point, d_pixels_d_parameters, pixels, valid)
     lever_points = reference.placed(seen["rotation"], seen["translation"], seen["table"][seen["point"]])
     ours = ViewSums.of(views, parameters + warps + 7)
     for block in (slice(0, 2), slice(2, 3)):
@@ -51,7 +51,7 @@ def test_sums_are_as_defined(
             np.testing.assert_allclose(one, other[block].reshape(-1, 3).T, rtol=ROUNDING, atol=ROUNDING)
         d_point, d_parameters = (
             np.ascontiguousarray(np.moveaxis(by[block].reshape(-1, *by.shape[2:]), 0, -1))
-            for by in (by_point, by_parameters)
+            for by in (d_pixels_d_point, d_pixels_d_parameters)
         )
         u, v = pixels[block].reshape(-1, 2).T
         ours.add(block.start, d_point, d_parameters, (u, v, valid[block].ravel()), lever)

@@ -23,12 +23,14 @@ def test_pixels_and_derivatives_are_as_defined(model: str, rng: np.random.Genera
     points[7] = np.nan
     if model == "scaramuzza":
         given, limits, linear = POLYNOMIAL, (0.0, 760.0), LINEAR
-        pixels, valid, by_point, by_parameters = reference.scaramuzza(points, given, linear, limits[1])
+        pixels, valid, d_pixels_d_point, d_pixels_d_parameters = reference.scaramuzza(points, given, linear, limits[1])
     else:
         given, limits, linear = K, (2.1, 0.0), LINEAR * [380.0, 0.0, 377.0, 1.0, 1.0]
-        pixels, valid, by_point, by_parameters = reference.kannala_brandt(points, given, linear, limits[0])
+        pixels, valid, d_pixels_d_point, d_pixels_d_parameters = reference.kannala_brandt(
+            points, given, linear, limits[0]
+        )
     assert 0.5 < valid.mean() < 0.95
-    d_point, d_parameters = np.zeros((2, 3, 300)), np.zeros((2, by_parameters.shape[-1], 300))
+    d_point, d_parameters = np.zeros((2, 3, 300)), np.zeros((2, d_pixels_d_parameters.shape[-1], 300))
     x, y, z = points.T
     l00, l01, l11, cx, cy = linear.tolist()
     camera = model, (x, y, z), given, (l00, l01, l11, cx, cy), limits
@@ -37,8 +39,8 @@ def test_pixels_and_derivatives_are_as_defined(model: str, rng: np.random.Genera
     size = np.linalg.norm(points, axis=1)[:, None, None]
     for found, expected in (
         (np.stack([u, v], axis=-1), pixels),
-        (np.moveaxis(d_point, -1, 0) * size, by_point * size),
-        (np.moveaxis(d_parameters, -1, 0), by_parameters),
+        (np.moveaxis(d_point, -1, 0) * size, d_pixels_d_point * size),
+        (np.moveaxis(d_parameters, -1, 0), d_pixels_d_parameters),
     ):
         np.testing.assert_allclose(found[valid], expected[valid], rtol=10.0 * ROUNDING, atol=ROUNDING)
     np.testing.assert_array_equal(radial_pixels(*camera), (u, v, seen))

@@ -68,8 +68,8 @@ def _best_turn(state: State, rays: np.ndarray, pixels: np.ndarray) -> np.ndarray
     """Return the rotation of the rays after which the camera of `state` projects them nearest to the pixels."""
     turn = np.eye(3)
     for _ in range(3):
-        found, valid, by_point, _ = state.camera.project_with_jacobians(rays @ turn.T)
-        design = np.cross((rays @ turn.T)[:, None], by_point)[valid].reshape(-1, 3)
+        found, valid, d_pixels_d_point, _ = state.camera.project_with_jacobians(rays @ turn.T)
+        design = np.cross((rays @ turn.T)[:, None], d_pixels_d_point)[valid].reshape(-1, 3)
         turn = exp_so3(np.linalg.lstsq(design, (pixels - found)[valid].reshape(-1), rcond=None)[0]) @ turn
     return turn
 

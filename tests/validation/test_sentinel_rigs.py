@@ -170,8 +170,8 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     for _ in range(4):
         rows, left = [], []
         for camera, pose, pixels in zip(watched.cameras, watched.cam_from_rig, shown, strict=True):
-            projected, _, by_point, _ = camera.project_with_jacobians(pose.apply(found))
-            rows.append(by_point @ pose.rotation)
+            projected, _, d_pixels_d_point, _ = camera.project_with_jacobians(pose.apply(found))
+            rows.append(d_pixels_d_point @ pose.rotation)
             left.append(pixels - projected)
         J, r = np.concatenate(rows, axis=-2)[seen], np.concatenate(left, axis=-1)[seen]
         JT = np.swapaxes(J, -1, -2)

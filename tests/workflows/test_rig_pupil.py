@@ -159,8 +159,8 @@ def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, save
         for _ in range(6):
             rows, residuals = [], []
             for camera, moved, pixels in zip(cameras, (Rigid3.identity(), pose), seen, strict=True):
-                shown, _, by_point, _ = camera.project_with_jacobians(moved.apply(points))
-                rows.append(by_point @ moved.rotation)
+                shown, _, d_pixels_d_point, _ = camera.project_with_jacobians(moved.apply(points))
+                rows.append(d_pixels_d_point @ moved.rotation)
                 residuals.append(pixels - shown)
             step = np.linalg.pinv(np.concatenate(rows, axis=1)) @ np.concatenate(residuals, axis=1)[..., None]
             points = points + step[..., 0]

@@ -184,10 +184,12 @@ def _turned(calibration: Calibration, evidence: ViewEvidence, second: BoolArray)
     follow = across @ evidence.common_covariance()
     step = _best_steps(own, across, follow, along, second[None])[0][0]
     common = -np.tensordot(second.astype(np.float64), follow, axes=1).T @ step
-    by_point, by_parameter = np.zeros((2, 3, 1)), np.zeros((2, len(step), 1))
-    u, v, _ = calibration.near.derivatives(np.zeros(1), np.zeros(1), np.ones(1), by_point, by_parameter)
-    one = np.array([u[0], v[0]]) + by_parameter[..., 0] @ common[: len(step)]
-    way = by_parameter[..., 0] @ step
+    d_pixels_d_point, d_pixels_d_parameters = np.zeros((2, 3, 1)), np.zeros((2, len(step), 1))
+    u, v, _ = calibration.near.derivatives(
+        np.zeros(1), np.zeros(1), np.ones(1), d_pixels_d_point, d_pixels_d_parameters
+    )
+    one = np.array([u[0], v[0]]) + d_pixels_d_parameters[..., 0] @ common[: len(step)]
+    way = d_pixels_d_parameters[..., 0] @ step
     apart = max(float(np.linalg.norm(way)), MIN_APART_PX)
     # Half a turn, and each mirror, takes a principal point through the middle of the picture.
     off = 2.0 * one + way - (np.array(calibration.camera.size_px) - 1.0)

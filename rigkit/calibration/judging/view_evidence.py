@@ -189,8 +189,8 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
     p = calibration.near.parameters.size
     rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
-    by_point = rows[:, 3:6]
-    u, v, valid = calibration.near.derivatives(in_cam[0], in_cam[1], in_cam[2], by_point, rows[:, 6 : 6 + p])
+    d_pixels_d_point = rows[:, 3:6]
+    u, v, valid = calibration.near.derivatives(in_cam[0], in_cam[1], in_cam[2], d_pixels_d_point, rows[:, 6 : 6 + p])
     pixels = np.where(valid, [u, v], np.nan)
     lever, flat = centred(turned), centred(points[:2])
     x, y = flat / np.maximum.reduceat(np.abs(flat).max(axis=0), start)[view]
@@ -198,10 +198,10 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     along_u, along_v = centred(pixels) / np.array(calibration.camera.size_px)[:, None]
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
-        np.multiply(lever[i], by_point[:, j], out=rows[:, k])
-        rows[:, k] -= lever[j] * by_point[:, i]
+        np.multiply(lever[i], d_pixels_d_point[:, j], out=rows[:, k])
+        rows[:, k] -= lever[j] * d_pixels_d_point[:, i]
     ways = {name: rows[:, way] for name, way in columns_of(rows.shape[1]).items()}
-    out_of_plane = (by_point * rotation[:, 2]).sum(axis=1)
+    out_of_plane = (d_pixels_d_point * rotation[:, 2]).sum(axis=1)
     for k, bow in enumerate((x * x, x * y, y * y)):
         np.multiply(out_of_plane, bow, out=ways["bend"][:, k])
     np.subtract(pixels, centre[:, None], out=ways["focus"][:, 0])

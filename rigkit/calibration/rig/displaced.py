@@ -62,14 +62,16 @@ def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatA
     """Return the weighted products of the modes with the derivatives by the parameters (P, M), and with those by the
     pose of each view (V, 6, M)."""
     points, lever = alone.points_in_cam(own)
-    pixels, valid, by_point, by_parameters = alone.camera.project_with_jacobians(points)
+    pixels, valid, d_pixels_d_point, d_pixels_d_parameters = alone.camera.project_with_jacobians(points)
     used = valid & (weight > 0.0)
     moved = np.zeros((*used.shape, 2, modes.shape[1]))
     moved[used] = (displacements(pixels[used], alone.camera.size_px).transpose(2, 0, 1) @ modes) * (
         weight[used, None, None] ** 2
     )
-    by_point, by_parameters = (np.where(used[..., None, None], by, 0.0) for by in (by_point, by_parameters))
-    by_view = np.concatenate([-by_point @ skew(lever), by_point], axis=-1)
+    d_pixels_d_point, d_pixels_d_parameters = (
+        np.where(used[..., None, None], by, 0.0) for by in (d_pixels_d_point, d_pixels_d_parameters)
+    )
+    by_view = np.concatenate([-d_pixels_d_point @ skew(lever), d_pixels_d_point], axis=-1)
     views, count = len(weight), modes.shape[1]
     of_views = np.swapaxes(by_view.reshape(views, -1, 6), 1, 2) @ moved.reshape(views, -1, count)
-    return by_parameters.reshape(-1, by_parameters.shape[-1]).T @ moved.reshape(-1, count), of_views
+    return d_pixels_d_parameters.reshape(-1, d_pixels_d_parameters.shape[-1]).T @ moved.reshape(-1, count), of_views

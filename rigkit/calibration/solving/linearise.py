@@ -36,13 +36,19 @@ def normal_equations(
     count = parameters + shape.basis.shape[-1]
     sums = ViewSums.of(_board_views(observations, state, weight, loss_px), count + 7)
     step = max(1, CORNERS_AT_A_TIME // max(corners, 1))
-    by_point = by_parameters = np.empty((2, 0, 0))
+    d_pixels_d_point = d_pixels_d_parameters = np.empty((2, 0, 0))
     for first in range(0, views, step):
         lever, points = sums.seen.placed(first, min(first + step, views))
-        if by_point.shape[-1] != lever.shape[-1]:
-            by_point, by_parameters = observations.workspace.derivatives(parameters, lever.shape[-1])
+        if d_pixels_d_point.shape[-1] != lever.shape[-1]:
+            d_pixels_d_point, d_pixels_d_parameters = observations.workspace.derivatives(parameters, lever.shape[-1])
         x, y, z = points
-        sums.add(first, by_point, by_parameters, camera.derivatives(x, y, z, by_point, by_parameters), lever)
+        sums.add(
+            first,
+            d_pixels_d_point,
+            d_pixels_d_parameters,
+            camera.derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters),
+            lever,
+        )
     products, shared = sums.products, sums.products[:, :count].sum(axis=0)
     normal = NormalEquations(
         gg=shared[:, :count],

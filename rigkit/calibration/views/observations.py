@@ -31,9 +31,9 @@ class Workspace:
         size = 2 * (3 + parameters) * corners
         if self._memory.size < size:
             self._memory = np.empty(size)
-        by_point, by_parameters = self._memory[: 6 * corners], self._memory[6 * corners : size]
-        by_parameters.fill(0.0)
-        return by_point.reshape(2, 3, corners), by_parameters.reshape(2, parameters, corners)
+        d_pixels_d_point, d_pixels_d_parameters = self._memory[: 6 * corners], self._memory[6 * corners : size]
+        d_pixels_d_parameters.fill(0.0)
+        return d_pixels_d_point.reshape(2, 3, corners), d_pixels_d_parameters.reshape(2, parameters, corners)
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

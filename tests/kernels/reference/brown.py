@@ -27,13 +27,13 @@ def derivatives(
     by_plane = np.stack([2 * p1 * y + 6 * p2 * x, cross, cross, 6 * p1 * y + 2 * p2 * x], axis=-1).reshape(-1, 2, 2)
     by_plane += (a / b)[:, None, None] * np.eye(2) + 2.0 * slope[:, None, None] * plane[:, :, None] * plane[:, None]
     rays = np.stack([1.0 / z, 0.0 * z, -x / z, 0.0 * z, 1.0 / z, -y / z], axis=-1).reshape(-1, 2, 3)
-    by_point = focal[:, None] * (by_plane @ rays)
-    by_parameters = np.zeros((len(t), 2, 12))
-    by_parameters[:, [0, 1], [0, 1]] = (pixels - [cx, cy]) / focal
-    by_parameters[:, [0, 1], [2, 3]] = 1.0
-    by_parameters[:, :, 6] = focal * np.stack([2 * x * y, t + 2 * y * y], axis=-1)
-    by_parameters[:, :, 7] = focal * np.stack([t + 2 * x * x, 2 * x * y], axis=-1)
+    d_pixels_d_point = focal[:, None] * (by_plane @ rays)
+    d_pixels_d_parameters = np.zeros((len(t), 2, 12))
+    d_pixels_d_parameters[:, [0, 1], [0, 1]] = (pixels - [cx, cy]) / focal
+    d_pixels_d_parameters[:, [0, 1], [2, 3]] = 1.0
+    d_pixels_d_parameters[:, :, 6] = focal * np.stack([2 * x * y, t + 2 * y * y], axis=-1)
+    d_pixels_d_parameters[:, :, 7] = focal * np.stack([t + 2 * x * x, 2 * x * y], axis=-1)
     for power, top, bottom in zip(powers, (4, 5, 8), (9, 10, 11), strict=True):
-        by_parameters[:, :, top] = focal * plane * (power / b)[:, None]
-        by_parameters[:, :, bottom] = -(a / b)[:, None] * by_parameters[:, :, top]
-    return pixels, (z > 0.0) & (t <= max_r**2), by_point, by_parameters[..., : parameters.size]
+        d_pixels_d_parameters[:, :, top] = focal * plane * (power / b)[:, None]
+        d_pixels_d_parameters[:, :, bottom] = -(a / b)[:, None] * d_pixels_d_parameters[:, :, top]
+    return pixels, (z > 0.0) & (t <= max_r**2), d_pixels_d_point, d_pixels_d_parameters[..., : parameters.size]

@@ -16,22 +16,30 @@ def placed(rotation: FloatArray, translation: FloatArray, board: FloatArray) -> 
 
 
 def rows_of_corner(
-    by_point: FloatArray, by_parameters: FloatArray, rotation: FloatArray, warp: FloatArray, lever: FloatArray
+    d_pixels_d_point: FloatArray,
+    d_pixels_d_parameters: FloatArray,
+    rotation: FloatArray,
+    warp: FloatArray,
+    lever: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rows (2, K - 1) of a corner and its derivatives by the board's point (2, 3)."""
-    by_board = by_point @ rotation
-    turn = np.cross(lever, by_point)
-    return np.concatenate([by_parameters, by_board @ warp, turn, by_point], axis=1), by_board
+    by_board = d_pixels_d_point @ rotation
+    turn = np.cross(lever, d_pixels_d_point)
+    return np.concatenate([d_pixels_d_parameters, by_board @ warp, turn, d_pixels_d_point], axis=1), by_board
 
 
 def sums(
-    seen: dict[str, Any], by_point: FloatArray, by_parameters: FloatArray, pixels: FloatArray, valid: BoolArray
+    seen: dict[str, Any],
+    d_pixels_d_point: FloatArray,
+    d_pixels_d_parameters: FloatArray,
+    pixels: FloatArray,
+    valid: BoolArray,
 ) -> dict[str, FloatArray]:
     """Return residuals, costs and products by their names in api.h, from derivatives (V, C, 2, .) and pixels (V, C, 2)
     of the corners."""
     point: IntArray = seen["point"]
     views, corners = point.shape
-    across = by_parameters.shape[-1] + seen["warp"].shape[-1] + 7
+    across = d_pixels_d_parameters.shape[-1] + seen["warp"].shape[-1] + 7
     count = int(seen["place"].max(initial=-1)) + 1
     lever, _ = placed(seen["rotation"], seen["translation"], seen["table"][point])
     out = {
@@ -53,7 +61,7 @@ def sums(
             continue
         j = point[v, c]
         rows, by_board = rows_of_corner(
-            by_point[v, c], by_parameters[v, c], seen["rotation"][v], seen["warp"][j], lever[v, c]
+            d_pixels_d_point[v, c], d_pixels_d_parameters[v, c], seen["rotation"][v], seen["warp"][j], lever[v, c]
         )
         rows = weight * np.concatenate([rows, residual[:, None]], axis=1)
         out["products"][v] += rows.T @ rows

@@ -21,12 +21,12 @@ def kannala_brandt(points: FloatArray, shape: FloatArray, linear: FloatArray, ma
     powers = theta ** np.arange(3, 11, 2)[:, None]
     slope = 1.0 + shape @ (np.arange(3, 11, 2)[:, None] * powers / theta)
     radius = theta + shape @ powers
-    pixels, by_point, along = _differentiated(points, linear, radius, slope * z / length2, -slope * r / length2)
-    by_parameters = np.zeros((len(points), 2, 8))
-    by_parameters[:, [0, 1], [0, 1]] = radius[:, None] * points[:, :2] / r[:, None]
-    by_parameters[:, [0, 1], [2, 3]] = 1.0
-    by_parameters[:, :, 4:] = along[:, :, None] * powers.T[:, None]
-    return pixels, theta <= max_angle, by_point, by_parameters
+    pixels, d_pixels_d_point, along = _differentiated(points, linear, radius, slope * z / length2, -slope * r / length2)
+    d_pixels_d_parameters = np.zeros((len(points), 2, 8))
+    d_pixels_d_parameters[:, [0, 1], [0, 1]] = radius[:, None] * points[:, :2] / r[:, None]
+    d_pixels_d_parameters[:, [0, 1], [2, 3]] = 1.0
+    d_pixels_d_parameters[:, :, 4:] = along[:, :, None] * powers.T[:, None]
+    return pixels, theta <= max_angle, d_pixels_d_point, d_pixels_d_parameters
 
 
 def scaramuzza(points: FloatArray, polynomial: FloatArray, linear: FloatArray, max_radius: float) -> Derivatives:
@@ -41,14 +41,14 @@ def scaramuzza(points: FloatArray, polynomial: FloatArray, linear: FloatArray, m
     f, slope = np.polyval(polynomial[::-1], radius), np.polyval(np.polyder(polynomial[::-1]), radius)
     # z d rho + rho dz = f dr + r f' d rho + r rho^k d a_k.
     by_rho = z - r * slope
-    pixels, by_point, along = _differentiated(points, linear, radius, f / by_rho, -radius / by_rho)
+    pixels, d_pixels_d_point, along = _differentiated(points, linear, radius, f / by_rho, -radius / by_rho)
     n = len(polynomial) - 1
-    by_parameters = np.zeros((len(points), 2, n + 4))
+    d_pixels_d_parameters = np.zeros((len(points), 2, n + 4))
     powers = radius ** np.array([0, *range(2, n + 1)])[:, None] * (r / by_rho)
-    by_parameters[:, :, :n] = along[:, :, None] * powers.T[:, None]
-    by_parameters[:, [0, 1], [n, n + 1]] = 1.0
-    by_parameters[:, 0, n + 2 :] = radius[:, None] * points[:, :2] / r[:, None]
-    return pixels, valid, by_point, by_parameters
+    d_pixels_d_parameters[:, :, :n] = along[:, :, None] * powers.T[:, None]
+    d_pixels_d_parameters[:, [0, 1], [n, n + 1]] = 1.0
+    d_pixels_d_parameters[:, 0, n + 2 :] = radius[:, None] * points[:, :2] / r[:, None]
+    return pixels, valid, d_pixels_d_point, d_pixels_d_parameters
 
 
 def _differentiated(
@@ -61,5 +61,5 @@ def _differentiated(
     towards = points[:, :2] / r[:, None]
     across = np.eye(2) - towards[:, :, None] * towards[:, None]
     by_xy = (radius / r)[:, None, None] * across + by_r[:, None, None] * towards[:, :, None] * towards[:, None]
-    by_point = np.concatenate([L @ by_xy, (towards @ L.T * by_z[:, None])[:, :, None]], axis=-1)
-    return radius[:, None] * (towards @ L.T) + [cx, cy], by_point, towards @ L.T
+    d_pixels_d_point = np.concatenate([L @ by_xy, (towards @ L.T * by_z[:, None])[:, :, None]], axis=-1)
+    return radius[:, None] * (towards @ L.T) + [cx, cy], d_pixels_d_point, towards @ L.T
