@@ -65,8 +65,12 @@ def interruption(error: BaseException) -> KeyboardInterrupt | None:
     """Return the interruption that `error` came of; None where it came of something else. Libraries that are
     interrupted while they are loaded say that they could not be."""
     cause: BaseException | None = error
+    # An error that is raised again from one that came of it is among its own causes.
+    seen: set[int] = set()
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
-        cause = cause.__cause__ or cause.__context__
+        seen.add(id(cause))
+        further = (cause.__cause__, cause.__context__)
+        cause = next((one for one in further if one is not None and id(one) not in seen), None)
     return cause
 
 

@@ -180,6 +180,19 @@ def test_a_library_interrupted_while_it_is_loaded(
         _attempt(work, job)
 
 
+def test_an_error_among_its_own_causes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its causes are not followed for ever."""
+    first, second = InputError("a.json: it is empty; write it again"), ValueError("empty")
+
+    def work(_: object) -> int:
+        second.__cause__ = first
+        raise first from second
+
+    monkeypatch.setattr(diff, "run", work)
+    assert main(["diff", "a.json", "b.json"]) == first.exit_code
+    assert capsys.readouterr().err == "rigkit: a.json: it is empty; write it again\n"
+
+
 def test_an_interrupted_pool_leaves_no_thread() -> None:
     """Python itself stumbles at its end over the thread of a pool that closes just then."""
     before = set(threading.enumerate())
