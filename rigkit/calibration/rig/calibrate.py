@@ -86,13 +86,14 @@ def calibrate_rig(
         begun=begun,
     )
     _require_sound(views, options)
+    same = same_pictures(views)
     every, notes = options.each_alone(views, progress), tuple[Finding, ...]()
     if rigid_boards:
         every, notes = _on_rigid_boards(every, views, rigid_boards, options, progress)
     with _mistakes_named(every):
         joint = solve_jointly(every, progress, known)
     rig, far = assemble_rig(joint, heldout_rms(joint, folds))
-    notes = (*same_pictures(views), *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
+    notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
     return replace(rig, verdicts=judge_rig(rig, far, notes, in_force=options.in_force))
 
 
