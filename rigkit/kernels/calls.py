@@ -73,7 +73,7 @@ class _Checks:
         ready = [f"{name} = _ready('{name}', {name}, {array.shape})" for name, array in self._arrays.items()]
         checked = [self._passed(name, "_address({0})") for name in self.names]
         # A structure keeps alive what it points to; a function is done with it when it returns.
-        keep = f"out._ready = ({''.join(f'{name}, ' for name in self._arrays)})" if isinstance(target, type) else "pass"
+        keep = f"_made._ready = ({''.join(f'{name}, ' for name in self._arrays)})" if isinstance(target, type) else ""
         code = f"""
 def call({", ".join(self.names)}):
     if {" and ".join(tests) or "True"}:
@@ -82,9 +82,9 @@ def call({", ".join(self.names)}):
         except (TypeError, ValueError, BufferError):
             pass
     {"; ".join(ready) or "pass"}
-    out = _target({", ".join(checked)})
+    _made = _target({", ".join(checked)})
     {keep}
-    return out
+    return _made
 """
         scope: dict[str, Any] = dict(NAMES_IN_SIZES)
         scope |= {f"_{array.dtype}": array.dtype for array in self._arrays.values()}

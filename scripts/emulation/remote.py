@@ -25,6 +25,8 @@ COMMAND = "RIGKIT_EMULATED_HOST"
 SLOTS = 4096
 """Bytes at the beginning of the file, for arguments and results."""
 ALIGNMENT = 64
+EMPTY_THERE = ADDRESS + SLOTS
+"""What `calls.EMPTY` is in the program: no array lies there."""
 
 
 class Host:
@@ -57,7 +59,7 @@ class Call:
     """The arguments of one call, as they lie in the shared file."""
 
     def __init__(self) -> None:
-        self._next = ADDRESS + SLOTS
+        self._next = EMPTY_THERE + ALIGNMENT
         self._blocks: list[tuple[int, int, int, bool]] = []
         """Address here, bytes, address there, whether it may be written to."""
         self._structures: list[tuple[ctypes.Structure, int]] = []
@@ -88,7 +90,7 @@ class Call:
     def there(self, address: int | None) -> int:
         """Return what an address is in the program; raises LookupError where it points to nothing that was copied."""
         if not address or address == ctypes.addressof(calls.EMPTY):
-            return 0 if not address else ADDRESS + SLOTS
+            return 0 if not address else EMPTY_THERE
         for start, size, there, _ in self._blocks:
             if start <= address <= start + size:
                 return there + address - start
@@ -96,6 +98,8 @@ class Call:
 
     def _here(self, address: int) -> int:
         """Return what an address of the program is on this side; 0 of none."""
+        if address == EMPTY_THERE:
+            return ctypes.addressof(calls.EMPTY)
         places = [start + address - there for start, size, there, _ in self._blocks if there <= address <= there + size]
         return places[0] if places else 0
 
@@ -146,7 +150,10 @@ def _arrays(value: Any) -> list[np.ndarray[Any, Any]]:
         return _arrays(list(value.values()))
     if isinstance(value, list | tuple | ctypes.Array):
         return [array for part in value for array in _arrays(part)]
-    return _arrays(getattr(value, "_kept", [])) if isinstance(value, ctypes.Structure) else []
+    if not isinstance(value, ctypes.Structure):
+        return []
+    # Of arrays that are not as declared, copies are passed.
+    return [array for name in ("_kept", "_ready") for array in _arrays(getattr(value, name, []))]
 
 
 def _bounds(array: np.ndarray[Any, Any]) -> tuple[int, int]:
@@ -161,22 +168,31 @@ class RemoteKernel(calls.Kernel):
         super().__init__(name, library)
         self._which = list(header().functions).index(name)
         self._arguments: tuple[Any, ...] = ()
+        self._copies: list[Any] = []
 
     def _declare(self) -> Any:
         super()._declare()
+        ready = self._checks._ready
+
+        def noted(*one: Any) -> Any:
+            """An array as it is passed, which may be a copy of the argument."""
+            self._copies.append(ready(*one))
+            return self._copies[-1]
+
+        self._checks._ready = noted  # type: ignore[method-assign, assignment]
         self._call = self._checks.calling(self._there)
         return self._call
 
     def __call__(self, *arguments: Any) -> Any:
-        before, self._arguments = self._arguments, arguments
+        before, self._arguments, self._copies = (self._arguments, self._copies), arguments, []
         try:
             return super().__call__(*arguments)
         finally:
-            self._arguments = before
+            self._arguments, self._copies = before
 
     def _there(self, *passed: Any) -> Any:
         program, call, result = host(), Call(), header().results[self.name]
-        call.take_arrays(list(self._arguments))
+        call.take_arrays([*self._arguments, *self._copies])
         for i, (value, one) in enumerate(zip(passed, header().functions[self.name], strict=True)):
             at = ADDRESS + 8 * i
             if isinstance(value, ctypes.Structure):

@@ -20,6 +20,7 @@ from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header, parsed
 from rigkit.kernels.front import ImageOf
 from rigkit.kernels.growth import FitRules
+from rigkit.kernels.patches import PATCH_COLUMNS, _Grid
 from rigkit.kernels.planes import _PlaneGrid
 from rigkit.kernels.pose import qualities
 
@@ -129,6 +130,15 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
     read = np.ctypeslib.as_array((ctypes.c_double * 12).from_address(grid.values)).reshape(1, 4, 3)
     np.testing.assert_array_equal(read, whole[:, ::2])
     assert len(others) == 50
+
+
+def test_a_structure_with_a_member_of_any_name_does_not_keep_itself() -> None:
+    rays = np.ones((2, 6, 3))[:, ::2]
+    out, tries, heap = np.empty((2, 3, PATCH_COLUMNS)), np.empty((2, 3), np.uint8), np.empty((2, 3), np.int32)
+    slopes = np.ones((2, 3, 3, 2))
+    numbers = {"rows": 2, "columns": 3, "step": 1, "most_tries": 1}
+    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, tries=tries, heap=heap, **numbers)
+    assert any(kept is out for kept in grid._ready) and all(kept is not grid for kept in grid._ready)
 
 
 def test_arguments_are_counted() -> None:
