@@ -17,6 +17,7 @@ from rigkit.cameras.compare import CameraDifference
 from rigkit.core.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
+from rigkit.report.scene_view import PYRAMID
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,8 +35,6 @@ BARE_POINT = 1.5
 MAX_NORMALS = 300
 """Of a cloud without boards: more are not drawn."""
 NORMAL_COLOUR = "#1f6fd0"
-PYRAMID = np.array([[0.0, 0.0, 0.0], [-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
-"""Tip and base of a drawn camera of depth 1."""
 PYRAMID_DEPTH_IN_FIGURE = 0.18
 """Depth of a drawn camera pyramid, relative to the median distance of the points."""
 

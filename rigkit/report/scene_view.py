@@ -1,4 +1,4 @@
-"""3D views: cameras as pyramids, boards where they were held, as `viewer.js` reads them."""
+"""3D views as `viewer.js` reads them: cameras as pyramids, boards where they were held, clouds."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rigkit.calibration.result import ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.reconstruction.reconstruct import Reconstruction
 
 MAX_BOARDS = 400
 """More boards hide each other; of more, every second, third, ... is drawn."""
@@ -20,16 +21,30 @@ DEPTH = 0.15
 SAME_PLACE = 0.01
 """Entries of two poses that differ by less, lengths relative to the distance, are of one board seen twice."""
 PYRAMID = np.array([[0.0, 0.0, 0.0], [-0.6, -0.45, 1.0], [0.6, -0.45, 1.0], [0.6, 0.45, 1.0], [-0.6, 0.45, 1.0]])
+"""Tip and base of a drawn camera of depth 1."""
 
 
-def camera_pyramid(name: str, world_from_cam: Rigid3, depth_mm: float) -> dict[str, Any]:
-    """Return a camera of the view."""
-    return {"name": name, "corners": rounded(world_from_cam.apply(depth_mm * PYRAMID), 2)}
+def scene_of(reconstruction: Reconstruction) -> dict[str, Any]:
+    """Return the scene of a pair: its oriented cloud, the cameras and the board planes."""
+    cloud = reconstruction.cloud
+    cameras = {"camera 1": Rigid3.identity(), "camera 2": reconstruction.cam2_from_cam1.inverse()}
+    planes = [
+        {"board": index, "corners": _rounded(_box(cloud.points_mm[cloud.board_index == index]), 2)}
+        for index in range(len(cloud.board_ids))
+        if (cloud.board_index == index).sum() >= 3
+    ]
+    scene = _scene(cameras, np.linalg.norm(cloud.points_mm, axis=1), cloud.board_ids, planes)
+    return scene | {
+        "points": _rounded(cloud.points_mm, 2),
+        "normals": _rounded(cloud.normals, 4),
+        "board": [int(b) for b in cloud.board_index],
+        "square_mm": float(np.mean([b.square_x_mm for b in reconstruction.boards])),
+    }
 
 
 def boards_scene(views: Sequence[ViewResult], boards: Sequence[BoardShape]) -> dict[str, Any]:
     """Return the scene of one camera with every board that it saw."""
-    return _scene({"camera": Rigid3.identity()}, [(view, Rigid3.identity()) for view in views], boards)
+    return _views_scene({"camera": Rigid3.identity()}, [(view, Rigid3.identity()) for view in views], boards)
 
 
 def rig_scene(rig: RigCalibration) -> dict[str, Any]:
@@ -51,15 +66,10 @@ def rig_scene(rig: RigCalibration) -> dict[str, Any]:
     boards: dict[str, BoardShape] = {}
     for camera in rig.cameras:
         boards = {board.board_id: board for board in camera.calibration.boards} | boards
-    return _scene(cameras, views, list(boards.values()))
+    return _views_scene(cameras, views, list(boards.values()))
 
 
-def rounded(values: FloatArray, digits: int) -> list[list[float]]:
-    """Return rows of numbers as JSON has them."""
-    return [[round(float(v), digits) for v in row] for row in values]
-
-
-def _scene(
+def _views_scene(
     cameras: Mapping[str, Rigid3], views: Sequence[tuple[ViewResult, Rigid3]], boards: Sequence[BoardShape]
 ) -> dict[str, Any]:
     shapes = {board.board_id: board.points_mm for board in boards}
@@ -69,20 +79,31 @@ def _scene(
     for view, world_from_cam in views[:: -(-len(views) // MAX_BOARDS) or 1]:
         corners = (world_from_cam @ view.cam_from_board).apply(outlines[view.board_id])
         name = f"{view.image}, {view.board_id}: {view.rms_px:.3f} px"
-        planes.append({"board": names.index(view.board_id), "corners": rounded(corners, 2), "name": name})
-    far = [
-        float(np.linalg.norm(view.cam_from_board.apply(outlines[view.board_id]), axis=1).mean()) for view, _ in views
-    ]
-    depth = DEPTH * float(np.median(far)) if far else 1.0
+        planes.append({"board": names.index(view.board_id), "corners": _rounded(corners, 2), "name": name})
+    far = [np.linalg.norm(view.cam_from_board.apply(outlines[view.board_id]), axis=1).mean() for view, _ in views]
+    return _scene(cameras, far, names, planes)
+
+
+def _scene(
+    cameras: Mapping[str, Rigid3], far_mm: Sequence[float] | FloatArray, boards: Sequence[str], planes: list[Any]
+) -> dict[str, Any]:
+    """Return a scene without points, of cameras by their places in it that see what is `far_mm` away from them."""
+    depth = DEPTH * float(np.median(far_mm)) if len(far_mm) else 1.0
+    pyramids = {name: world_from_cam.apply(depth * PYRAMID) for name, world_from_cam in cameras.items()}
     return {
         "points": [],
         "normals": [],
         "board": [],
-        "boards": names,
-        "cameras": [camera_pyramid(name, frame, depth) for name, frame in cameras.items()],
+        "boards": list(boards),
+        "cameras": [{"name": name, "corners": _rounded(pyramid, 2)} for name, pyramid in pyramids.items()],
         "planes": planes,
         "square_mm": 1.0,
     }
+
+
+def _rounded(values: FloatArray, digits: int) -> list[list[float]]:
+    """Return rows of numbers as JSON has them."""
+    return [[round(float(v), digits) for v in row] for row in values]
 
 
 def _outline(points_mm: FloatArray) -> FloatArray:
@@ -90,3 +111,12 @@ def _outline(points_mm: FloatArray) -> FloatArray:
     (x0, y0), (x1, y1) = points_mm[:, :2].min(axis=0), points_mm[:, :2].max(axis=0)
     z = float(points_mm[:, 2].mean())
     return np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
+
+
+def _box(points: FloatArray) -> FloatArray:
+    """Return the corners of the smallest box, along the principal axes, around points that lie in a plane."""
+    centre = points.mean(axis=0)
+    axes = np.linalg.svd(points - centre, full_matrices=False)[2][:2]
+    local = (points - centre) @ axes.T
+    (x0, y0), (x1, y1) = local.min(axis=0), local.max(axis=0)
+    return np.asarray(centre + np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]) @ axes)

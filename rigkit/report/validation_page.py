@@ -11,7 +11,8 @@ from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.findings import Severity
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.report.page import PairSection, scene_of
+from rigkit.report.page import PairSection
+from rigkit.report.scene_view import scene_of
 from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
