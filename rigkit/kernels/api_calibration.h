@@ -26,18 +26,18 @@ typedef struct {
 
 EXPORT void displace_pixels(
     ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
-    ARRAY(double, out, 2, DISPLACEMENTS, count));
+    RESULT(double, out, 2, DISPLACEMENTS, count));
 EXPORT void displace_by(
     ARRAY(const double, u, count), ARRAY(const double, v, count), int64_t count, int64_t width, int64_t height,
-    ARRAY(const double, amounts, DISPLACEMENTS), ARRAY(double, out, 2, count));
+    ARRAY(const double, amounts, DISPLACEMENTS), RESULT(double, out, 2, count));
 EXPORT int64_t lens_memory(int64_t parameters);
 EXPORT void lens_products(
-    const lens_corners_t *corners, ARRAY(double, memory, lens_memory(corners.parameters)),
-    ARRAY(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
-    ARRAY(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
+    const lens_corners_t *corners, SCRATCH(double, memory, lens_memory(corners.parameters)),
+    RESULT(double, with_pose, corners.views, POSE + corners.parameters + DISPLACEMENTS + 1, POSE),
+    RESULT(double, products, corners.parameters + DISPLACEMENTS + 1, corners.parameters + DISPLACEMENTS + 1));
 EXPORT void average_amounts(
     ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
-    ARRAY(const double, sizes, count), int64_t count, ARRAY(double, out, DISPLACEMENTS, DISPLACEMENTS));
+    ARRAY(const double, sizes, count), int64_t count, RESULT(double, out, DISPLACEMENTS, DISPLACEMENTS));
 
 /* linearise.c */
 
@@ -72,13 +72,14 @@ typedef struct {
 
 /* Where the corners of the views from `first` on stand in the camera frame, and those without the translation. */
 EXPORT void place_corners(
-    const board_views_t *seen, int64_t first, int64_t count, ARRAY(double, lever, 3, count), ARRAY(double, points, 3, count));
+    const board_views_t *seen, int64_t first, int64_t count, RESULT(double, lever, 3, count),
+    RESULT(double, points, 3, count));
 EXPORT int64_t rows_memory(int64_t across);
 EXPORT void add_views(
     const board_views_t *seen, int64_t first, int64_t count, int64_t parameters,
     ARRAY(const double, d_pixels_d_point, 2, 3, count), ARRAY(const double, d_pixels_d_parameters, 2, parameters, count),
     ARRAY(const double, u, count), ARRAY(const double, v, count), ARRAY(const uint8_t, projects, count),
-    ARRAY(const double, lever, 3, count), ARRAY(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
+    ARRAY(const double, lever, 3, count), SCRATCH(double, memory, rows_memory(sums.across)), const view_sums_t *sums);
 
 /* schur.c */
 
@@ -94,8 +95,8 @@ typedef struct {
 
 EXPORT int64_t schur_memory(int64_t globals, int64_t views);
 EXPORT int64_t solve_schur(
-    const normal_equations_t *normal, double damping, ARRAY(double, memory, schur_memory(normal.globals, normal.views)),
-    ARRAY(double, step_g, normal.globals), ARRAY(double, step_p, normal.views, POSE), ARRAY(double, predicted, 1));
+    const normal_equations_t *normal, double damping, SCRATCH(double, memory, schur_memory(normal.globals, normal.views)),
+    RESULT(double, step_g, normal.globals), RESULT(double, step_p, normal.views, POSE), RESULT(double, predicted, 1));
 
 /* close_pairs.c */
 
@@ -107,15 +108,15 @@ EXPORT int64_t close_pairs(
 
 EXPORT void sum_series(
     ARRAY(const double, leverage, clusters, n, n), ARRAY(const double, pull, clusters, n), int64_t clusters, int64_t n,
-    double bound, ARRAY(const double, series, terms), int64_t terms, ARRAY(double, memory, 3 * n),
-    ARRAY(double, out, clusters, n));
+    double bound, ARRAY(const double, series, terms), int64_t terms, SCRATCH(double, memory, 3 * n),
+    RESULT(double, out, clusters, n));
 
 /* coverage.c */
 
 EXPORT void cover_pixels(
     ARRAY(const int64_t, grid, count, 2), ARRAY(const double, corners, count, 2), int64_t count,
     ARRAY(const int64_t, counts, views), int64_t views, double squares, ARRAY(const double, pixels, asked, 2), int64_t asked,
-    ARRAY(uint8_t, covered, asked));
+    RESULT(truth_t, covered, asked));
 
 /* brown.c */
 
@@ -132,11 +133,11 @@ typedef struct {
 
 EXPORT void differentiate_brown(
     const brown_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
-    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
-    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), RESULT(double, u, points.count),
+    RESULT(double, v, points.count), RESULT(truth_t, valid, points.count));
 EXPORT void undistort_brown(
     ARRAY(const double, parameters, 12), double max_r, int64_t rational, ARRAY(const double, m, 2, count), int64_t count,
-    ARRAY(double, plane, 2, count), ARRAY(uint8_t, valid, count));
+    ARRAY(double, plane, 2, count), RESULT(truth_t, valid, count));
 
 /* radial.c */
 
@@ -153,12 +154,12 @@ typedef struct {
 
 EXPORT void differentiate_kannala_brandt(
     const radial_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
-    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
-    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), RESULT(double, u, points.count),
+    RESULT(double, v, points.count), RESULT(truth_t, valid, points.count));
 EXPORT void differentiate_scaramuzza(
     const radial_points_t *points, ARRAY(double, d_pixels_d_point, 2, points.axes, points.count),
-    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), ARRAY(double, u, points.count),
-    ARRAY(double, v, points.count), ARRAY(uint8_t, valid, points.count));
+    ARRAY(double, d_pixels_d_parameters, 2, points.rows, points.count), RESULT(double, u, points.count),
+    RESULT(double, v, points.count), RESULT(truth_t, valid, points.count));
 
 /* monotone.c */
 
@@ -175,9 +176,9 @@ typedef struct {
     double first, last, low, high;
 } increasing_t;
 
-EXPORT void invert_increasing(const increasing_t *functions, ARRAY(double, out, functions.count));
+EXPORT void invert_increasing(const increasing_t *functions, RESULT(double, out, functions.count));
 EXPORT double smallest_root(
     ARRAY(const double, polynomials, count, terms), int64_t count, int64_t terms, double limit,
-    ARRAY(double, memory, 2 * terms));
+    SCRATCH(double, memory, 2 * terms));
 
 #endif

@@ -20,15 +20,13 @@ typedef struct {
 
 EXPORT int64_t edges_scratch(const edge_rules_t *rules);
 EXPORT void fit_edges(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
+    IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, curvature, count, 2), ARRAY(const double, curvature_sigma, count, 2),
-    ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, tilts, count, 2, 2),
-    ARRAY(const double, reach, count, 2, 2),
+    ARRAY(const double, gaps, count, 2, 2), ARRAY(const double, tilts, count, 2, 2), ARRAY(const double, reach, count, 2, 2),
     ARRAY(const double, paper, count, 2, 2), ARRAY(const double, single, count, 2), ARRAY(const double, sign, count),
     ARRAY(const double, blur, count), ARRAY(const double, window_blur, count), ARRAY(const double, contrast, count),
-    ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules,
-    ARRAY(float, scratch, edges_scratch(rules)), ARRAY(double, out, count, OUTCOMES));
+    ARRAY(const uint8_t, ends, count, 2, 2), const edge_rules_t *rules, SCRATCH(float, scratch, edges_scratch(rules)),
+    RESULT(double, out, count, OUTCOMES));
 
 /* What windows of the corners of tags go by: how wide a border is, in sides of a tag, how many s it is left by, and the distance
  * of neighbouring lines where none are near, px. */
@@ -47,12 +45,12 @@ EXPORT void sigma_factors(
     ARRAY(const double, products, count, LAGS), ARRAY(const double, pairs, count, LAGS), ARRAY(const double, noise, count),
     ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
     ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
-    int64_t boards, const factor_rules_t *rules, ARRAY(double, out, boards));
+    int64_t boards, const factor_rules_t *rules, RESULT(double, out, boards));
 EXPORT void uneven_factors(
     ARRAY(const double, products, count, LAGS), ARRAY(const double, pairs, count, LAGS), ARRAY(const double, noise, count),
     ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
     ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
-    int64_t boards, ARRAY(const double, usual, boards), const factor_rules_t *rules, ARRAY(double, out, count));
+    int64_t boards, ARRAY(const double, usual, boards), const factor_rules_t *rules, RESULT(double, out, count));
 
 /* bends.c */
 
@@ -65,8 +63,8 @@ typedef struct {
 EXPORT void line_bends(
     ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns),
     ARRAY(const uint8_t, wanted, rows, columns), int64_t rows, int64_t columns, int64_t count,
-    ARRAY(const double, sides, count, 2), const bend_rules_t *rules, ARRAY(double, out, count, 2),
-    ARRAY(double, out_sigma, count, 2));
+    ARRAY(const double, sides, count, 2), const bend_rules_t *rules, RESULT(double, out, count, 2),
+    RESULT(double, out_sigma, count, 2));
 
 /* paper.c */
 
@@ -79,12 +77,12 @@ typedef struct {
 
 EXPORT int64_t paper_memory(int64_t count);
 EXPORT void find_paper(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, gaps, count, 2, 2),
-    ARRAY(const uint8_t, ends, count, 2, 2), ARRAY(const double, contrast, count), ARRAY(const double, blur, count),
-    ARRAY(const double, sign, count), ARRAY(const int64_t, owner, count), const paper_rules_t *rules,
-    ARRAY(double, scratch, 2 * rules.step_count + 4 * count), ARRAY(uint8_t, memory, paper_memory(count)),
-    ARRAY(int64_t, near, 4 * count), ARRAY(double, paper, count, 2, 2), ARRAY(double, out_gaps, count, 2, 2));
+    IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
+    ARRAY(const double, gaps, count, 2, 2), ARRAY(const uint8_t, ends, count, 2, 2), ARRAY(const double, contrast, count),
+    ARRAY(const double, blur, count), ARRAY(const double, sign, count), ARRAY(const int64_t, owner, count),
+    const paper_rules_t *rules, SCRATCH(double, scratch, 2 * rules.step_count + 4 * count),
+    SCRATCH(uint8_t, memory, paper_memory(count)), SCRATCH(int64_t, near, 4 * count), RESULT(double, paper, count, 2, 2),
+    RESULT(double, out_gaps, count, 2, 2));
 
 /* surface.c */
 
@@ -101,20 +99,21 @@ enum { FIT_SCRATCH = 5 + 2 * (SURFACE_DEGREE + 1) };
 
 EXPORT void project_places(
     ARRAY(const double, places, count, 2), int64_t count, ARRAY(const double, homography, 3, 3),
-    ARRAY(double, out, count, SURFACE_COLUMNS));
+    RESULT(double, out, count, SURFACE_COLUMNS));
 EXPORT double fit_perspective(
-    ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, ARRAY(double, out, 3, 3));
+    ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, RESULT(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(
     ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
-    double most_leverage, ARRAY(double, basis, terms, count), ARRAY(double, scratch, FIT_SCRATCH, count), ARRAY(double, unit, 3), ARRAY(double, triangle, terms, terms),
-    ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1), ARRAY(double, off, count),
-    ARRAY(double, gain, count), ARRAY(double, scatter, 1));
+    double most_leverage, SCRATCH(double, basis, terms, count), SCRATCH(double, scratch, FIT_SCRATCH, count),
+    RESULT(double, unit, 3), ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2),
+    RESULT(double, misses, SURFACE_DEGREE + 1), RESULT(double, off, count), RESULT(double, gain, count),
+    RESULT(double, scatter, 1));
 EXPORT int64_t fit_map(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, int64_t terms,
-    double most_leverage, double nearest, ARRAY(double, rest, count, 2), ARRAY(double, basis, terms, count),
-    ARRAY(double, scratch, FIT_SCRATCH, count), ARRAY(double, homography, 3, 3), ARRAY(double, unit, 3),
-    ARRAY(double, triangle, terms, terms), ARRAY(double, told, terms, 2), ARRAY(double, misses, SURFACE_DEGREE + 1),
-    ARRAY(double, off, count), ARRAY(double, gain, count), ARRAY(double, scatter, 1));
+    double most_leverage, double nearest, SCRATCH(double, rest, count, 2), SCRATCH(double, basis, terms, count),
+    SCRATCH(double, scratch, FIT_SCRATCH, count), RESULT(double, homography, 3, 3), RESULT(double, unit, 3),
+    ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2), RESULT(double, misses, SURFACE_DEGREE + 1),
+    RESULT(double, off, count), RESULT(double, gain, count), RESULT(double, scatter, 1));
 EXPORT void add_polynomial(
     ARRAY(const double, wanted, count, 2), int64_t count, ARRAY(const double, unit, 3), int64_t terms, int64_t degree,
     ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
@@ -174,23 +173,23 @@ typedef struct {
     ARRAY(double, corners, board.count, CORNER_COLUMNS);
     ARRAY(uint8_t, marks, TAG_MARKS, board.count);
     ARRAY(double, base, board.count, SURFACE_COLUMNS);
-    ARRAY(double, fitted, board.count, OUTCOMES);
-    ARRAY(double, sides, board.count, 2, 2);
+    SCRATCH(double, fitted, board.count, OUTCOMES);
+    SCRATCH(double, sides, board.count, 2, 2);
     ARRAY(double, curvature, board.count, 2);
     ARRAY(double, numbers, TAG_NUMBERS);
-    ARRAY(double, off, 2, board.count);
-    ARRAY(double, map, ROOM_OF_MAP);
-    ARRAY(double, room, board.count, ROOM_OF_CORNER);
-    ARRAY(double, modules, board.count / 4, board.modules * board.modules);
-    ARRAY(float, windows, edges_scratch(rules.last.contents));
+    SCRATCH(double, off, 2, board.count);
+    SCRATCH(double, map, ROOM_OF_MAP);
+    SCRATCH(double, room, board.count, ROOM_OF_CORNER);
+    SCRATCH(double, modules, board.count / 4, board.modules * board.modules);
+    SCRATCH(float, windows, edges_scratch(rules.last.contents));
 } tag_fit_t;
 
 EXPORT void map_tag_board(const tag_fit_t *fit);
 EXPORT double tag_sigma_factor(const tag_fit_t *fit, const factor_rules_t *rules);
 EXPORT double tag_scatter(const tag_fit_t *fit, double factor);
 EXPORT void tag_heights(
-    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, ARRAY(double, longer, rows / 2, columns / 2),
-    ARRAY(double, height, rows / 2, columns / 2));
+    ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns,
+    RESULT(double, longer, rows / 2, columns / 2), RESULT(double, height, rows / 2, columns / 2));
 EXPORT void fit_tag_board(const tag_fit_t *fit, double blur);
 EXPORT void refit_tag_corners(const tag_fit_t *fit);
 EXPORT int64_t add_tag_corners(const tag_fit_t *fit, int64_t rounds, int64_t by_this_map);
@@ -200,23 +199,21 @@ EXPORT int64_t drop_tag_corners(const tag_fit_t *fit, int64_t rounds);
 
 EXPORT int64_t squares_of_lattice(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, int64_t odd,
-    ARRAY(double, quads, rows * columns, 4, 2), ARRAY(int64_t, cells, rows * columns, 2));
+    RESULT(double, quads, rows * columns, 4, 2), RESULT(int64_t, cells, rows * columns, 2));
 EXPORT int64_t vote_place(
-    ARRAY(const int64_t, cells, count, 2), ARRAY(const int64_t, turns, count), ARRAY(const int64_t, places, count, 2), int64_t count,
-    int64_t columns, int64_t rows, ARRAY(int64_t, scratch, count, 3), ARRAY(int64_t, place, 3));
+    ARRAY(const int64_t, cells, count, 2), ARRAY(const int64_t, turns, count), ARRAY(const int64_t, places, count, 2),
+    int64_t count, int64_t columns, int64_t rows, SCRATCH(int64_t, scratch, count, 3), ARRAY(int64_t, place, 3));
 
 /* codes.c */
 
-EXPORT void maps_of_quads(ARRAY(const double, quads, count, 4, 2), int64_t count, ARRAY(double, out, count, 3, 3));
+EXPORT void maps_of_quads(ARRAY(const double, quads, count, 4, 2), int64_t count, RESULT(double, out, count, 3, 3));
 EXPORT void read_modules(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
-    ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side,
-    ARRAY(double, bright, count, side * side), ARRAY(double, spread, count));
+    IMAGE(grey), ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side,
+    RESULT(double, bright, count, side * side), RESULT(double, spread, count));
 EXPORT void read_codes(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height,
-    ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side, ARRAY(const double, patterns, codes, side * side),
-    int64_t codes, double least, ARRAY(double, bright, count, side * side), ARRAY(int64_t, best, count),
-    ARRAY(double, likeness, count));
+    IMAGE(grey), ARRAY(const double, quads, count, 4, 2), int64_t count, int64_t side,
+    ARRAY(const double, patterns, codes, side * side), int64_t codes, double least,
+    SCRATCH(double, bright, count, side * side), RESULT(int64_t, best, count), RESULT(double, likeness, count));
 
 /* tags.c */
 
@@ -233,11 +230,11 @@ typedef struct {
 } tag_rules_t;
 
 EXPORT void fit_tags(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2), ARRAY(const double, scales, count),
-    ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells, ARRAY(const double, breaks, cells - 1), double reach,
-    ARRAY(const double, blur, count), ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
-    ARRAY(double, scratch, most, TAG_BLOCK), ARRAY(double, out, count, TAG_OUTCOMES));
+    IMAGE(grey), int64_t count, ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2),
+    ARRAY(const double, scales, count), ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells,
+    ARRAY(const double, breaks, cells - 1), double reach, ARRAY(const double, blur, count),
+    ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
+    SCRATCH(double, scratch, most, TAG_BLOCK), RESULT(double, out, count, TAG_OUTCOMES));
 
 /* boards.c */
 
@@ -247,37 +244,38 @@ enum { BOARD_PLANES = 11 };
 
 EXPORT void board_places(
     ARRAY(const double, coefficients, rows + 2, columns + 2, 2), int64_t rows, int64_t columns, int64_t left, int64_t top,
-    int64_t width, int64_t height, double around, ARRAY(double, places, height, width, 2));
+    int64_t width, int64_t height, double around, RESULT(double, places, height, width, 2));
 EXPORT void board_picture(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
-    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp, ARRAY(float, out, BOARD_PLANES, height, width));
+    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp,
+    RESULT(float, out, BOARD_PLANES, height, width));
 
 /* board_changes.c */
 
 EXPORT void board_shares(
-    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing,
-    double most, int64_t cubic, int64_t margin, ARRAY(int32_t, nodes, height, width, 2),
-    ARRAY(float, weights, height, width, 2, 4), ARRAY(int64_t, boxes, rows * columns, 4));
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
+    double spacing, double most, int64_t cubic, int64_t margin, RESULT(int32_t, nodes, height, width, 2),
+    RESULT(float, weights, height, width, 2, 4), RESULT(int64_t, boxes, rows * columns, 4));
 EXPORT void board_values(
     ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
     int64_t height, int64_t rows, int64_t columns, ARRAY(const double, values, count, rows, columns), int64_t count,
-    ARRAY(float, out, count, height, width));
+    RESULT(float, out, count, height, width));
 EXPORT void move_blocks(
     ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
     int64_t height, int64_t rows, int64_t columns, ARRAY(const float, gradient, 2, height, width),
     ARRAY(const float, weight, height, width), ARRAY(const float, taps, 2 * radius + 1), int64_t radius,
     ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
-    ARRAY(float, scratch, 3 * room), int64_t size, ARRAY(float, data, size));
+    SCRATCH(float, scratch, 3 * room), int64_t size, ARRAY(float, data, size));
 EXPORT void share_blocks(
     ARRAY(const int32_t, nodes, height, width, 2), ARRAY(const float, weights, height, width, 2, 4), int64_t width,
     int64_t height, int64_t rows, int64_t columns, ARRAY(const float, planes, wide_by, height, width), int64_t wide_by,
     ARRAY(const int64_t, boxes, rows * columns, 4), ARRAY(const int64_t, starts, rows * columns), int64_t room,
-    ARRAY(float, scratch, room), int64_t size, ARRAY(float, data, size));
+    SCRATCH(float, scratch, room), int64_t size, ARRAY(float, data, size));
 EXPORT void block_products(
     ARRAY(const int64_t, boxes, count, 4), ARRAY(const int64_t, starts, count), ARRAY(const int64_t, wide_by, count),
     ARRAY(const int64_t, first, count), int64_t count, int64_t size, ARRAY(const float, data, size),
     ARRAY(const float, rest, height, width), int64_t width, int64_t height, int64_t unknowns,
-    ARRAY(double, out, unknowns, unknowns), ARRAY(double, right, unknowns));
+    RESULT(double, out, unknowns, unknowns), RESULT(double, right, unknowns));
 
 /* circles.c */
 
@@ -292,10 +290,10 @@ typedef struct {
 } circle_rules_t;
 
 EXPORT void fit_circles(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2), ARRAY(const double, bends, count, 2, 3),
-    ARRAY(const double, blur, count), ARRAY(const double, reach, count), ARRAY(const int64_t, beside, count, BESIDE),
-    const circle_rules_t *rules, int64_t most, ARRAY(double, scratch, SPOT, most), ARRAY(double, out, count, CIRCLE_OUTCOMES));
+    IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2),
+    ARRAY(const double, bends, count, 2, 3), ARRAY(const double, blur, count), ARRAY(const double, reach, count),
+    ARRAY(const int64_t, beside, count, BESIDE), const circle_rules_t *rules, int64_t most,
+    SCRATCH(double, scratch, SPOT, most), RESULT(double, out, count, CIRCLE_OUTCOMES));
 
 /* light.c */
 
@@ -312,14 +310,13 @@ typedef struct {
 } light_rules_t;
 
 EXPORT void lit_unevenly(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, aside, count),
-    ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts, double most_aside, double least_px,
-    double uneven, ARRAY(uint8_t, out, count));
+    IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
+    ARRAY(const double, aside, count), ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts,
+    double most_aside, double least_px, double uneven, RESULT(truth_t, out, count));
 EXPORT void fit_light_steps(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t count,
-    ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, curvature, count, 2),
-    ARRAY(const double, aside, count), double blur, ARRAY(const double, most_step, LIGHT_UNKNOWNS), const light_rules_t *rules,
-    int64_t most, ARRAY(double, scratch, 4, most), ARRAY(double, out, count, LIGHT_OUTCOMES));
+    IMAGE(grey), int64_t count, ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2),
+    ARRAY(const double, curvature, count, 2), ARRAY(const double, aside, count), double blur,
+    ARRAY(const double, most_step, LIGHT_UNKNOWNS), const light_rules_t *rules, int64_t most,
+    SCRATCH(double, scratch, 4, most), RESULT(double, out, count, LIGHT_OUTCOMES));
 
 #endif

@@ -11,21 +11,20 @@ typedef struct {
 /* looks.c */
 
 EXPORT int64_t has_mosaic(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t step, double least,
-    double share, ARRAY(double, scratch, 2 * (height / 2 / step) * (width / 2 / step)));
+    IMAGE(grey), int64_t step, double least, double share,
+    SCRATCH(double, scratch, 2 * (height / 2 / step) * (width / 2 / step)));
 
 EXPORT int64_t count_bad_pixels(
-    ARRAY(const void, grey, height, width), int64_t bytes, int64_t width, int64_t height, int64_t first, int64_t apart,
-    double step, double share, ARRAY(double, span, 1));
+    IMAGE(grey), int64_t first, int64_t apart, double step, double share, RESULT(double, span, 1));
 
 /* smoothing.c */
 
 EXPORT void shrink_floats(
-    ARRAY(const float, image, height, width), int64_t height, int64_t width, int64_t factor, ARRAY(float, sums, width),
-    ARRAY(float, out, height / factor, width / factor));
+    ARRAY(const float, image, height, width), int64_t height, int64_t width, int64_t factor, SCRATCH(float, sums, width),
+    RESULT(float, out, height / factor, width / factor));
 EXPORT void shrink_bytes(
     ARRAY(const uint8_t, image, height, width), int64_t height, int64_t width, int64_t factor,
-    ARRAY(uint16_t, sums, 2 * width), ARRAY(float, out, height / factor, width / factor));
+    SCRATCH(uint16_t, sums, 2 * width), RESULT(float, out, height / factor, width / factor));
 /* What levels are smoothed with, a kernel of multiples of 1 / whole, and what their thresholds follow from
  * (detection.saddles.response). */
 typedef struct {
@@ -38,24 +37,22 @@ typedef struct {
 enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 
 EXPORT void make_level(
-    ARRAY(const void, image, height, width), int64_t bytes, int64_t width, int64_t height, int64_t step,
-    const level_rules_t *rules,
-    ARRAY(float, scratch, width + 4 + 3 * ((height - 3) / step + 1) * ((width - 3) / step + 1)),
+    IMAGE(image), int64_t step, const level_rules_t *rules,
+    SCRATCH(float, scratch, width + 4 + 3 * ((height - 3) / step + 1) * ((width - 3) / step + 1)),
     ARRAY(float, smooth, height, width), ARRAY(float, half, (height + 1) / 2, (width + 1) / 2),
-    ARRAY(float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1));
+    RESULT(float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1));
 
 /* peaks.c */
 
 EXPORT int64_t find_peaks(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width,
     ARRAY(const float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1),
-    ARRAY(float, scratch, 5 * (width + STRIP + 4)), ARRAY(uint8_t, high, 5 * (width / STRIP + 1)),
-    ARRAY(int32_t, at, (height / 3 + 1) * (width / 3 + 1), 2),
-    ARRAY(float, response, (height / 3 + 1) * (width / 3 + 1)));
+    SCRATCH(float, scratch, 5 * (width + STRIP + 4)), SCRATCH(uint8_t, high, 5 * (width / STRIP + 1)),
+    RESULT(int32_t, at, (height / 3 + 1) * (width / 3 + 1), 2), RESULT(float, response, (height / 3 + 1) * (width / 3 + 1)));
 EXPORT int64_t keep_strongest(
     ARRAY(int32_t, at, count, 2), ARRAY(float, response, count), int64_t count, int64_t height, int64_t width, int64_t side,
     int64_t most, int64_t finest, ARRAY(float, squares, (height / side + 1) * (width / side + 1)),
-    ARRAY(int32_t, bins, finest + 1), ARRAY(int32_t, share, count));
+    ARRAY(int32_t, bins, finest + 1), SCRATCH(int32_t, share, count));
 
 /* corners.c; rings also in growth.c */
 
@@ -75,12 +72,12 @@ EXPORT int64_t find_corners(
     ARRAY(const float, smooth, height, width), int64_t width, int64_t height, ARRAY(const int32_t, peaks, count, 2),
     ARRAY(const float, response, count), int64_t count, double radius, double most_step, double most_sharp,
     const ring_rules_t *rules, double scale, double offset, ARRAY(const double, known, known_count, 2), int64_t known_count,
-    double reach, ARRAY(double, saddles, count, 2), ARRAY(double, pixels, count, 2), ARRAY(double, angles, count, 2),
-    ARRAY(double, contrast, count), ARRAY(uint8_t, smeared, count), ARRAY(uint8_t, repeated, count),
-    ARRAY(int64_t, found, 2));
+    double reach, RESULT(double, saddles, count, 2), RESULT(double, pixels, count, 2), RESULT(double, angles, count, 2),
+    RESULT(double, contrast, count), RESULT(truth_t, smeared, count), RESULT(truth_t, repeated, count),
+    RESULT(int64_t, found, 2));
 EXPORT int64_t mark_known(
     ARRAY(const double, fresh, count, 2), int64_t count, ARRAY(const double, known, known_count, 2), int64_t known_count,
-    double reach, ARRAY(uint8_t, mark, count));
+    double reach, RESULT(truth_t, mark, count));
 
 /* links.c */
 
@@ -104,7 +101,7 @@ typedef struct {
 
 EXPORT int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules,
-    ARRAY(int64_t, nearest, corners.count, 4), ARRAY(int64_t, both, corners.count, 4));
+    SCRATCH(int64_t, nearest, corners.count, 4), RESULT(int64_t, both, corners.count, 4));
 
 /* growth.c */
 
@@ -152,20 +149,20 @@ typedef struct {
 EXPORT void fit_cells(
     ARRAY(const double, lattice, rows, columns, 2), int64_t rows, int64_t columns,
     ARRAY(const uint8_t, cells, rows, columns), const fit_rules_t *rules, int64_t count,
-    ARRAY(double, out, count, FIT_COLUMNS));
+    RESULT(double, out, count, FIT_COLUMNS));
 EXPORT int64_t squares_memory(int64_t count);
 EXPORT void sort_points(
     ARRAY(const double, points, count, 2), int64_t count, ARRAY(int32_t, memory, squares_memory(count)), squares_t *out);
 EXPORT int64_t grow_lattice(
     sheet_t *sheet, const pyramid_level_t *level, const squares_t *saddles, const growth_rules_t *rules, int64_t rings,
-    ARRAY(double, fresh, sheet.rows * sheet.columns, 3), ARRAY(int64_t, where, sheet.rows * sheet.columns));
+    SCRATCH(double, fresh, sheet.rows * sheet.columns, 3), SCRATCH(int64_t, where, sheet.rows * sheet.columns));
 
 /* components.c */
 
 EXPORT int64_t find_components(
-    int64_t count, ARRAY(int64_t, to, count, 4), ARRAY(int64_t, label, count), ARRAY(int64_t, grid, count, 2),
-    ARRAY(int64_t, turn, count), ARRAY(int64_t, members, count), ARRAY(int64_t, queue, 2 * count),
-    ARRAY(uint8_t, bound, 4 * count));
+    int64_t count, ARRAY(int64_t, to, count, 4), RESULT(int64_t, label, count), RESULT(int64_t, grid, count, 2),
+    RESULT(int64_t, turn, count), RESULT(int64_t, members, count), SCRATCH(int64_t, queue, 2 * count),
+    SCRATCH(uint8_t, bound, 4 * count));
 
 /* lattice.c */
 
@@ -177,22 +174,22 @@ typedef struct {
 
 EXPORT void uneven_steps(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns,
-    ARRAY(double, scratch, 2 * rows * columns), int64_t inner, ARRAY(double, typical, inner),
-    ARRAY(int64_t, seen, inner), ARRAY(double, every, 2));
+    SCRATCH(double, scratch, 2 * rows * columns), int64_t inner, RESULT(double, typical, inner),
+    RESULT(int64_t, seen, inner), RESULT(double, every, 2));
 EXPORT void line_gaps(
     ARRAY(const double, sides, count, 2, 2), ARRAY(const double, bends, count, 2, 2), int64_t count,
-    ARRAY(double, out, count, 2, 2));
+    RESULT(double, out, count, 2, 2));
 EXPORT void excess_scatter(
-    ARRAY(const double, pixels, height, width, 2), ARRAY(const double, sigma, height, width), int64_t height,
-    int64_t width, ARRAY(const int64_t, parts, count, 4), int64_t count, const scatter_rules_t *rules,
-    ARRAY(double, scratch, 7 * height * width), ARRAY(double, out, count));
+    ARRAY(const double, pixels, height, width, 2), ARRAY(const double, sigma, height, width), int64_t height, int64_t width,
+    ARRAY(const int64_t, parts, count, 4), int64_t count, const scatter_rules_t *rules,
+    SCRATCH(double, scratch, 7 * height * width), RESULT(double, out, count));
 EXPORT void surface_scatter(
     ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns), int64_t rows, int64_t columns,
-    const scatter_rules_t *rules, ARRAY(double, scratch, 20 * rows * columns), ARRAY(double, out, 2));
+    const scatter_rules_t *rules, SCRATCH(double, scratch, 20 * rows * columns), RESULT(double, out, 2));
 EXPORT void edge_shifts(
     ARRAY(const double, pixels, rows, columns, 2), int64_t rows, int64_t columns, double sign, image_t image, double scale,
     double offset, double reach, ARRAY(const double, along, parts), int64_t parts, int64_t steps, int64_t most,
-    ARRAY(double, sums, parts, steps + 1), ARRAY(double, out, parts));
+    SCRATCH(double, sums, parts, steps + 1), RESULT(double, out, parts));
 
 /* splits.c */
 
@@ -205,7 +202,7 @@ typedef struct {
 EXPORT int64_t splits_scratch(int64_t rows, int64_t columns);
 EXPORT void clearest_splits(
     ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns), int64_t rows, int64_t columns,
-    int64_t several, const split_rules_t *rules, ARRAY(double, scratch, splits_scratch(rows, columns)),
-    ARRAY(double, out, 2, 3));
+    int64_t several, const split_rules_t *rules, SCRATCH(double, scratch, splits_scratch(rows, columns)),
+    RESULT(double, out, 2, 3));
 
 #endif

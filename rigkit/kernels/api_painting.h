@@ -32,7 +32,8 @@ typedef struct {
 EXPORT int64_t tile_cover(const tile_t *tile, const surface_t *surface);
 EXPORT int64_t paint_surface(ARRAY(float, fine, tile.rows, tile.columns), const tile_t *tile, const surface_t *surface);
 EXPORT void reduce_tile(
-    ARRAY(const float, fine, rows, columns), int64_t rows, int64_t columns, ARRAY(const float, kernel, length), int64_t length,
-    int64_t per_pixel, ARRAY(float, memory, columns), ARRAY(float, out, height, width), int64_t height, int64_t width);
+    ARRAY(const float, fine, rows, columns), int64_t rows, int64_t columns, ARRAY(const float, kernel, length),
+    int64_t length, int64_t per_pixel, SCRATCH(float, memory, columns), RESULT(float, out, height, width), int64_t height,
+    int64_t width);
 
 #endif

@@ -6,24 +6,23 @@
 
 enum { MAX_ROOTS = 10 };
 
-EXPORT void five_rows(ARRAY(const double, rows, count, 5, 9), int64_t count, ARRAY(double, out, count, MAX_ROOTS, 3, 3));
+EXPORT void five_rows(ARRAY(const double, rows, count, 5, 9), int64_t count, RESULT(double, out, count, MAX_ROOTS, 3, 3));
 
 /* six_point.c */
 
-EXPORT void six_rows(ARRAY(const double, rows, count, 6, 9), int64_t count, ARRAY(double, out, count, 1, 3, 3));
+EXPORT void six_rows(ARRAY(const double, rows, count, 6, 9), int64_t count, RESULT(double, out, count, 1, 3, 3));
 
 /* pose_quality.c */
 
 EXPORT void residuals(
     ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, E, hypotheses, 3, 3), int64_t hypotheses,
-    ARRAY(double, out, hypotheses, count));
+    RESULT(double, out, hypotheses, count));
 EXPORT void qualities(
     ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, E, hypotheses, 3, 3), int64_t hypotheses,
-    double noise, ARRAY(double, out, hypotheses));
+    double noise, RESULT(double, out, hypotheses));
 EXPORT void qualities_ahead(
     ARRAY(const double, packed, 18, count), int64_t count, ARRAY(const double, R, hypotheses, 2, 3, 3),
-    ARRAY(const double, t, hypotheses, 3), int64_t hypotheses, double noise, double sigmas,
-    ARRAY(double, out, hypotheses));
+    ARRAY(const double, t, hypotheses, 3), int64_t hypotheses, double noise, double sigmas, RESULT(double, out, hypotheses));
 EXPORT void improve(
     ARRAY(const double, packed, 18, count), int64_t count, ARRAY(double, R, hypotheses, 3, 3),
     ARRAY(double, t, hypotheses, 3), double noise, int64_t hypotheses, ARRAY(const int64_t, free, freedom), int64_t freedom,
@@ -47,8 +46,8 @@ typedef struct {
 
 EXPORT int64_t minimise(
     const pose_problem_t *problem, ARRAY(double, R, 3, 3), ARRAY(double, t, 3),
-    ARRAY(double, r, problem.count + 2 * problem.chosen), ARRAY(double, J, problem.count + 2 * problem.chosen, 5),
-    ARRAY(double, w, problem.count + 2 * problem.chosen));
+    RESULT(double, r, problem.count + 2 * problem.chosen), RESULT(double, J, problem.count + 2 * problem.chosen, 5),
+    RESULT(double, w, problem.count + 2 * problem.chosen));
 
 /* patches.c, with epipolar_lines.c */
 
@@ -82,14 +81,14 @@ typedef struct {
     ARRAY(const double, rays1, rows, columns, 3);
     ARRAY(const double, jacobians1, rows, columns, 3, 2);
     ARRAY(double, out, rows, columns, PATCH_COLUMNS);
-    ARRAY(uint8_t, tries, rows, columns);
-    ARRAY(int32_t, heap, rows, columns);
+    SCRATCH(uint8_t, tries, rows, columns);
+    SCRATCH(int32_t, heap, rows, columns);
     int64_t rows, columns, step, most_tries;
 } patch_grid_t;
 
 EXPORT void align_patches(
     const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, ARRAY(const double, starts, count, 8),
-    int64_t count, ARRAY(double, out, count, PATCH_COLUMNS));
+    int64_t count, RESULT(double, out, count, PATCH_COLUMNS));
 
 /* patch_growth.c */
 
@@ -110,9 +109,9 @@ typedef struct {
 } plane_grid_t;
 
 EXPORT void fit_planes(
-    const plane_grid_t *grid, ARRAY(double, planes, grid.rows, grid.columns, 3),
-    ARRAY(double, normals, grid.rows, grid.columns, 3, 3), ARRAY(double, support, grid.rows, grid.columns),
-    ARRAY(double, squares, grid.rows, grid.columns));
+    const plane_grid_t *grid, RESULT(double, planes, grid.rows, grid.columns, 3),
+    RESULT(double, normals, grid.rows, grid.columns, 3, 3), RESULT(double, support, grid.rows, grid.columns),
+    RESULT(double, squares, grid.rows, grid.columns));
 
 /* sweep.c */
 
@@ -138,16 +137,16 @@ EXPORT int64_t sweep_cost_memory(int64_t columns);
 EXPORT int64_t sweep_path_memory(int64_t columns, int64_t levels);
 EXPORT void sweep_costs(
     const sweep_t *sweep, const image_t *image2, ARRAY(const float, samples1, sweep.rows, sweep.columns),
-    ARRAY(float, memory, sweep_cost_memory(sweep.columns)),
-    ARRAY(uint8_t, costs, sweep.rows, sweep.columns, sweep_levels(sweep.levels)));
+    SCRATCH(float, memory, sweep_cost_memory(sweep.columns)),
+    RESULT(uint8_t, costs, sweep.rows, sweep.columns, sweep_levels(sweep.levels)));
 EXPORT void sweep_surfaces(
     const surface_rules_t *rules, ARRAY(const uint8_t, costs, rules.rows, rules.columns, sweep_levels(rules.levels)),
     ARRAY(const float, samples1, rules.rows, rules.columns),
-    ARRAY(uint8_t, memory, sweep_path_memory(rules.columns, rules.levels)),
-    ARRAY(uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)));
+    SCRATCH(uint8_t, memory, sweep_path_memory(rules.columns, rules.levels)),
+    RESULT(uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)));
 EXPORT void sweep_winners(
     const surface_rules_t *rules, ARRAY(const uint16_t, total, rules.rows, rules.columns, sweep_levels(rules.levels)),
-    ARRAY(int32_t, best, rules.rows, rules.columns), ARRAY(int32_t, around, rules.rows, rules.columns, 4));
+    RESULT(int32_t, best, rules.rows, rules.columns), RESULT(int32_t, around, rules.rows, rules.columns, 4));
 
 /* Surfaces at some samples (row, column): the level there, its change from row to row and from column to column, and how
  * many levels away another surface begins. Samples count less the further they are, in units of `radius` samples, and the
@@ -161,7 +160,7 @@ typedef struct {
 
 EXPORT void sweep_rivals(
     const claims_t *claims, ARRAY(const uint8_t, costs, claims.rows, claims.columns, sweep_levels(claims.levels)),
-    ARRAY(const float, samples1, claims.rows, claims.columns), ARRAY(uint16_t, memory, sweep_levels(claims.levels)),
-    ARRAY(float, found, claims.count, 2));
+    ARRAY(const float, samples1, claims.rows, claims.columns), SCRATCH(uint16_t, memory, sweep_levels(claims.levels)),
+    RESULT(float, found, claims.count, 2));
 
 #endif

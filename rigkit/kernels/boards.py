@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.declarations import header
-
-BOARD_PLANES = header().constants["BOARD_PLANES"]
 
 Picture = NDArray[np.float32]
 """(H, W), or several of them."""
@@ -57,25 +54,20 @@ def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], aroun
     box : first column and row of the picture in the image, its width and height.
     around : squares are looked for so far beside the box of their corners, in sides of that.
     """
-    left, top, width, height = box
     rows, columns = coefficients.shape[0] - 2, coefficients.shape[1] - 2
-    places = np.empty((height, width, 2))
-    kernels().board_places(coefficients, rows, columns, left, top, width, height, around, places)
-    return places
+    return np.asarray(kernels().board_places(coefficients, rows, columns, *box, around))
 
 
 def board_picture(
     places: FloatArray, size: tuple[int, int], ends: FloatArray, paper: FloatArray, sharp_px: float
 ) -> Picture:
-    """Return the `BOARD_PLANES` of the picture, (11, H, W), blurred by `sharp_px`, of a board of R x C corners, `size`.
+    """Return the planes (11, H, W) of the picture of a board of R x C corners, `size`, blurred by `sharp_px` (api.h:
+    BOARD_PLANES).
 
     `ends` (2, 2): where, in squares, it begins and ends along columns and along rows; `paper` (4,) what is beyond each
     of these, where squares are 1 and -1.
     """
-    height, width = places.shape[:2]
-    out = np.empty((BOARD_PLANES, height, width), np.float32)
-    kernels().board_picture(places, width, height, *size, ends, paper, sharp_px, out)
-    return out
+    return np.asarray(kernels().board_picture(places, *size, ends, paper, sharp_px))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -104,20 +96,11 @@ class Shares:
         Between nodes the shares are those of a cubic, or of a straight line; up to `beyond` squares beyond the nodes
         the last two go on on a straight line.
         """
-        height, width = places.shape[:2]
-        nodes, weights = np.empty((height, width, 2), np.int32), np.empty((height, width, 2, 4), np.float32)
-        boxes = np.empty((size[0] * size[1], 4), np.int64)
-        kernels().board_shares(
-            *(places, width, height, *size, spacing, beyond, int(cubic), margin, nodes, weights, boxes)
-        )
-        return Shares(size, nodes, weights, boxes)
+        return Shares(size, *kernels().board_shares(places, *size, spacing, beyond, cubic, margin))
 
     def interpolated(self, values: FloatArray) -> Picture:
         """Return `values` (K, R, C) at the nodes as pictures (K, H, W)."""
-        height, width = self.nodes.shape[:2]
-        out = np.empty((len(values), height, width), np.float32)
-        kernels().board_values(self.nodes, self.weights, width, height, *self.size, values, len(values), out)
-        return out
+        return np.asarray(kernels().board_values(self.nodes, self.weights, values))
 
 
 def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture) -> Blocks:
@@ -126,25 +109,21 @@ def move_blocks(shares: Shares, slopes: Picture, weight: Picture, taps: Picture)
     `slopes` (2, H, W) are those of the sharp picture along u and v, `taps` (2 K + 1,) the blur, for which the boxes of
     `shares` have their margin.
     """
-    height, width = weight.shape
     blocks = Blocks.empty(shares.boxes, 2)
     room = int(areas(blocks.boxes).max(initial=1))
     kernels().move_blocks(
-        *(shares.nodes, shares.weights, width, height, *shares.size, slopes, weight, taps),
-        *(len(taps) // 2,),
-        *(blocks.boxes, blocks.starts, room, np.empty(3 * room, np.float32), len(blocks.data), blocks.data),
+        *(shares.nodes, shares.weights, *shares.size, slopes, weight, taps, len(taps) // 2),
+        *(blocks.boxes, blocks.starts, room, blocks.data),
     )
     return blocks
 
 
 def share_blocks(shares: Shares, planes: Picture) -> Blocks:
     """Return how a picture changes with values at nodes, that are interpolated and times `planes` (K, H, W)."""
-    count, height, width = planes.shape
-    blocks = Blocks.empty(shares.boxes, count)
+    blocks = Blocks.empty(shares.boxes, len(planes))
     room = int(areas(blocks.boxes).max(initial=1))
     kernels().share_blocks(
-        *(shares.nodes, shares.weights, width, height, *shares.size, planes, count, blocks.boxes, blocks.starts),
-        *(room, np.empty(room, np.float32), len(blocks.data), blocks.data),
+        *(shares.nodes, shares.weights, *shares.size, planes, blocks.boxes, blocks.starts, room, blocks.data)
     )
     return blocks
 
@@ -156,10 +135,7 @@ def block_products(groups: Sequence[Blocks], rest: Picture) -> tuple[FloatArray,
     starts = np.concatenate([group.starts + at for group, at in zip(groups, before, strict=False)])
     each = np.concatenate([np.full(len(group.boxes), group.each, np.int64) for group in groups])
     data = np.concatenate([group.data for group in groups])
-    unknowns, (height, width) = int(each.sum()), rest.shape
-    out, right = np.empty((unknowns, unknowns)), np.empty(unknowns)
-    kernels().block_products(
-        *(boxes, starts, each, np.cumsum(each) - each, len(boxes), len(data), data, rest, width, height),
-        *(unknowns, out, right),
+    products: tuple[FloatArray, FloatArray] = kernels().block_products(
+        boxes, starts, each, np.cumsum(each) - each, data, rest, int(each.sum())
     )
-    return out, right
+    return products

@@ -45,10 +45,8 @@ def brown_places(
 ) -> tuple[FloatArray, BoolArray]:
     """Return the (x, y) (2, N) in the plane at unit depth that a camera distorts to m (2, N), by Newton's method from
     `start` (2, N) inside the circle of `max_r`, and where it came to an end (N,)."""
-    plane, valid = np.array(start, order="C"), np.empty(m.shape[1], dtype=bool)
-    own, rational = _of_twelve(parameters), int(parameters.size > 9)
-    kernels().undistort_brown(own, max_r, rational, m, m.shape[1], plane, valid)
-    return plane, valid
+    plane = np.array(start, order="C")
+    return plane, kernels().undistort_brown(_of_twelve(parameters), max_r, parameters.size > 9, m, plane)
 
 
 def _of_twelve(parameters: FloatArray) -> FloatArray:
@@ -74,7 +72,7 @@ def radial_pixels(
     limits : the largest angle, rad, or the largest radius, px, that the camera sees; the other does not count.
     """
     # A copy: what is read-only takes longer to pass.
-    camera: dict[str, Any] = {"polynomial": np.array(polynomial), "terms": len(polynomial)}
+    camera: dict[str, Any] = {"polynomial": np.array(polynomial)}
     camera |= zip(("l00", "l01", "l11", "cx", "cy", "max_angle", "max_radius"), (*linear, *limits), strict=True)
     kernel = getattr(kernels(), f"differentiate_{model}")
     return _written(kernel, _RadialPoints, points, d_pixels_d_point, d_pixels_d_parameters, camera)
@@ -92,13 +90,12 @@ def _written(
     count = len(points[0])
     x, y, z = points
     by_point, by_parameters = (_memory(out, count) for out in (d_pixels_d_point, d_pixels_d_parameters))
-    at = struct.of(x=x, y=y, z=z, count=count, axes=by_point.shape[1], rows=by_parameters.shape[1], **camera)
-    u, v, valid = np.empty(count), np.empty(count), np.empty(count, dtype=bool)
-    kernel(at, by_point, by_parameters, u, v, valid)
+    at = struct.of(x=x, y=y, z=z, axes=by_point.shape[1], rows=by_parameters.shape[1], **camera)
+    projected: tuple[FloatArray, FloatArray, BoolArray] = kernel(at, by_point, by_parameters)
     for out, memory in ((d_pixels_d_point, by_point), (d_pixels_d_parameters, by_parameters)):
         if out is not None and out is not memory:
             out[...] = memory
-    return u, v, valid
+    return projected
 
 
 def _memory(out: FloatArray | None, count: int) -> FloatArray:

@@ -6,10 +6,10 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-CIRCLE_OUTCOMES, SPOT, BESIDE = (header().constants[name] for name in ("CIRCLE_OUTCOMES", "SPOT", "BESIDE"))
+BESIDE = header().constants["BESIDE"]
 
 
 @structure("circle_rules_t")
@@ -30,8 +30,4 @@ def fit_circles(
 ) -> FloatArray:
     """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `most` : pixels of
     the largest window."""
-    out, scratch = np.empty((len(pixels), CIRCLE_OUTCOMES)), np.empty((SPOT, most))
-    kernels().fit_circles(
-        *(*image_arguments(image), len(pixels), pixels, maps, bends, blur, reach, beside, rules, most, scratch, out)
-    )
-    return out
+    return np.asarray(kernels().fit_circles(image, pixels, maps, bends, blur, reach, beside, rules, most))

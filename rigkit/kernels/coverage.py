@@ -17,17 +17,15 @@ def covered_pixels(grid: IntArray, corners: Pixels, counts: IntArray, squares: f
     Of the `corners` (N, 2), with places (column, row) in their `grid` (N, 2), each view has so many as `counts` (V,)
     says. A square is as long as the longer side of those that the affine map of a view's grid into the image has.
     """
-    covered = np.empty(len(pixels), dtype=bool)
-    kernels().cover_pixels(grid, corners, len(corners), counts, len(counts), squares, pixels, len(pixels), covered)
-    return covered
+    return np.asarray(kernels().cover_pixels(grid, corners, counts, squares, pixels))
 
 
 def pairs_within(points: FloatArray, reach: float, ends: IntArray) -> IntArray:
     """Return the pairs (P, 2) of points (N, D) that are within `reach` of each other along every axis; the partners of
     each are sought between the first and the second, and the third and the fourth of its `ends` (N, 4)."""
     pairs = np.empty((USUAL_PARTNERS * len(points), 2), np.int64)
-    found = kernels().close_pairs(points, *points.shape, reach, ends, pairs, len(pairs))
+    found = kernels().close_pairs(points, reach, ends, pairs)
     if found > len(pairs):
         pairs = np.empty((found, 2), np.int64)
-        kernels().close_pairs(points, *points.shape, reach, ends, pairs, len(pairs))
+        kernels().close_pairs(points, reach, ends, pairs)
     return pairs[:found]

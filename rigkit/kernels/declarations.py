@@ -9,6 +9,7 @@ import ctypes
 import functools
 import re
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ SCALARS: dict[str, type[ctypes.c_int64] | type[ctypes.c_double] | type[ctypes.c_
 }
 
 DTYPES: dict[str, np.dtype[np.generic] | None] = {
+    "truth_t": np.dtype(np.bool_),
     "uint8_t": np.dtype(np.uint8),
     "uint16_t": np.dtype(np.uint16),
     "int32_t": np.dtype(np.int32),
@@ -28,17 +30,34 @@ DTYPES: dict[str, np.dtype[np.generic] | None] = {
     "double": np.dtype(np.float64),
     "void": None,
 }
-"""NumPy's name of a C type; `void` is of any."""
+"""NumPy's name of a C type; `void` is an image's, of bytes or of float32."""
+
+IMAGE = r"ARRAY(const void, \1, height, width), int64_t bytes, int64_t width, int64_t height"
+"""What the macro of that name stands for."""
+
+
+class Role(StrEnum):
+    """Who makes an array: the caller, or the call, which returns it or forgets it."""
+
+    GIVEN = "ARRAY"
+    RESULT = "RESULT"
+    SCRATCH = "SCRATCH"
 
 
 @dataclass(frozen=True, slots=True)
 class Array:
-    """An array that is passed by its address: its type, None for any, what its shape must be, and whether the kernel
-    only reads it."""
+    """An array that is passed by its address: its type, None for an image's, its sizes in terms of other parameters,
+    and whether the kernel only reads it."""
 
     dtype: np.dtype[np.generic] | None
-    shape: str
+    sizes: tuple[str, ...]
     read_only: bool = False
+    role: Role = Role.GIVEN
+
+    @property
+    def shape(self) -> str:
+        """The sizes as a tuple in Python."""
+        return f"({', '.join(self.sizes)},)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +102,7 @@ def parsed(text: str) -> Header:
     """Return what the header `text` declares."""
     text = re.sub(r"/\*.*?\*/", " ", text, flags=re.DOTALL)
     text = re.sub(r"^\s*#.*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"\bIMAGE\((\w+)\)", IMAGE, text)
     constants: dict[str, int] = {}
     for body in re.findall(r"\benum\s*\{(.*?)\}\s*;", text, flags=re.DOTALL):
         for entry in _split(body):
@@ -121,9 +141,10 @@ def _python(expression: str) -> str:
 def _declared(text: str, constants: dict[str, int]) -> list[Declaration]:
     """Return what one declaration declares: several members if it names several."""
     text = " ".join(text.split())
-    if found := re.fullmatch(r"ARRAY\((const )?(\w+), (\w+), (.*)\)", text):
-        const, kind, name, sizes = found.groups()
-        return [Declaration(name, kind, Array(DTYPES[kind], f"({_python(sizes)},)", const is not None))]
+    if found := re.fullmatch(r"(ARRAY|RESULT|SCRATCH)\((const )?(\w+), (\w+), (.*)\)", text):
+        role, const, kind, name, sizes = found.groups()
+        array = Array(DTYPES[kind], tuple(_split(_python(sizes))), const is not None, Role(role))
+        return [Declaration(name, kind, array)]
     found = re.fullmatch(r"(?:const )?(\w+) (.*)", text)
     if found is None:
         raise ValueError(f"api.h: cannot read {text!r}")

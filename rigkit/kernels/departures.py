@@ -50,9 +50,6 @@ class LensCorners(Struct):
             residuals=residuals,
             told=told,
             counts=counts,
-            count=len(told),
-            parameters=len(sigmas),
-            views=len(counts),
             width=size_px[0],
             height=size_px[1],
         )
@@ -64,11 +61,8 @@ class LensCorners(Struct):
         With rows in this order: the pose (w, t), the P parameters in units of `sigmas`, the displacements, the
         residual.
         """
-        out = np.empty((self.parameters + DISPLACEMENTS + 1,) * 2)
-        with_pose = np.empty((self.views, len(out) + POSE, POSE))
-        memory = np.empty(kernels().lens_memory(self.parameters))
-        kernels().lens_products(self, memory, with_pose, out)
-        return with_pose, out
+        products: tuple[FloatArray, FloatArray] = kernels().lens_products(self)
+        return products
 
 
 def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -78,9 +72,7 @@ def averaged_amounts(information: FloatArray, score: FloatArray, sizes: FloatArr
     Beforehand a is normal with mean zero, those along the radius of one of the `sizes` (S,), the others of one, all
     pairs alike; each counts as far as the images bear it out.
     """
-    out = np.empty((DISPLACEMENTS, DISPLACEMENTS))
-    kernels().average_amounts(information, score, sizes, len(sizes), out)
-    return out
+    return np.asarray(kernels().average_amounts(information, score, sizes))
 
 
 def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
@@ -89,14 +81,10 @@ def displacements(pixels: Pixels, size_px: tuple[int, int]) -> FloatArray:
     Powers of the radius, decentring (tangential distortion), thin prisms, these again with the square of the radius,
     aspect ratio and shear.
     """
-    out = np.empty((2, DISPLACEMENTS, len(pixels)))
-    kernels().displace_pixels(pixels[:, 0], pixels[:, 1], len(pixels), *size_px, out)
-    return out
+    return np.asarray(kernels().displace_pixels(pixels[:, 0], pixels[:, 1], *size_px))
 
 
 def displacement(u: FloatArray, v: FloatArray, amounts: FloatArray, size_px: tuple[int, int]) -> FloatArray:
     """Return how far amounts (J,) of the displacements move pixels u, v (M,), (2, M) px; beyond the corners of the
     image as on the circle through them."""
-    out = np.empty((2, len(u)))
-    kernels().displace_by(u, v, len(u), *size_px, amounts, out)
-    return out
+    return np.asarray(kernels().displace_by(u, v, *size_px, amounts))

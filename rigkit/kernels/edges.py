@@ -6,14 +6,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-LAG, OUTCOMES = (header().constants[name] for name in ("LAG", "OUTCOMES"))
+LAG = header().constants["LAG"]
 
 LAGS = tuple((-up, right) for up in range(LAG + 1) for right in range(-LAG, LAG + 1) if up or right >= 0)
 """How far, in rows and columns, two pixels lie apart whose noise is compared; the opposite ones are the same."""
@@ -57,18 +56,12 @@ def fit_corners(
     contrast: FloatArray,
     rules: Rules,
 ) -> FloatArray:
-    """Return the `OUTCOMES` of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
-    out = np.empty((len(pixels), OUTCOMES))
-    kernels().fit_edges(
-        *(*image_arguments(image), len(pixels), pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper),
-        *(single, sign, blur, window_blur, contrast, ends, rules, scratch_of(rules), out),
+    """Return the OUTCOMES (api.h) of N corners, (N, 35). Arguments as `detection.subpixel.edge_fit.fit_edges`."""
+    out = kernels().fit_edges(
+        *(image, pixels, sides, curvature, curvature_sigma, gaps, tilts, reach, paper),
+        *(single, sign, blur, window_blur, contrast, ends, rules),
     )
-    return out
-
-
-def scratch_of(rules: Rules) -> NDArray[np.float32]:
-    """Return the room that the windows of a fit take."""
-    return np.empty(kernels().edges_scratch(rules), np.float32)
+    return np.asarray(out)
 
 
 class NoiseOfCorners(NamedTuple):
@@ -96,16 +89,12 @@ class NoiseOfCorners(NamedTuple):
 
 def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.sigma_factors` does."""
-    out = np.empty(boards)
-    kernels().sigma_factors(*corners, len(corners.pixels), boards, rules, out)
-    return out
+    return np.asarray(kernels().sigma_factors(*corners, boards, rules))
 
 
 def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.uneven_factors` does."""
-    out = np.empty(len(corners.pixels))
-    kernels().uneven_factors(*corners, len(corners.pixels), len(usual), usual, rules, out)
-    return out
+    return np.asarray(kernels().uneven_factors(*corners, usual, rules))
 
 
 def line_bends(
@@ -115,6 +104,5 @@ def line_bends(
     count = len(sides_px)
     if np.count_nonzero(cells) != count:
         raise ValueError(f"line_bends: {count} sides for {np.count_nonzero(cells)} cells")
-    out, out_sigma = np.empty((2, count, 2))
-    kernels().line_bends(pixels, sigma_px, cells, *cells.shape, count, sides_px, rules, out, out_sigma)
-    return out, out_sigma
+    bends: tuple[FloatArray, FloatArray] = kernels().line_bends(pixels, sigma_px, cells, sides_px, rules)
+    return bends

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
 _CONSTANTS = header().constants
@@ -43,28 +43,17 @@ class RingRules(Struct):
     def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
         """Return the rules; `circle` (2 * HALF, 2) are the samples of a ring of radius 1."""
         samples = np.ascontiguousarray(circle, np.float32)
-        return cls.of(circle=samples, gains=gains, gain_count=len(gains), **numbers)
+        return cls.of(circle=samples, gains=gains, **numbers)
 
 
 @structure("link_rules_t")
 class LinkRules(Struct):
     """How links are found."""
 
-    @classmethod
-    def make(cls, neighbours: int, along: FloatArray, most: int, **numbers: float) -> LinkRules:
-        """Return the rules; `along` are the places of an edge that are looked at."""
-        places = np.ascontiguousarray(along, np.float64)
-        return cls.of(neighbours=neighbours, along=places, places=len(places), most=most, **numbers)
-
 
 @structure("image_t")
 class ImageOf(Struct):
     """An image of brightness, float32."""
-
-    @classmethod
-    def make(cls, image: Image) -> ImageOf:
-        height, width = image.shape
-        return cls.of(brightness=image, height=height, width=width)
 
 
 @structure("corners_t")
@@ -76,30 +65,21 @@ def has_mosaic(image: GreyImage, step: int, least: float, share: float) -> bool:
     """Return whether a place in squares of 2 x 2 pixels is brighter or darker than the mean of its square by `share` of
     that: in the upper median over those squares, of every `step`-th both ways, that are brighter than the upper median
     of all, and than `least`."""
-    grey, bytewise, width, height = image_arguments(image)
-    scratch = np.empty(2 * (height // 2 // step) * (width // 2 // step))
-    return bool(kernels().has_mosaic(grey, bytewise, width, height, step, least, share, scratch))
+    return bool(kernels().has_mosaic(image, step, least, share))
 
 
 def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:
     """Return how many inner pixels of every `apart`-th row from the `first` on stand out of all of their neighbours by
     more than `step` and by more than `share` of the range of brightness in these rows; and that range."""
-    span = np.empty(1)
-    grey, bytewise, width, height = image_arguments(image)
-    count = kernels().count_bad_pixels(grey, bytewise, width, height, first, apart, step, share, span)
+    count, span = kernels().count_bad_pixels(image, first, apart, step, share)
     return count, float(span[0])
 
 
 def shrunk(image: GreyImage, factor: int) -> Image:
     """Return the means of `factor` x `factor` pixels."""
-    height, width = image.shape
-    bytewise = image.dtype == np.uint8 and factor <= MAX_SUMMED
-    image = image if bytewise else image.astype(np.float32, copy=False)
-    sums = np.empty(2 * width, np.uint16) if bytewise else np.empty(width, np.float32)
-    out = np.empty((height // factor, width // factor), np.float32)
-    shrink = kernels().shrink_bytes if bytewise else kernels().shrink_floats
-    shrink(np.ascontiguousarray(image), height, width, factor, sums, out)
-    return out
+    if image.dtype == np.uint8 and factor <= MAX_SUMMED:
+        return np.asarray(kernels().shrink_bytes(image, factor))
+    return np.asarray(kernels().shrink_floats(image.astype(np.float32, copy=False), factor))
 
 
 def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[Image, Image, Image]:
@@ -110,10 +90,7 @@ def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[Image, Image,
     # One block of memory: the allocator keeps it for the next image, as it would not two.
     block = np.empty(height * width + half_height * half_width, np.float32)
     smooth, half = block[: height * width].reshape(height, width), block[height * width :].reshape(-1, half_width)
-    above = np.empty((height // STRIP_ROWS + 1, width // STRIP + 1), np.float32)
-    scratch = np.empty(width + 4 + 3 * ((height - 3) // step + 1) * ((width - 3) // step + 1), np.float32)
-    kernels().make_level(*image_arguments(image), step, rules, scratch, smooth, half, above)
-    return smooth, half, above
+    return smooth, half, kernels().make_level(image, step, rules, smooth, half)
 
 
 def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tuple[NDArray[np.int32], Image]:
@@ -123,15 +100,12 @@ def peaks(smooth: Image, above: Image, limit: int, side: int, finest: int) -> tu
     pixels, to one part in `finest`.
     """
     height, width = smooth.shape
-    most = (height // 3 + 1) * (width // 3 + 1)
-    at, response = np.empty((most, 2), np.int32), np.empty(most, np.float32)
-    scratch, high = np.empty(5 * (width + STRIP + 4), np.float32), np.empty(5 * (width // STRIP + 1), np.uint8)
-    found = kernels().find_peaks(smooth, height, width, above, scratch, high, at, response)
+    found, at, response = kernels().find_peaks(smooth, above)
     at, response = at[:found], response[:found]
     if found > limit:
         squares = np.zeros((height // side + 1) * (width // side + 1), np.float32)
-        bins, share = np.zeros(finest + 1, np.int32), np.empty(found, np.int32)
-        found = kernels().keep_strongest(at, response, found, height, width, side, limit, finest, squares, bins, share)
+        bins = np.zeros(finest + 1, np.int32)
+        found = kernels().keep_strongest(at, response, height, width, side, limit, finest, squares, bins)
     return at[:found], response[:found]
 
 
@@ -173,28 +147,23 @@ def corners(
     known : (K, 2) corners that are known; one within `reach` of these is repeated.
     """
     at, response = np.ascontiguousarray(at, np.int32), np.ascontiguousarray(response, np.float32)
-    count, (height, width), found = len(at), smooth.shape, np.empty(2, np.int64)
-    (saddles, pixels, angles), contrast = np.empty((3, count, 2)), np.empty(count)
-    smeared, repeated = np.empty((2, count), np.bool_)
-    if not kernels().find_corners(
-        *(smooth, width, height, at, response, count, *tests, rules, *to_full, known, len(known), reach),
-        *(saddles, pixels, angles, contrast, smeared, repeated, found),
-    ):
+    done, saddles, *of_corners, found = kernels().find_corners(
+        smooth, at, response, *tests, rules, *to_full, known, reach
+    )
+    if not done:
         raise MemoryError
     near, good = found.tolist()
-    return CornersOfLevel(
-        saddles[:near], pixels[:good], angles[:good], contrast[:good], smeared[:good], repeated[:good]
-    )
+    return CornersOfLevel(saddles[:near], *(values[:good] for values in of_corners))
 
 
 def near_any(fresh: FloatArray, known: FloatArray, reach: float) -> BoolArray:
     """Return which of `fresh` (N, 2) lie within `reach` of any of `known` (M, 2)."""
     if not len(fresh) or not len(known):
         return np.zeros(len(fresh), np.bool_)
-    mark = np.empty(len(fresh), np.bool_)
-    if not kernels().mark_known(fresh, len(fresh), known, len(known), reach, mark):
+    done, mark = kernels().mark_known(fresh, known, reach)
+    if not done:
         raise MemoryError
-    return mark
+    return np.asarray(mark)
 
 
 def links(
@@ -214,10 +183,8 @@ def links(
     largest distance of the places that are looked at from the edge.
     """
     least, most = bounds
-    given = _CornerArrays.of(
-        pixels=pixels, lines=lines, contrast=contrast, least=least, most=most, reach=reach, count=len(pixels)
-    )
-    nearest, both = np.empty((2, len(pixels), 4), np.int64)
-    if not kernels().find_links(given, ImageOf.make(image), scale, offset, rules, nearest, both):
+    given = _CornerArrays.of(pixels=pixels, lines=lines, contrast=contrast, least=least, most=most, reach=reach)
+    done, both = kernels().find_links(given, ImageOf.of(brightness=image), scale, offset, rules)
+    if not done:
         raise MemoryError
     return np.asarray(both)

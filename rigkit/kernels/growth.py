@@ -9,10 +9,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
-from rigkit.kernels.declarations import header
 from rigkit.kernels.front import ImageOf, RingRules
-
-FIT_COLUMNS = header().constants["FIT_COLUMNS"]
 
 
 @structure("fit_rules_t")
@@ -27,9 +24,7 @@ class GrowthRules(Struct):
     @classmethod
     def make(cls, predictions: Sequence[FitRules], ring: RingRules, along: np.ndarray, **numbers: float) -> GrowthRules:
         """Return the rules; `along` are the places of an edge that are looked at."""
-        places = np.ascontiguousarray(along, np.float64)
-        both = (FitRules * 2)(*predictions)
-        return cls.of(predictions=both, ring=ring, along=places, places=len(places), **numbers)
+        return cls.of(predictions=(FitRules * 2)(*predictions), ring=ring, along=along, **numbers)
 
 
 @structure("pyramid_level_t")
@@ -52,15 +47,13 @@ class GridBuckets(Struct):
         memory = np.empty(kernels().squares_memory(len(points)), np.int32)
         squares = cls()
         squares._kept = {"points": points, "memory": memory}
-        kernels().sort_points(points, len(points), memory, squares)
+        kernels().sort_points(points, memory, squares)
         return squares
 
 
 def fit(lattice: FloatArray, cells: BoolArray, rules: FitRules) -> FloatArray:
     """Return the fits of M `cells` (R, C) of `lattice` (R, C, 2): (M, 12), in the order of `LocalFit`."""
-    out = np.empty((int(np.count_nonzero(cells)), FIT_COLUMNS))
-    kernels().fit_cells(lattice, *cells.shape, cells, rules, len(out), out)
-    return out
+    return np.asarray(kernels().fit_cells(lattice, cells, rules, int(np.count_nonzero(cells))))
 
 
 def grown(
@@ -78,13 +71,10 @@ def grown(
 
     Returns the rings that are left if the lattice has reached the border of its arrays, -1 if it has grown all it can.
     """
-    rows, columns = contrast.shape
-    image = np.ascontiguousarray(image, np.float32)
-    due = np.ones((2, rows, columns), np.uint8)
-    fresh, where = np.empty((rows * columns, 3)), np.empty(rows * columns, np.int64)
-    sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=due, rows=rows, columns=columns, sign=sign)
-    level = _PyramidLevel.of(image=ImageOf.make(image), scale=scale, offset=offset)
-    return int(kernels().grow_lattice(sheet, level, saddles, rules, rings, fresh, where))
+    brightness = np.ascontiguousarray(image, np.float32)
+    sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=np.ones((2, *contrast.shape), np.uint8), sign=sign)
+    level = _PyramidLevel.of(image=ImageOf.of(brightness=brightness), scale=scale, offset=offset)
+    return int(kernels().grow_lattice(sheet, level, saddles, rules, rings))
 
 
 def components_of(links: IntArray) -> tuple[int, IntArray, IntArray, IntArray, IntArray]:
@@ -92,9 +82,7 @@ def components_of(links: IntArray) -> tuple[int, IntArray, IntArray, IntArray, I
 
     `links` (N, 4) are 4 * the neighbour + its arm, -1 for none.
     """
-    count = len(links)
-    links = np.array(links, np.int64, order="C")
-    label, grid, turn = np.empty(count, np.int64), np.empty((count, 2), np.int64), np.empty(count, np.int64)
-    members, queue, bound = np.empty(count, np.int64), np.empty(2 * count, np.int64), np.empty(4 * count, np.uint8)
-    found = kernels().find_components(count, links, label, grid, turn, members, queue, bound)
-    return int(found), label, grid, turn, members
+    found: tuple[int, IntArray, IntArray, IntArray, IntArray] = kernels().find_components(
+        np.array(links, np.int64, order="C")
+    )
+    return found

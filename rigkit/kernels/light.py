@@ -9,12 +9,10 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-LIGHT_OUTCOMES, LIGHT_ASIDE, LIGHT_BLOCK = (
-    header().constants[name] for name in ("LIGHT_OUTCOMES", "LIGHT_ASIDE", "LIGHT_BLOCK")
-)
+LIGHT_ASIDE, LIGHT_BLOCK = (header().constants[name] for name in ("LIGHT_ASIDE", "LIGHT_BLOCK"))
 
 
 @structure("light_rules_t")
@@ -35,12 +33,7 @@ def fit_light_steps(
     """Return the outcomes of N corners, (N, 8). Arguments as `detection.subpixel.shadows.light_steps`; what a step
     of the fit changes is `most_step` (11,) at most."""
     most = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
-    out = np.empty((len(start), LIGHT_OUTCOMES))
-    kernels().fit_light_steps(
-        *(*image_arguments(image), len(start), start, sides, curvature, aside),
-        *(blur, most_step, rules, most, np.empty((4, most)), out),
-    )
-    return out
+    return np.asarray(kernels().fit_light_steps(image, start, sides, curvature, aside, blur, most_step, rules, most))
 
 
 def lit_unevenly(
@@ -58,12 +51,7 @@ def lit_unevenly(
 
     The last four are its constants.
     """
-    out = np.empty(len(pixels), np.bool_)
-    kernels().lit_unevenly(
-        *(*image_arguments(image), len(pixels), pixels, sides, aside, ends),
-        *(along, len(along), most_aside, least_px, uneven, out),
-    )
-    return out
+    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, most_aside, least_px, uneven))
 
 
 @structure("paper_rules_t")
@@ -84,12 +72,7 @@ def find_paper(
     rules: PaperRules,
 ) -> tuple[FloatArray, FloatArray]:
     """Return `paper` and `gaps`, (N, 2, 2) each, as `detection.subpixel.outer_squares.with_paper` sets them."""
-    library, count = kernels(), len(pixels)
-    scratch, near = np.empty(2 * rules.step_count + 4 * count), np.empty(4 * count, np.int64)
-    memory = np.empty(library.paper_memory(count), np.uint8)
-    paper, out_gaps = np.empty((2, count, 2, 2))
-    library.find_paper(
-        *(*image_arguments(image), count, pixels, sides, gaps, ends, contrast, blur, sign, owner),
-        *(rules, scratch, memory, near, paper, out_gaps),
+    found: tuple[FloatArray, FloatArray] = kernels().find_paper(
+        image, pixels, sides, gaps, ends, contrast, blur, sign, owner, rules
     )
-    return paper, out_gaps
+    return found

@@ -20,10 +20,8 @@ class BoardViews(Struct):
     def placed(self, first: int, stop: int) -> tuple[FloatArray, FloatArray]:
         """Return the lever arms R X and the points R X + t, (3, N) mm each, of the corners of the views from `first` to
         before `stop`."""
-        count = (stop - first) * self.corners
-        lever, points = np.empty((3, count)), np.empty((3, count))
-        kernels().place_corners(self, first, count, lever, points)
-        return lever, points
+        placed: tuple[FloatArray, FloatArray] = kernels().place_corners(self, first, (stop - first) * self.corners)
+        return placed
 
 
 @structure("view_sums_t")
@@ -46,7 +44,6 @@ class ViewSums:
     products: FloatArray
     own: FloatArray
     poses: FloatArray
-    _memory: FloatArray = field(repr=False)
     _struct: _ViewSumsStruct = field(repr=False)
 
     @classmethod
@@ -61,8 +58,7 @@ class ViewSums:
             "own": np.zeros((r, 3, across + 3)),
             "poses": np.zeros((v, r, 3, 6)),
         }
-        struct = _ViewSumsStruct.of(**arrays, views=v, corners=c, across=across, released=r)
-        return cls(seen=seen, **arrays, _memory=np.empty(kernels().rows_memory(across)), _struct=struct)
+        return cls(seen=seen, **arrays, _struct=_ViewSumsStruct.of(**arrays))
 
     def add(
         self,
@@ -74,11 +70,7 @@ class ViewSums:
     ) -> None:
         """Add the views from `first` on, of N corners in all: `d_pixels_d_point` (2, 3, N), `d_pixels_d_parameters`
         (2, P, N) and what `Camera.derivatives` returns with them, and the `lever` arms (3, N)."""
-        count, parameters = lever.shape[1], d_pixels_d_parameters.shape[1]
-        kernels().add_views(
-            *(self.seen, first, count, parameters, d_pixels_d_point, d_pixels_d_parameters, *projected, lever),
-            *(self._memory, self._struct),
-        )
+        kernels().add_views(self.seen, first, d_pixels_d_point, d_pixels_d_parameters, *projected, lever, self._struct)
 
 
 @structure("normal_equations_t")
@@ -98,13 +90,9 @@ def schur_step(
     gg, gp, pp : (G, G), (V, G, 6) and (V, 6, 6) of J^T W J: globals, globals with poses, poses.
     g, p : (G,) and (V, 6) of J^T W r.
     """
-    views, count, _ = gp.shape
-    normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p, globals=count, views=views)
-    step_g, step_p, predicted = np.empty(count), np.empty((views, 6)), np.empty(1)
-    memory = np.empty(kernels().schur_memory(count, views))
-    if not kernels().solve_schur(normal, damping, memory, step_g, step_p, predicted):
-        return None
-    return step_g, step_p, float(predicted[0])
+    normal = _BlockSystem.of(gg=gg, gp=gp, pp=pp, g=g, p=p)
+    positive_definite, step_g, step_p, predicted = kernels().solve_schur(normal, damping)
+    return (step_g, step_p, float(predicted[0])) if positive_definite else None
 
 
 def chebyshev_series(matrices: FloatArray, vectors: FloatArray, bound: float, series: FloatArray) -> FloatArray:
@@ -112,7 +100,4 @@ def chebyshev_series(matrices: FloatArray, vectors: FloatArray, bound: float, se
 
     `series` has two terms or more; the eigenvalues of M lie between 0 and `bound`.
     """
-    out = np.empty(vectors.shape)
-    memory = np.empty(3 * vectors.shape[1])
-    kernels().sum_series(matrices, vectors, *vectors.shape, bound, series, len(series), memory, out)
-    return out
+    return np.asarray(kernels().sum_series(matrices, vectors, bound, series))

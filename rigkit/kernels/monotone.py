@@ -32,7 +32,6 @@ def inverses(
     target : (N,) by which the `table` of x (cells + 1,), even in it from the first of `values` to the second, is read.
     """
     linear, factor, offset = parts
-    out = np.empty(len(target))
     functions = _Increasing.of(
         polynomial=polynomial,
         linear=linear,
@@ -40,19 +39,16 @@ def inverses(
         offset=offset,
         target=target,
         table=table,
-        count=len(out),
-        terms=len(polynomial),
         cells=len(table) - 1,
         first=values[0],
         last=values[1],
         low=limits[0],
         high=limits[1],
     )
-    kernels().invert_increasing(functions, out)
-    return out
+    return np.asarray(kernels().invert_increasing(functions))
 
 
 def smallest_root(polynomials: FloatArray, limit: float) -> float:
     """Return the smallest root in (0, `limit`] of polynomials (M, K) that do not vanish at zero, of the power zero
     first, or `limit` where there is none; NaN where one overflows."""
-    return float(kernels().smallest_root(polynomials, *polynomials.shape, limit, np.empty(2 * polynomials.shape[1])))
+    return float(kernels().smallest_root(polynomials, limit))

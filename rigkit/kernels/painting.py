@@ -27,17 +27,8 @@ class PaintedTile(Struct):
     ) -> PaintedTile:
         """Return a tile of (rows, TILE_NODES) and (TILE_NODES, columns) weights; `rays` (rows, columns, 3) where they
         are not to be interpolated from those at the `nodes`, (TILE_NODES, TILE_NODES, 3)."""
-        rows, columns = len(weights_v), weights_u.shape[1]
-        return cls.of(
-            weights_v=weights_v,
-            weights_u=weights_u,
-            nodes=nodes,
-            rays=np.empty((0, columns, 3)) if rays is None else np.ascontiguousarray(rays, np.float64),
-            rows=rows,
-            columns=columns,
-            per_pixel=per_pixel,
-            ray_rows=0 if rays is None else rows,
-        )
+        told = np.empty((0, weights_u.shape[1], 3)) if rays is None else rays
+        return cls.of(weights_v=weights_v, weights_u=weights_u, nodes=nodes, rays=told, per_pixel=per_pixel)
 
 
 @structure("surface_t")
@@ -59,8 +50,4 @@ def paint_surface(fine: Float32, tile: PaintedTile, surface: PaintedSurface) -> 
 def reduce_tile(fine: Float32, kernel: Float32, per_pixel: int, shape: tuple[int, int]) -> Float32:
     """Return the pixels (height, width = `shape`) of sub-samples `fine`: along each axis `kernel` weighs those from
     `per_pixel` times the pixel's place on."""
-    out = np.empty(shape, np.float32)
-    kernels().reduce_tile(
-        fine, *fine.shape, kernel, len(kernel), per_pixel, np.empty(fine.shape[1], np.float32), out, *shape
-    )
-    return out
+    return np.asarray(kernels().reduce_tile(fine, kernel, per_pixel, *shape))

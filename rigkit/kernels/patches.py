@@ -25,8 +25,8 @@ class Pyramid(Struct):
 
     @classmethod
     def make(cls, levels: Sequence[NDArray[np.float32]]) -> Pyramid:
-        images = [ImageOf.make(np.ascontiguousarray(level, np.float32)) for level in levels[:MAX_LEVELS]]
-        blank = ImageOf.make(np.zeros((1, 1), np.float32))
+        images = [ImageOf.of(brightness=np.ascontiguousarray(level, np.float32)) for level in levels[:MAX_LEVELS]]
+        blank = ImageOf.of(brightness=np.zeros((1, 1), np.float32))
         out = cls.of(levels=(ImageOf * MAX_LEVELS)(*images, *[blank] * (MAX_LEVELS - len(images))), count=len(images))
         out._kept["images"] = images, blank
         return out
@@ -48,8 +48,6 @@ class EpipolarKnowledge(Struct):
         """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where there is none."""
         return cls.of(
             rays2=rays2,
-            rows=rays2.shape[0],
-            columns=rays2.shape[1],
             spacing=float(spacing),
             E21=tuple(E21.reshape(9)),
             sigma=sigma,
@@ -94,9 +92,7 @@ def starts_of(pixels1: Pixels, pixels2: Pixels, A21: Affines) -> FloatArray:
 
 def aligned(first: Pyramid, second: Pyramid, rules: PatchRules, starts: FloatArray) -> PatchTable:
     """Return the patches (N,) aligned from `starts` (N, 8)."""
-    out = np.empty((len(starts), PATCH_COLUMNS))
-    kernels().align_patches(first, second, rules, starts, len(starts), out)
-    return _table(out)
+    return _table(kernels().align_patches(first, second, rules, starts))
 
 
 def grown(
@@ -111,18 +107,7 @@ def grown(
     seeds: FloatArray,
 ) -> PatchTable:
     """Return the patches (R * C,) grown from `seeds` (S, 8) over the nodes of rays (R, C, 3), `step` pixels apart."""
-    rows, columns = rays1.shape[:2]
-    out = np.empty((rows, columns, PATCH_COLUMNS))
-    grid = _Grid.of(
-        rays1=rays1,
-        jacobians1=jacobians1,
-        out=out,
-        tries=np.empty((rows, columns), np.uint8),
-        heap=np.empty((rows, columns), np.int32),
-        rows=rows,
-        columns=columns,
-        step=step,
-        most_tries=most_tries,
-    )
-    kernels().grow_patches(first, second, epipolar, rules, grid, seeds, len(seeds))
+    out = np.empty((*rays1.shape[:2], PATCH_COLUMNS))
+    grid = _Grid.of(rays1=rays1, jacobians1=jacobians1, out=out, step=step, most_tries=most_tries)
+    kernels().grow_patches(first, second, epipolar, rules, grid, seeds)
     return _table(out.reshape(-1, PATCH_COLUMNS))

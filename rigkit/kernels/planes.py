@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
 from rigkit.core.arrays import FloatArray
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
@@ -35,18 +33,5 @@ def fitted_planes(
     a plane predicts them. Of a neighbour at the Mahalanobis distance s from a plane the weight is
     1 / (1 + s^2 / (3 turn^2))^2 (Geman and McClure), in the first round with the uncertainty of the node's own plane.
     """
-    rows, columns = values.shape[:2]
-    grid = _PlaneGrid.of(
-        values=values,
-        information=information,
-        frames=frames,
-        rows=rows,
-        columns=columns,
-        reach=reach,
-        rounds=rounds,
-        turn=turn,
-    )
-    planes, normals = np.empty((rows, columns, 3)), np.empty((rows, columns, 3, 3))
-    support, squares = np.empty((2, rows, columns))
-    kernels().fit_planes(grid, planes, normals, support, squares)
-    return PlaneFits(planes, normals, support, squares)
+    grid = _PlaneGrid.of(values=values, information=information, frames=frames, reach=reach, rounds=rounds, turn=turn)
+    return PlaneFits(*kernels().fit_planes(grid))

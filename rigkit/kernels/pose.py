@@ -16,7 +16,7 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-NO_MEMORY, MAX_ROOTS = (header().constants[name] for name in ("NO_MEMORY", "MAX_ROOTS"))
+NO_MEMORY = header().constants["NO_MEMORY"]
 
 
 @structure("pose_problem_t")
@@ -26,23 +26,17 @@ class _Problem(Struct):
 
 def residuals(packed: FloatArray, E21: Mat3) -> FloatArray:
     """Return the distances (H, N) in sigmas of the matches `packed` (18, N) from hypotheses (H, 3, 3)."""
-    out = np.empty((len(E21), packed.shape[1]))
-    kernels().residuals(packed, packed.shape[1], E21, len(E21), out)
-    return out
+    return np.asarray(kernels().residuals(packed, E21))
 
 
 def qualities(packed: FloatArray, E21: Mat3, noise: float) -> FloatArray:
     """Return the sums (H,) of the marginal quality at a noise level of hypotheses (H, 3, 3)."""
-    out = np.empty(len(E21))
-    kernels().qualities(packed, packed.shape[1], E21, len(E21), noise, out)
-    return out
+    return np.asarray(kernels().qualities(packed, E21, noise))
 
 
 def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, sigmas: float) -> FloatArray:
     """Return the sums (H,) over what lies ahead, of rotations (H, 2, 3, 3) and directions (H, 3), as pose_quality.c."""
-    out = np.empty(len(t))
-    kernels().qualities_ahead(packed, packed.shape[1], R, t, len(t), noise, sigmas, out)
-    return out
+    return np.asarray(kernels().qualities_ahead(packed, R, t, noise, sigmas))
 
 
 def improve(
@@ -50,7 +44,7 @@ def improve(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
-    kernels().improve(packed, packed.shape[1], R, t, noise, len(R), free, len(free), most_steps, settled_rad)
+    kernels().improve(packed, R, t, noise, free, most_steps, settled_rad)
     return R, t
 
 
@@ -77,18 +71,13 @@ def minimise(
         point_weights=point_weights,
         which=which,
         free=free,
-        count=packed.shape[1],
-        chosen=len(which),
-        freedom=len(free),
         loss=loss[0],
         most_iterations=most_iterations,
         scale=loss[1],
         tolerance=tolerance,
     )
-    rows = packed.shape[1] + 2 * len(which)
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64)
-    r, jacobian, weights = np.empty(rows), np.empty((rows, 5)), np.empty(rows)
-    iterations = kernels().minimise(problem, R, t, r, jacobian, weights)
+    iterations, r, jacobian, weights = kernels().minimise(problem, R, t)
     if iterations == NO_MEMORY:
         raise MemoryError
     return R, t, r, jacobian, weights, abs(iterations), iterations > 0 or not len(free)
@@ -96,9 +85,7 @@ def minimise(
 
 def five_rows(rows: FloatArray) -> Mat3:
     """Return up to ten E (B, 10, 3, 3) of `rows` (B, 5, 9), NaN where there are fewer."""
-    out = np.empty((len(rows), MAX_ROOTS, 3, 3))
-    kernels().five_rows(rows, len(rows), out)
-    return out
+    return np.asarray(kernels().five_rows(rows))
 
 
 def six_rows(rows: FloatArray) -> Mat3:
@@ -108,6 +95,4 @@ def six_rows(rows: FloatArray) -> Mat3:
     The monomials are scaled so that the answer does not depend on the choice of the basis: all 27 products of three of
     the unknowns, of which ten differ, have the length one together.
     """
-    out = np.empty((len(rows), 1, 3, 3))
-    kernels().six_rows(rows, len(rows), out)
-    return out
+    return np.asarray(kernels().six_rows(rows))

@@ -9,12 +9,11 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import image_arguments
 from rigkit.kernels.declarations import header
 
 _CONSTANTS = header().constants
-SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS, FIT_SCRATCH = (
-    _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS", "FIT_SCRATCH")
+SIDES, SECOND, GAIN, CURVATURE, HEIGHTS, SURFACE_COLUMNS = (
+    _CONSTANTS[name] for name in ("SIDES", "SECOND", "GAIN", "CURVATURE", "HEIGHTS", "SURFACE_COLUMNS")
 )
 SURFACE_DEGREE = _CONSTANTS["SURFACE_DEGREE"]
 """Of the polynomial that a lens adds to a perspective: a board that fills a fisheye of 180 degrees takes degree 7."""
@@ -32,8 +31,8 @@ def perspective(places: FloatArray, pixels: FloatArray) -> tuple[FloatArray, flo
     """Return the homography (3, 3) that takes `places` (N, 2) nearest to `pixels` (N, 2), of depth 1 at their mean, and
     the least depth of a place (Hartley and Zisserman, Multiple View Geometry, 2004, algorithm 4.2).
     """
-    out = np.empty((3, 3))
-    return out, float(kernels().fit_perspective(places, pixels, len(places), out))
+    depth, homography = kernels().fit_perspective(places, pixels)
+    return homography, depth
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -108,21 +107,14 @@ class TagSurface:
 
 def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     """Return what a homography (3, 3) does of `places` (M, 2), without curvatures and heights."""
-    out = np.empty((len(places), SURFACE_COLUMNS))
-    kernels().project_places(places, len(places), homography, out)
-    return TagSurface(out)
+    return TagSurface(kernels().project_places(places, homography))
 
 
-class _Room:
-    """The arrays that polynomials of `most` terms at most through `count` points are worked out in."""
-
-    def __init__(self, count: int, most: int) -> None:
-        terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, most) - 1]
-        self.sizes = (count, terms)
-        self.scratch = np.empty((terms, count)), np.empty((FIT_SCRATCH, count))
-        off, gain = np.empty((2, count))
-        shape = (np.empty(3), np.zeros((terms, terms)), np.empty((terms, 2)), np.empty(SURFACE_DEGREE + 1))
-        self.results = (*shape, off, gain, np.empty(1))
+def _empty_triangle(most: int) -> FloatArray:
+    """Return what the kernel writes the triangle (T, T) of a polynomial to that has `most` terms at most: those of
+    whole degrees."""
+    terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, most) - 1]
+    return np.zeros((terms, terms))
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -154,9 +146,9 @@ class Polynomials:
     @classmethod
     def through(cls, places: FloatArray, values: FloatArray, most: int, most_leverage: float) -> Polynomials:
         """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
-        room = _Room(len(places), most)
-        best = kernels().fit_polynomials(places, values, *room.sizes, most_leverage, *room.scratch, *room.results)
-        return cls._of(room, best)
+        triangle = _empty_triangle(most)
+        best, unit, *fitted = kernels().fit_polynomials(places, values, most_leverage, triangle)
+        return cls._of(best, unit, triangle, *fitted)
 
     @classmethod
     def beside_perspective(
@@ -164,16 +156,22 @@ class Polynomials:
     ) -> tuple[FloatArray, Polynomials] | None:
         """Return the `perspective` that takes `places` (N, 2) nearest to `pixels` (N, 2), and polynomials through what
         it leaves; None where a place is nearer than `nearest` in it."""
-        room, homography = _Room(len(places), most), np.empty((3, 3))
-        best = kernels().fit_map(
-            *(places, pixels, *room.sizes, most_leverage, nearest, np.empty((len(places), 2))),
-            *(*room.scratch, homography, *room.results),
-        )
-        return None if best < 0 else (homography, cls._of(room, best))
+        triangle = _empty_triangle(most)
+        best, homography, unit, *fitted = kernels().fit_map(places, pixels, most_leverage, nearest, triangle)
+        return None if best < 0 else (homography, cls._of(best, unit, triangle, *fitted))
 
     @classmethod
-    def _of(cls, room: _Room, best: int) -> Polynomials:
-        unit, triangle, told, misses, off, gain, scatter = room.results
+    def _of(
+        cls,
+        best: int,
+        unit: FloatArray,
+        triangle: FloatArray,
+        told: FloatArray,
+        misses: FloatArray,
+        off: FloatArray,
+        gain: FloatArray,
+        scatter: FloatArray,
+    ) -> Polynomials:
         plain = int((misses <= HARDLY_MORE * misses[best]).argmax())
         return cls(
             unit=unit,
@@ -194,18 +192,13 @@ class Polynomials:
         degrees run wild, and what counts is the usual miss times the gain.
         """
         out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
-        kernels().add_polynomial(
-            *(wanted, len(wanted), self.unit, len(self.told), self.plain),
-            *(self.triangle, self.told, self.misses, surest, out),
-        )
+        kernels().add_polynomial(wanted, self.unit, self.plain, self.triangle, self.told, self.misses, surest, out)
         return TagSurface(out)
 
 
 def maps_of_quads(quads: FloatArray) -> FloatArray:
     """Return the homographies (N, 3, 3) of the unit square, corners (0,0) (1,0) (1,1) (0,1), to the quads (N, 4, 2)."""
-    out = np.empty((len(quads), 3, 3))
-    kernels().maps_of_quads(quads, len(quads), out)
-    return out
+    return np.asarray(kernels().maps_of_quads(quads))
 
 
 def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatArray, FloatArray]:
@@ -215,9 +208,8 @@ def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatA
     `quads` (N, 4, 2) are the corners of each tag; brightness is bilinear at the middles of `side` x `side` modules,
     that of the border beyond it.
     """
-    spread, bright = np.empty(len(quads)), np.empty((len(quads), side * side))
-    kernels().read_modules(*image_arguments(image), quads, len(quads), side, bright, spread)
-    return bright, spread
+    read: tuple[FloatArray, FloatArray] = kernels().read_modules(image, quads, side)
+    return read
 
 
 def read_codes(
@@ -225,9 +217,5 @@ def read_codes(
 ) -> tuple[IntArray, FloatArray]:
     """Return which of the `patterns` (C, side * side) the modules of N tags are most like, (N,), and the correlation,
     (N,); 0 and 0 where their brightness has a standard deviation below `least`. Else as `read_modules`."""
-    best, likeness = np.empty(len(quads), np.int64), np.empty(len(quads))
-    kernels().read_codes(
-        *(*image_arguments(image), quads, len(quads), side, patterns, len(patterns), least),
-        *(np.empty((len(quads), side * side)), best, likeness),
-    )
-    return best, likeness
+    read: tuple[IntArray, FloatArray] = kernels().read_codes(image, quads, side, patterns, least)
+    return read

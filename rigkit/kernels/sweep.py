@@ -39,21 +39,9 @@ def swept_costs(
     shows nothing it is half of the bits. K' is K and what fills up vectors: levels of high cost.
     """
     rows, columns = samples1.shape
-    levels, table_rows, table_columns = table.shape[:3]
-    sweep = _SweptRanges.of(
-        table=np.ascontiguousarray(table, np.float32),
-        levels=levels,
-        table_rows=table_rows,
-        table_columns=table_columns,
-        spacing=spacing,
-        rows=rows,
-        columns=columns,
-    )
-    image = ImageOf.make(np.ascontiguousarray(image2, np.float32))
-    memory = np.empty(kernels().sweep_cost_memory(columns), np.float32)
-    costs = np.empty((rows, columns, kernels().sweep_levels(levels)), np.uint8)
-    kernels().sweep_costs(sweep, image, np.ascontiguousarray(samples1, np.float32), memory, costs)
-    return costs
+    sweep = _SweptRanges.of(table=np.ascontiguousarray(table, np.float32), spacing=spacing, rows=rows, columns=columns)
+    image = ImageOf.of(brightness=np.ascontiguousarray(image2, np.float32))
+    return np.asarray(kernels().sweep_costs(sweep, image, np.ascontiguousarray(samples1, np.float32)))
 
 
 def swept_surfaces(
@@ -66,12 +54,9 @@ def swept_surfaces(
     """
     rows, columns = samples1.shape
     rules = _SurfaceRules.of(rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
-    memory = np.empty(kernels().sweep_path_memory(columns, levels), np.uint8)
-    total = np.empty(costs.shape, np.uint16)
-    kernels().sweep_surfaces(rules, costs, np.ascontiguousarray(samples1, np.float32), memory, total)
-    best, around = np.empty((rows, columns), np.int32), np.empty((rows, columns, 4), np.int32)
-    kernels().sweep_winners(rules, total, best, around)
-    return best, around
+    total = kernels().sweep_surfaces(rules, costs, np.ascontiguousarray(samples1, np.float32))
+    winners: tuple[NDArray[np.int32], NDArray[np.int32]] = kernels().sweep_winners(rules, total)
+    return winners
 
 
 def swept_rivals(
@@ -96,14 +81,10 @@ def swept_rivals(
     claims = _Claims.of(
         samples=np.ascontiguousarray(samples, np.int32),
         surfaces=np.ascontiguousarray(surfaces, np.float32),
-        count=len(samples),
         rows=rows,
         columns=columns,
         levels=levels,
         radius=radius,
         alike=alike,
     )
-    memory = np.empty(kernels().sweep_levels(levels), np.uint16)
-    found = np.empty((len(samples), 2), np.float32)
-    kernels().sweep_rivals(claims, costs, np.ascontiguousarray(samples1, np.float32), memory, found)
-    return found
+    return np.asarray(kernels().sweep_rivals(claims, costs, np.ascontiguousarray(samples1, np.float32)))

@@ -7,17 +7,14 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, GreyImage, IntArray
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
-from rigkit.kernels.edges import OUTCOMES, FactorRules, scratch_of
+from rigkit.kernels.edges import FactorRules
 from rigkit.kernels.surface import SURFACE_COLUMNS
 
 _CONSTANTS = header().constants
-CORNER_COLUMNS, TAG_MARKS, TAG_NUMBERS, ROOM_OF_CORNER, ROOM_OF_MAP, MAP_KNOWN, MAP_BY_CAMERA = (
-    _CONSTANTS[name]
-    for name in (
-        *("CORNER_COLUMNS", "TAG_MARKS", "TAG_NUMBERS", "ROOM_OF_CORNER", "ROOM_OF_MAP", "MAP_KNOWN", "MAP_BY_CAMERA"),
-    )
+CORNER_COLUMNS, TAG_MARKS, TAG_NUMBERS, MAP_KNOWN, MAP_BY_CAMERA = (
+    _CONSTANTS[name] for name in ("CORNER_COLUMNS", "TAG_MARKS", "TAG_NUMBERS", "MAP_KNOWN", "MAP_BY_CAMERA")
 )
 
 
@@ -47,7 +44,6 @@ class TagBoardFit:
 
     def __init__(self, image: GreyImage, tags: TagsOfBoard, rules: TagCornerRules, pixels: FloatArray) -> None:
         """Begin with corners (R, C, 2) roughly at `pixels`, NaN where unknown."""
-        grey, of_bytes, width, height = image_arguments(image)
         count = tags.count
         self.corners = np.full((count, CORNER_COLUMNS), np.nan)
         self.corners[:, :2] = pixels.reshape(-1, 2)
@@ -55,22 +51,12 @@ class TagBoardFit:
         self._fit = _TagFit.of(
             board=tags,
             rules=rules,
-            grey=grey,
-            bytes=of_bytes,
-            width=width,
-            height=height,
+            grey=image,
             corners=self.corners,
             marks=np.zeros((TAG_MARKS, count), np.uint8),
             base=self._base,
-            fitted=np.empty((count, OUTCOMES)),
-            sides=np.empty((count, 2, 2)),
             curvature=np.full((count, 2), np.nan),
             numbers=self._numbers,
-            off=np.empty((2, count)),
-            map=np.empty(ROOM_OF_MAP),
-            room=np.empty((count, ROOM_OF_CORNER)),
-            modules=np.empty((count // 4, tags.modules**2)),
-            windows=scratch_of(rules.last.contents),
         )
 
     @property
@@ -120,23 +106,19 @@ class TagBoardFit:
 def tag_heights(pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the longer of two sides of each tag whose corners are among `pixels` (R, C, 2), (R / 2, C / 2) px, and how
     far the end of the other lies from it; NaN where one of the four is missing."""
-    rows, columns = pixels.shape[:2]
-    longer, height = np.empty((2, rows // 2, columns // 2))
-    kernels().tag_heights(pixels, rows, columns, longer, height)
-    return longer, height
+    heights: tuple[FloatArray, FloatArray] = kernels().tag_heights(pixels)
+    return heights
 
 
 def squares_of_lattice(pixels: FloatArray, odd: bool) -> tuple[FloatArray, IntArray]:
     """Return the squares of a lattice (R, C, 2) whose row and column together are odd, or even: corners (N, 4, 2) in
     order of growing angle from u to v, and the (column, row) (N, 2) of their first."""
-    rows, columns = pixels.shape[:2]
-    quads, cells = np.empty((rows * columns, 4, 2)), np.empty((rows * columns, 2), np.int64)
-    count = kernels().squares_of_lattice(pixels, rows, columns, odd, quads, cells)
+    count, quads, cells = kernels().squares_of_lattice(pixels, odd)
     return quads[:count], cells[:count]
 
 
 def vote_place(cells: IntArray, turns: IntArray, places: IntArray, size: tuple[int, int]) -> tuple[int, int, IntArray]:
     """Return what `detection.tags.placing.voted_place` does of a lattice of `size` (columns, rows)."""
     place = np.zeros(3, np.int64)
-    votes = kernels().vote_place(cells, turns, places, len(cells), *size, np.empty((len(cells), 3), np.int64), place)
+    votes = kernels().vote_place(cells, turns, places, *size, place)
     return int(votes), int(place[0]), place[1:]

@@ -6,10 +6,10 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, GreyImage
 from rigkit.kernels import kernels
-from rigkit.kernels.calls import Struct, image_arguments, structure
+from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-TAG_OUTCOMES, TAG_SIDE, TAG_BLOCK = (header().constants[name] for name in ("TAG_OUTCOMES", "TAG_SIDE", "TAG_BLOCK"))
+TAG_SIDE = header().constants["TAG_SIDE"]
 
 
 @structure("tag_rules_t")
@@ -42,9 +42,5 @@ def fit_tags(
     bend_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
     """
     most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
-    out = np.empty((len(maps), TAG_OUTCOMES))
-    kernels().fit_tags(
-        *(*image_arguments(image), len(maps), maps, centres, scales, ink, ink.shape[1], breaks, reach),
-        *(blur, contrast, bend_sigma, rules, most, np.empty((most, TAG_BLOCK)), out),
-    )
-    return out
+    out = kernels().fit_tags(image, maps, centres, scales, ink, breaks, reach, blur, contrast, bend_sigma, rules, most)
+    return np.asarray(out)

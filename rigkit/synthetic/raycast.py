@@ -50,17 +50,14 @@ class Surface:
         marks, discs = (np.zeros((0, n)) if a is None else a for a, n in ((self.marks, 4), (self.discs, 3)))
         ground = np.zeros((0, 2, 2)) if self.ground is None else np.array([self.ground])
         return PaintedSurface.of(
-            plane_from_ray=np.ascontiguousarray(self.plane_from_ray, np.float64),
+            plane_from_ray=self.plane_from_ray,
             ends=np.array([self.low, self.high], np.float64),
-            marks=np.ascontiguousarray(marks, np.float64),
-            discs=np.ascontiguousarray(discs, np.float64),
-            ground=ground.astype(np.float64),
+            marks=marks,
+            discs=discs,
+            ground=ground,
             columns=columns,
             rows=rows,
             first_black=self.first_black,
-            mark_count=len(marks),
-            disc_count=len(discs),
-            grounds=len(ground),
             white=self.white,
             black=self.black,
             width_mm=self.squares_mm[0],

@@ -10,6 +10,7 @@ import ctypes
 import os
 import shlex
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +153,7 @@ def _arrays(value: Any) -> list[np.ndarray[Any, Any]]:
         return [array for part in value for array in _arrays(part)]
     if not isinstance(value, ctypes.Structure):
         return []
-    # Of arrays that are not as declared, copies are passed.
-    return [array for name in ("_kept", "_ready") for array in _arrays(getattr(value, name, []))]
+    return _arrays(getattr(value, "_kept", []))
 
 
 def _bounds(array: np.ndarray[Any, Any]) -> tuple[int, int]:
@@ -170,18 +170,23 @@ class RemoteKernel(calls.Kernel):
         self._arguments: tuple[Any, ...] = ()
         self._copies: list[Any] = []
 
-    def _declare(self) -> Any:
-        super()._declare()
-        ready = self._checks._ready
+    def _compile(self) -> Any:
+        super()._compile()
+        # Arrays that are passed and are no arguments: copies of these, images, results and scratch.
+        for name in ("_ready", "_image", "_new"):
+            setattr(self._call, name, self._noted(getattr(self._call, name)))
+        returns = header().results[self.name].type != "void"
+        self._compiled = self._call.compiled(self._there, returns=returns)
+        return self._compiled
+
+    def _noted(self, make: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that makes the same arrays and notes them."""
 
         def noted(*one: Any) -> Any:
-            """An array as it is passed, which may be a copy of the argument."""
-            self._copies.append(ready(*one))
+            self._copies.append(make(*one))
             return self._copies[-1]
 
-        self._checks._ready = noted  # type: ignore[method-assign, assignment]
-        self._call = self._checks.calling(self._there)
-        return self._call
+        return noted
 
     def __call__(self, *arguments: Any) -> Any:
         before, self._arguments, self._copies = (self._arguments, self._copies), arguments, []

@@ -99,12 +99,12 @@ def test_an_array_of_another_kind_is_refused(wrong: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [np.zeros(2, np.float32), np.zeros(3), np.zeros(4)[::2]],
+    [np.zeros((2, 4), np.float32), np.zeros((2, 5)), np.zeros((2, 8))[:, ::2]],
     ids=["dtype", "shape", "strided"],
 )
 def test_what_is_written_to_must_be_as_declared(wrong: np.ndarray) -> None:
-    with pytest.raises(TypeError, match="qualities: 'out' is"):
-        kernels().qualities(np.ones((18, 9)), 9, np.ones((2, 3, 3)), 2, 2.0, wrong)
+    with pytest.raises(TypeError, match="undistort_brown: 'plane' is"):
+        kernels().undistort_brown(np.zeros(12), 1.0, 0, np.zeros((2, 4)), wrong)
 
 
 def test_what_is_only_read_may_be_of_another_type_or_order_and_empty() -> None:
@@ -124,7 +124,7 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
     """What is copied for a structure must live as long as that: the memory of a copy is soon another's."""
     whole = np.arange(8.0)[None, :, None].repeat(3, axis=2)
     matrices = np.zeros((1, 4, 3, 3))
-    fit = {"rows": 1, "columns": 4, "reach": 1, "rounds": 1, "turn": 1.0}
+    fit = {"reach": 1, "rounds": 1, "turn": 1.0}
     grid = _PlaneGrid.of(values=whole[:, ::2], information=matrices, frames=matrices, **fit)
     others = [np.full((1, 4, 3), 7.0) for _ in range(50)]
     read = np.ctypeslib.as_array((ctypes.c_double * 12).from_address(grid.values)).reshape(1, 4, 3)
@@ -134,25 +134,41 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
 
 def test_a_structure_with_a_member_of_any_name_does_not_keep_itself() -> None:
     rays = np.ones((2, 6, 3))[:, ::2]
-    out, tries, heap = np.empty((2, 3, PATCH_COLUMNS)), np.empty((2, 3), np.uint8), np.empty((2, 3), np.int32)
-    slopes = np.ones((2, 3, 3, 2))
-    numbers = {"rows": 2, "columns": 3, "step": 1, "most_tries": 1}
-    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, tries=tries, heap=heap, **numbers)
-    assert any(kept is out for kept in grid._ready) and all(kept is not grid for kept in grid._ready)
+    out, slopes = np.empty((2, 3, PATCH_COLUMNS)), np.ones((2, 3, 3, 2))
+    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, most_tries=1)
+    assert grid._kept["out"] is out and all(kept is not grid for kept in grid._kept.values())
+
+
+def test_sizes_are_read_from_arrays_and_scratch_is_made() -> None:
+    rays, slopes, out = np.ones((2, 5, 3)), np.ones((2, 5, 3, 2)), np.ones((2, 5, PATCH_COLUMNS))
+    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, most_tries=1)
+    assert (grid.rows, grid.columns) == (2, 5)
+    assert (grid._kept["heap"].shape, grid._kept["heap"].dtype) == ((2, 5), np.int32)
+    with pytest.raises(TypeError, match=r"qualities: 'packed' is float64 \(18,\), wants \(18, count\)"):
+        kernels().qualities(np.ones(18), np.ones((2, 3, 3)), 2.0)
+    with pytest.raises(TypeError, match="improve: 't' is"):
+        kernels().improve(np.ones((18, 9)), np.ones((2, 3, 3)), np.ones((1, 3)), 1.0, np.arange(5), 1, 1.0)
+
+
+def test_results_come_after_what_a_function_returns() -> None:
+    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    depth, homography = kernels().fit_perspective(square, square)
+    np.testing.assert_allclose(homography, np.eye(3), atol=1e-12)
+    assert depth == pytest.approx(1.0)
+    done, mark = kernels().mark_known(square, square[:1], 0.5)
+    assert done == 1 and mark.dtype == bool and mark.tolist() == [True, False, False, False]
 
 
 def test_arguments_are_counted() -> None:
-    with pytest.raises(TypeError, match="wants packed, count, E, hypotheses, noise, out"):
-        kernels().qualities(np.ones((18, 9)), 9)
+    with pytest.raises(TypeError, match="wants packed, E, noise; was given 1"):
+        kernels().qualities(np.ones((18, 9)))
 
 
 def test_members_are_checked() -> None:
     with pytest.raises(TypeError, match="'brightness' is float64"):
-        ImageOf.make(np.zeros((4, 5)))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="'brightness' is float32"):
-        ImageOf.of(brightness=np.zeros((4, 5), np.float32), height=5, width=4)
-    with pytest.raises(TypeError, match="wants brightness, width, height"):
-        ImageOf.of(brightness=np.zeros((4, 5), np.float32))
+        ImageOf.of(brightness=np.zeros((4, 5)))
+    with pytest.raises(TypeError, match="wants brightness; was given brightness, width"):
+        ImageOf.of(brightness=np.zeros((4, 5), np.float32), width=5)
 
 
 def test_the_header_is_read_as_c_reads_it() -> None:

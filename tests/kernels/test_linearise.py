@@ -36,8 +36,7 @@ def test_sums_are_as_defined(
         "loss_px": loss_px,
         "lost_px": 50.0,
     }
-    sizes = {"views": VIEWS, "corners": CORNERS, "points": POINTS, "warps": warps, "released": released}
-    views = BoardViews.of(**seen, **sizes)
+    views = BoardViews.of(**seen, released=released)
     d_pixels_d_point, d_pixels_d_parameters = (rng.normal(size=(VIEWS, CORNERS, 2, k)) for k in (3, parameters))
     pixels, valid = rng.normal(size=(VIEWS, CORNERS, 2)), rng.random((VIEWS, CORNERS)) < 0.9
     d_pixels_d_point[~valid] = np.nan

@@ -85,10 +85,10 @@ def find_links(corners: Corners, level: Level, length_ratio: float = LENGTH_RATI
 
 @functools.cache
 def _link_rules(length_ratio: float) -> front.LinkRules:
-    return front.LinkRules.make(
-        NEIGHBOURS,
-        EDGE_PLACES,
-        MIN_EDGE_PLACES,
+    return front.LinkRules.of(
+        neighbours=NEIGHBOURS,
+        along=EDGE_PLACES,
+        most=MIN_EDGE_PLACES,
         arm_cosine=ARM_COSINE,
         contrast_ratio=CONTRAST_RATIO,
         length_ratio=length_ratio,

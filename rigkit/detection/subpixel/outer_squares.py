@@ -136,7 +136,6 @@ def outer_squares(
 def _rules() -> PaperRules:
     return PaperRules.of(
         steps=STEPS_SQUARES,
-        step_count=len(STEPS_SQUARES),
         aside=ASIDE_SQUARES,
         first=FIRST,
         last=LAST,

@@ -100,8 +100,6 @@ def _tag_board(board: Board) -> TagBoard:
             code_turns=codes.turns,
             rows=board.rows,
             columns=board.columns,
-            count=signs.size,
-            codes=len(codes.patterns),
             modules=codes.modules,
             joined=pattern.corner_squares,
             spacing=pattern.spacing,
