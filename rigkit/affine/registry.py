@@ -1,7 +1,8 @@
-"""The affine estimators by name. Adding one is one line in the table and one module."""
+"""The affine estimators by name. Adding one is a module and an entry of the table."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,25 +16,54 @@ from rigkit.core.arrays import Affines, BoolArray, FloatArray, Mat3, as_array
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 
-AFFINE_METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
-
-_COUNT: dict[str, int | None] = {"F2UDIR": 2, "F3UDIR": None, "DET3UDIR": None, "2SDIR": 2, "3SDIR": None}
-_MIN_COUNT = {"F2UDIR": 2, "F3UDIR": 2, "DET3UDIR": 3, "2SDIR": 2, "3SDIR": 2}
+Block = tuple[FloatArray, FloatArray]
+"""vec(A), (4, n), and conditioning, (n,), of n corners."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _How:
-    """How affinities are found: see `affines_from_directions`."""
+class _Known:
+    """What is known beside the directions: see `affines_from_directions`."""
 
-    method: str
     epipolar: EpipolarNormals | None
     scale: str
     determinant: FloatArray | None
 
+    def select(self, which: slice | BoolArray) -> _Known:
+        """Return what is known of some of the corners."""
+        lines = None if self.epipolar is None else EpipolarNormals(self.epipolar.n1[which], self.epipolar.n2[which])
+        determinant = None if self.determinant is None else np.asarray(self.determinant, dtype=np.float64)[which]
+        return _Known(lines, self.scale, determinant)
+
+
+@dataclass(frozen=True, slots=True)
+class _Estimator:
+    """Solves a block of corners, from so many directions of each: the first `count` usable ones (None: all), at least
+    `min_count`."""
+
+    solve: Callable[[PlanarDirections, _Known], Block]
+    count: int | None = None
+    min_count: int = 2
+    needs_epipolar: bool = False
+
+
+def _by_epipolar(directions: PlanarDirections, known: _Known) -> Block:
+    assert known.epipolar is not None
+    return epipolar_block(directions, known.epipolar.n1.T, known.epipolar.n2.T)
+
+
+_ESTIMATORS = {
+    "F2UDIR": _Estimator(_by_epipolar, count=2, needs_epipolar=True),
+    "F3UDIR": _Estimator(_by_epipolar, needs_epipolar=True),
+    "DET3UDIR": _Estimator(lambda some, known: determinant_block(some, known.scale, known.determinant), min_count=3),
+    "2SDIR": _Estimator(lambda some, _: scaled_block(some), count=2),
+    "3SDIR": _Estimator(lambda some, _: scaled_block(some)),
+}
+AFFINE_METHODS = tuple(_ESTIMATORS)
+
 
 def needs_epipolar(method: str) -> bool:
     """Say whether `method` needs the epipolar geometry (then re-estimating that from its affinities is circular)."""
-    return _known(method).startswith("F")
+    return _estimator(method).needs_epipolar
 
 
 def affines_from_directions(
@@ -75,54 +105,48 @@ def affines_from_directions(
     """
     if F21 is not None and epipolar is None and needs_epipolar(method):
         epipolar = _epipolar_of(directions, F21)
-    how = _How(method, epipolar, scale, determinant)
-    _check(directions, how, epipolar_rows, noise)
-    A21, conditioning, use = _solved(directions, how, min_conditioning)
+    known = _Known(epipolar, scale, determinant)
+    _check(directions, method, known, epipolar_rows, noise)
+    A21, conditioning, use = _solved(directions, method, known, min_conditioning)
     if epipolar is not None and needs_epipolar(method) and epipolar_rows == "soft":
         A21 = soft_epipolar(directions, use, epipolar)
     with np.errstate(invalid="ignore"):
-        valid = (use.sum(axis=1) >= _MIN_COUNT[method]) & (conditioning >= min_conditioning)
+        valid = (use.sum(axis=1) >= _estimator(method).min_count) & (conditioning >= min_conditioning)
     valid &= finite(A21)
     A21[~valid] = np.nan
-    covariance = None if noise is None else _covariance(directions, how, use, valid, noise)
+    covariance = None if noise is None else _covariance(directions, method, known, use, valid, noise)
     return Affinities(A21, valid, conditioning, covariance)
 
 
-def _solved(directions: DirectionPairs, how: _How, min_conditioning: float) -> tuple[Affines, FloatArray, BoolArray]:
+def _solved(
+    directions: DirectionPairs, method: str, known: _Known, min_conditioning: float
+) -> tuple[Affines, FloatArray, BoolArray]:
     """Return affinities (N, 2, 2), conditioning (N,) and which directions were used (N, K), a block at a time."""
-    n, method, epipolar = len(directions.valid), how.method, how.epipolar
+    n, estimator = len(directions.valid), _estimator(method)
     A21 = np.full((n, 2, 2), np.nan)
     conditioning = np.full(n, np.nan)
     use = np.zeros(directions.valid.shape, dtype=bool)
     for block in blocks(n):
-        planar = PlanarDirections.of(directions, block)
-        if epipolar is not None and needs_epipolar(method):
-            n1, n2 = (np.ascontiguousarray(v[block].T) for v in (epipolar.n1, epipolar.n2))
-            chosen = usable_directions(planar, n2, _COUNT[method], min_conditioning)
+        planar, here = PlanarDirections.of(directions, block), known.select(block)
+        if estimator.needs_epipolar and here.epipolar is not None:
+            chosen = usable_directions(planar, here.epipolar.n2.T, estimator.count, min_conditioning)
             planar = planar if chosen is planar.use else planar.only(chosen)
-            a, conditioning[block] = epipolar_block(planar, n1, n2)
-        elif method == "DET3UDIR":
-            known = None if how.determinant is None else np.asarray(how.determinant, dtype=np.float64)[block]
-            a, conditioning[block] = determinant_block(planar, how.scale, known)
-        else:
-            count = _COUNT[method]
-            planar = planar if count is None else planar.only(first_of(planar.use, count))
-            a, conditioning[block] = scaled_block(planar)
+        elif estimator.count is not None:
+            planar = planar.only(first_of(planar.use, estimator.count))
+        a, conditioning[block] = estimator.solve(planar, here)
         use[block] = planar.use.T
         A21[block] = a.T.reshape(-1, 2, 2)
     return A21, conditioning, use
 
 
 def _covariance(
-    directions: DirectionPairs, how: _How, use: BoolArray, valid: BoolArray, noise: DirectionNoise
+    directions: DirectionPairs, method: str, known: _Known, use: BoolArray, valid: BoolArray, noise: DirectionNoise
 ) -> FloatArray:
     """Propagate the noise of the directions in use to vec(A), (N, 4, 4), to first order; NaN where invalid."""
-    lines = None if how.epipolar is None else EpipolarNormals(how.epipolar.n1[valid], how.epipolar.n2[valid])
-    known = None if how.determinant is None else np.asarray(how.determinant, dtype=np.float64)[valid]
-    some, how = replace(directions, valid=use).select(valid), replace(how, epipolar=lines, determinant=known)
+    some, of_some = replace(directions, valid=use).select(valid), known.select(valid)
 
     def solve(moved: DirectionPairs) -> Affines:
-        return _solved(moved, how, 0.0)[0]
+        return _solved(moved, method, of_some, 0.0)[0]
 
     out = np.full((len(valid), 4, 4), np.nan)
     out[valid] = propagated(solve, some, DirectionNoise(noise.covariance1[valid], noise.covariance2[valid]))
@@ -135,20 +159,22 @@ def _epipolar_of(directions: DirectionPairs, F21: Mat3) -> EpipolarNormals:
     return EpipolarNormals.from_F(F21, directions.pixels1, directions.pixels2)
 
 
-def _known(method: str) -> str:
-    if method not in AFFINE_METHODS:
+def _estimator(method: str) -> _Estimator:
+    if method not in _ESTIMATORS:
         raise InputError(f"affine method '{method}' is unknown; known: {', '.join(AFFINE_METHODS)}")
-    return method
+    return _ESTIMATORS[method]
 
 
-def _check(directions: DirectionPairs, how: _How, epipolar_rows: str, noise: DirectionNoise | None) -> None:
-    method, epipolar, determinant = how.method, how.epipolar, how.determinant
+def _check(
+    directions: DirectionPairs, method: str, known: _Known, epipolar_rows: str, noise: DirectionNoise | None
+) -> None:
+    estimator, epipolar, determinant = _estimator(method), known.epipolar, known.determinant
     n, k = directions.valid.shape
-    if how.scale not in SCALES:
-        raise InputError(f"affine scale '{how.scale}' is unknown; known: {', '.join(SCALES)}")
+    if known.scale not in SCALES:
+        raise InputError(f"affine scale '{known.scale}' is unknown; known: {', '.join(SCALES)}")
     if epipolar_rows not in ("hard", "soft"):
         raise InputError(f"epipolar rows '{epipolar_rows}' are unknown; known: hard, soft")
-    if needs_epipolar(method):
+    if estimator.needs_epipolar:
         if epipolar is None:
             raise InputError(f"{method} needs the epipolar geometry: pass epipolar=, or use 3SDIR")
         if len(epipolar) != n:
@@ -157,7 +183,7 @@ def _check(directions: DirectionPairs, how: _How, epipolar_rows: str, noise: Dir
         raise InputError(f"{method} needs the lengths of the directions, which these do not have: use F3UDIR")
     if determinant is not None:
         as_array(determinant, (n,), "determinant", finite=False)
-    if k < _MIN_COUNT[method]:
-        raise InputError(f"{method} needs {_MIN_COUNT[method]} directions a corner, got {k}")
+    if k < estimator.min_count:
+        raise InputError(f"{method} needs {estimator.min_count} directions a corner, got {k}")
     if noise is not None and noise.covariance1.shape != (n, 2 * k, 2 * k):
         raise InputError(f"direction noise: expected {n}x{2 * k}x{2 * k}, got {noise.covariance1.shape}")
