@@ -18,7 +18,7 @@ from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import with_priors
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
-from rigkit.calibration.views.usable import BESIDE
+from rigkit.calibration.views.usable import GRIDS_BESIDE
 from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -126,9 +126,9 @@ def test_images_left_out_are_named(rng: np.random.Generator) -> None:
     many = judge_session(result, [(f"{i}.png", "no board found") for i in range(5)])
     assert "5 images are left out, '0.png' the first: no board found" in many[1].message
     # Of an image that is used only something is left out; what lies beside the board is no cause to look.
-    assert judge_session(result, [("000.png", BESIDE)]) == result.verdicts
+    assert judge_session(result, [("000.png", GRIDS_BESIDE)]) == result.verdicts
     assert "of image '000.png' something is left out: bent" in judge_session(result, [("000.png", "bent")])[1].message
-    assert result.images_left_out == 1 and replace(result, dropped=(("000.png", BESIDE),)).images_left_out == 0
+    assert result.images_left_out == 1 and replace(result, dropped=(("000.png", GRIDS_BESIDE),)).images_left_out == 0
 
 
 def test_hundredths_of_a_pixel_are_no_reason_to_retake(rng: np.random.Generator) -> None:

@@ -33,7 +33,7 @@ from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
-from rigkit.calibration.views.usable import BESIDE
+from rigkit.calibration.views.usable import GRIDS_BESIDE
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
@@ -220,7 +220,7 @@ def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -
     told = set(_contradicting(dropped, views))
     dropped = [(image, reason) for image, reason in dropped if image not in told]
     used = {view.image for view in views}
-    parts = [(image, reason) for image, reason in dropped if image in used and reason != BESIDE]
+    parts = [(image, reason) for image, reason in dropped if image in used and reason != GRIDS_BESIDE]
     found = [
         Finding.look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts
     ]
