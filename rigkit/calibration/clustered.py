@@ -64,9 +64,12 @@ class Clustered:
 def effective_freedom(
     freedom: float, overdispersion: float, directions: int, common_freedom: float = float("inf")
 ) -> float:
-    """Return the degrees of freedom of the variance in one of so many directions (Satterthwaite): what corners scatter
-    is known from all directions of all images; of what images disagree beyond it, only as `freedom` of them tell, and
-    where that is one number for all directions, as it scatters around their mean (`common_freedom`)."""
+    """Return the degrees of freedom of the variance in one of so many directions (Satterthwaite).
+
+    What corners scatter is known from all directions of all images. What images disagree beyond that is known as well
+    as `freedom` of them tell; where it is one number for all directions, as well as directions agree on it
+    (`common_freedom`).
+    """
     beyond = max(0.0, 1.0 - 1.0 / overdispersion**2) if overdispersion > 0.0 else 0.0
     unsure = beyond**2 * (1.0 / freedom + 1.0 / common_freedom)
     unsure += (1.0 - beyond) ** 2 / (freedom * directions)

@@ -7,9 +7,9 @@ one question: the image of the lens is that of the model, moved by
     d(pixel) = sum_j a_j b_j(pixel),    a_j ~ N(0, tau_j^2),
 
 with b_j what models leave out: higher powers of the radius, decentring of two orders, thin prisms, shear and aspect
-ratio, each of one px at the corners of the image. What poses and parameters take up of it in the images given is taken
-out of the b_j (Schur complement), with what is left the residuals are compared: they say how large tau is, along the
-radius and otherwise, and what they leave open of it is averaged over (all orders of magnitude between limits alike).
+ratio, each of one px at the corners of the image. What poses and parameters take up of the b_j in the images given is
+taken out of them (Schur complement), and the residuals are compared with what is left. They say how large tau is, along
+the radius and otherwise; what they leave open of it is averaged over, all orders of magnitude between limits alike.
 What the camera is wrong by has the covariance B E[a a^T] B^T, with B the displacements less what the fitted parameters
 and the rotation of the rays have taken up of them. Images that disagree for other reasons say less of a: the variance
 of residuals is that between images.

@@ -159,9 +159,14 @@ def lens_of(camera: Camera) -> Camera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LensModes:
-    """What a lens may do beyond its model: modes (J, M) of displacements, px, of one standard deviation each,
-    independent of each other, how much all that was solved for (G, M) is off where a mode is there, and how the rays of
-    a camera alone turn with it (3, M), rad; None: they do not."""
+    """What a lens may do beyond its model, in M independent modes of one standard deviation each.
+
+    Attributes
+    ----------
+    modes : (J, M) px, the amounts of the displacements.
+    moves : (G, M) by how much all that was solved for is off with each mode.
+    turns : (3, M) rad, how the rays of a camera alone turn with each; None: they do not.
+    """
 
     modes: FloatArray
     moves: FloatArray

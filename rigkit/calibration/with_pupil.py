@@ -132,7 +132,7 @@ def surely_moves(calibration: Calibration) -> bool:
     return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
 
 
-def require_known(pupil: str, known: Sequence[str] = PUPILS) -> None:
+def require_known(pupil: str) -> None:
     """Raise InputError for an option without a meaning."""
-    if pupil not in known:
-        raise InputError(f"pupil '{pupil}' is unknown; known: {', '.join(known)}")
+    if pupil not in PUPILS:
+        raise InputError(f"pupil '{pupil}' is unknown; known: {', '.join(PUPILS)}")

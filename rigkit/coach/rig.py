@@ -49,11 +49,19 @@ MAX_MARKS = 1500
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigAdvice:
-    """What the coach says: words, what these frames bring as a part of what a board in the outline would, whether to
-    take them, whether there are enough or nothing is asked for until that is known (`waits`), the number of the camera
-    that it speaks of, what each camera's guide says, outlines (K, 2) to hold the board into by camera (None: none), how
-    wrong the mounts are (px; None where nobody knows), and, once the rig was calibrated, what that leaves of what is to
-    become small, and the part of the worst of it that two more frames would take away."""
+    """What the coach says of the frames just seen.
+
+    Attributes
+    ----------
+    lenses : what each camera's guide says.
+    mount_px : how wrong the mounts are; None where nobody knows.
+    worth : what the frames bring, as a part of what a board in the outline would.
+    enough, waits : whether there are enough frames; whether nothing is asked for until that is known.
+    speaks : the number of the camera that the words are about.
+    targets : by camera the outline (K, 2) to hold the board into, None for none.
+    left, gain : once the rig was calibrated, what that leaves of what is to become small, and the part of the worst of
+        it that two more frames would take away.
+    """
 
     lenses: tuple[Advice, ...]
     mount_px: float | None

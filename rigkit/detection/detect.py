@@ -38,9 +38,9 @@ def detect_boards(
     image : (H, W) or (H, W, 3 or 4), uint8 or uint16 (or float 0..255), grey or RGB, or the mosaic of a colour camera.
     boards : what may be in the image, if known. A grid of a board's size, either way round, is turned to its columns x
         rows; a part of a board whose borders show where it lies gets its place in the board's grid, any other part
-        stays a grid of its own. A board is named only where one single given board has that size and one single
-        detection fits it (whole, where others lack corners that would lie in the image), or by its marks; a grid of
-        circles where no larger board can be meant, of which the image's border cuts off the rest.
+        stays a grid of its own. A board is named by its marks, or where one single given board has that size and one
+        single detection fits it: whole, if others lack corners that would lie in the image. A grid of circles is named
+        where it cannot be the visible part of a larger board that the image's border cuts off.
     min_corners : boards with fewer corners are not reported, but for whole ones of `boards`.
     camera : the calibrated camera, if known: it shows which parts are of one board (`guided.rejoin`) and where
         corners of known boards were missed, and fits all of them with windows and lines as it sees them

@@ -53,14 +53,22 @@ PLACED_KEYS = keys_of(BOARD_RIG_FILE, "rigs", "boards")
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SavedRig:
-    """What a rig file says: cameras and cam_from_rig by name, the covariance of all intrinsics and of the mounts of all
-    cameras but the first, and the corners' sigma; None in a file that does not say (another tool's rig). `scale_sigma`
-    is how well all lengths are known from the boards' squares, relative; 0 where nobody stated it. `freedom` are the
-    degrees of freedom of the covariance, `overdispersion` is by how much more frames disagree than corners; `boards`
-    are those it was calibrated with, none in a file that does not say; `outlines` by name are convex, (N, 2) px, around
-    all corners that a camera saw, of those of which the file says it; `departures` are what each lens may do beyond its
-    model, none in a file that does not say; `pupils` are those that move, by name: `cameras` are exact far away;
-    `verdicts` are what was said of it."""
+    """What a rig file says. What another tool's file does not say is None, or has the default.
+
+    Attributes
+    ----------
+    cameras : cameras, exact far away, and cam_from_rig by name.
+    covariance : of all intrinsics, and of the mounts of all cameras but the first.
+    sigma_px : of the corners.
+    scale_sigma : how well all lengths are known from the boards' squares, relative; 0 where nobody stated it.
+    freedom : degrees of freedom of the covariance.
+    overdispersion : by how much more frames disagree than corners.
+    boards : those it was calibrated with.
+    outlines : by name, convex, (N, 2) px, around all corners that a camera saw.
+    departures : what each lens may do beyond its model.
+    pupils : those that move, by name.
+    verdicts : what was said of it.
+    """
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None

@@ -229,10 +229,8 @@ def _ordinal(number: int) -> str:
     return {2: "second", 3: "third"}.get(number, f"{number}th")
 
 
-def _crosses(at: FloatArray, half: float = 4.0) -> str:
-    return "".join(
-        f"M{x - half:.1f} {y - half:.1f}l{2 * half} {2 * half}m0 {-2 * half}l{-2 * half} {2 * half}" for x, y in at
-    )
+def _crosses(at: FloatArray) -> str:
+    return "".join(f"M{x - 4.0:.1f} {y - 4.0:.1f}l8.0 8.0m0 -8.0l-8.0 8.0" for x, y in at)
 
 
 def _colour(level: float) -> str:

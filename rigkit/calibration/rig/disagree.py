@@ -1,8 +1,8 @@
 """Targets on which views disagree: what sharing a pose costs, which cost is no chance, and taking such views apart.
 
-Limits and what they rest on, for rigs of 2 and 3 cameras and 3 to 25 frames (3000 clean ones with 0.05 to 0.5 px of
-noise, 2200 of boards bumpy by 0.15 mm that count as flat): the cost of sharing reaches 2.0 times sigma by noise and 3.5
-times by bumps, the distance before the joint solve 7.8 times the usual. Where a board was moved by 1 mm between two
+The limits rest on rigs of 2 and 3 cameras and 3 to 25 frames: 3000 clean ones with 0.05 to 0.5 px of noise, and 2200
+of boards bumpy by 0.15 mm that count as flat. There the cost of sharing reaches 2.0 times sigma by noise and 3.5 times
+by bumps, the distance before the joint solve 7.8 times the usual. Where a board was moved by 1 mm between two
 exposures, at 0.2 px of noise, sharing costs 4 to 8 times sigma among ten frames; moved by 10 mm it stands more than 22
 times the usual distance apart.
 """

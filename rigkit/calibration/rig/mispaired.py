@@ -1,10 +1,14 @@
 """Frames of a rig that were put together wrongly: one picture twice, left for right, counted one off, turned, mirrored.
 
-Cameras that disagree on where a board is are usually not of one moment. Mistakes with files look the same, and need no
-other pictures: the same ones under the names of two cameras, the images of a frame under each other's names, an image
-that is missing in one camera, so that all later ones are one frame off, images that a program has turned by half a
-turn, and one camera whose images are mirrored, which a chessboard does not show. Each is tried, and told where it puts
-right what disagrees.
+Cameras that disagree on where a board is have usually not taken their pictures at one moment. Mistakes with files look
+the same, and need no other pictures:
+
+- the same pictures under the names of two cameras, or the images of a frame under each other's names
+- an image that is missing in one camera, so that all later ones are one frame off
+- images that a program has turned by half a turn
+- one camera whose images are mirrored, which a chessboard does not show
+
+Each is tried, and told where it puts right what disagrees.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """The shape of the boards, with priors as wide as the views say.
 
 A prior that is too wide lets the noise of the views bend a flat board, and the lens with it; one that is too narrow
-holds back the corners of a wavy one. The evidence of the views knows: for bows, stretches and the stray of single
-corners in the plane and out of it, each board has a size of its own by MacKay's update sigma^2 = sum u^2 / gamma, where
-gamma = sum (1 - variance / prior^2) is how many of the unknowns u the views determine.
+holds back the corners of a wavy one. The evidence of the views tells how wide it should be. Each board has a size of
+its own for bows, for stretches, and for the stray of single corners in the plane and out of it. The size follows
+MacKay's update sigma^2 = sum u^2 / gamma, where gamma = sum (1 - variance / prior^2) is how many of the unknowns u the
+views determine.
 
 Reference: D. MacKay, "Bayesian interpolation", Neural Computation 4 (1992), section 4.
 """

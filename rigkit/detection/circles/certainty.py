@@ -1,10 +1,10 @@
 """How certain the centres of a grid's circles are: by the noise of pixels, and by what their shapes say of all else.
 
-Where neighbouring pixels share their noise (a picture smoothed after it was taken), where print or light differ along
-the edges, there is more about a circle than the residuals of its pixels show; there is less where noise changes its
-sign from pixel to pixel (JPEG), and where the residuals are those of another blur (motion), the same on both sides. It
-changes how circles are slanted as much as where they lie, each in its sigmas for white noise, and slant is known:
-neighbours foretell it.
+The residuals of a circle's pixels show too little of its error where neighbouring pixels share their noise (a picture
+smoothed after it was taken), or print or light differ along the edge. They show too much where noise changes its sign
+from pixel to pixel (JPEG), and where they are those of another blur (motion), the same on both sides. Whatever it is
+changes how circles are slanted as much as where they lie, each in its sigmas for white noise; and what the slant should
+be is known, for neighbours foretell it.
 """
 
 from __future__ import annotations

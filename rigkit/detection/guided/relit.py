@@ -56,9 +56,16 @@ most so many times what is usual on the board. One that left not so many times w
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Usual:
-    """What corners in even light are like: signs (R, C), blur (px), residual relative to the contrast, the factor that
-    the detector, which saw the board as a whole, gave the sigmas of their fits, and how far they lie off where the
-    others have them, px, for predictions of gain 1."""
+    """What corners in even light are like.
+
+    Attributes
+    ----------
+    signs : (R, C)
+    blur : px.
+    relative : residual over contrast.
+    factor : by which the detector, which saw the board as a whole, multiplied the sigmas of their fits.
+    off_px : how far they lie off where the others have them, for predictions of gain 1.
+    """
 
     signs: FloatArray
     blur: float

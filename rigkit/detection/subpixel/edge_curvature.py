@@ -1,11 +1,11 @@
 """How the rows and columns of a lattice bend at its corners.
 
 The edge model is told the curvature of its two lines: an error of 1e-4 / px moves a corner by some thousandths of a
-pixel. A row is a smooth curve of the column number; its Taylor coefficients at a corner are the most probable ones
-given the corners on the row, with their standard deviations, and that the k-th is about DECAY^k sides of the cell, or
-phi^(k - 1) / 2 where a line is seen to turn, or its cells to grow, by phi a cell, as large squares do in a fisheye. Few
-or noisy corners leave the high ones near zero; many exact ones are followed to the end of the row, where a polynomial
-of low degree would miss. Where few corners leave the curvature open, its standard deviation says so.
+pixel. A row is a smooth curve of the column number. Its Taylor coefficients at a corner are the most probable ones
+given the corners on the row with their standard deviations, and a prior: the k-th is about DECAY^k sides of the cell.
+Where a line is seen to turn, or its cells to grow, by phi a cell, as large squares do in a fisheye, it is about
+phi^(k - 1) / 2. Few or noisy corners leave the high ones near zero; many exact ones are followed to the end of the row,
+where a polynomial of low degree would miss. Where few corners leave the curvature open, its standard deviation says so.
 """
 
 from __future__ import annotations

@@ -82,10 +82,13 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
 
 
 def likeness_at(image: GreyImage, pixels: FloatArray, squares: IntArray, numbers: IntArray, board: Board) -> FloatArray:
-    """Return how like the markers of these `numbers` (N,) squares of the grid of a ChArUco board are, (N,), as
-    `excess_likeness`: by chance of mean 0 and standard deviation 1; 0 where there is nothing to read, NaN where the
-    corners do not foretell the square, or foretell it out of the image.
+    """Return how like the markers of these `numbers` (N,) the `squares` of a ChArUco board are, as `excess_likeness`.
 
+    By chance it has mean 0 and standard deviation 1. It is 0 where there is nothing to read, NaN where the corners do
+    not foretell the square, or foretell it out of the image.
+
+    Parameters
+    ----------
     pixels : (R, C, 2) corners, NaN where unknown.
     squares : (N, 2) column and row, the one before the first corner (0, 0), or one beyond the board's.
     """

@@ -1,8 +1,8 @@
 """The certificate: the bound on the error of a measurement over the image, its causes, and what would halve it.
 
-The calibration's covariance rests on a dozen images or so, and is known to about a quarter itself: a bound of 95 % is
-not 1.96 standard deviations then, but Student's quantile with the degrees of freedom that the whole has (Welch and
-Satterthwaite; JCGM 100 "GUM", annex G.4), the other causes' standard deviations being known.
+The calibration's covariance rests on a dozen images or so, and is known to about a quarter itself. So a bound of 95 %
+is not 1.96 standard deviations, but Student's quantile with the degrees of freedom of the whole (Welch and
+Satterthwaite; JCGM 100 "GUM", annex G.4); the standard deviations of the other causes count as known.
 """
 
 from __future__ import annotations

@@ -20,9 +20,16 @@ from rigkit.validation.sentinel.evidence import Watched, told_by
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Frames:
-    """Frames that could be taken: boards in poses rig_from_board, `rotation` (C, 3, 3) and `translation_mm` (C, 3), the
-    numbers of the boards (C,), which cameras see all of them (C, cameras), that for which each was thought of first
-    (C,), and what they say of theta (C, T, T) in px^2."""
+    """C frames that could be taken.
+
+    Attributes
+    ----------
+    rotation, translation_mm : (C, 3, 3) and (C, 3), of rig_from_board.
+    board : (C,) its number.
+    seen : (C, cameras) which see all of it.
+    owner : (C,) the camera for which the frame was thought of.
+    information : (C, T, T) px^2, what it says of theta.
+    """
 
     rotation: FloatArray
     translation_mm: Points
