@@ -36,6 +36,9 @@ typedef struct {
  * strip of STRIP_ROWS rows has a threshold of its own: strip (u - STRIPS_FROM) / STRIP of band v / STRIP_ROWS. */
 enum { STRIP = 64, STRIP_ROWS = 32, STRIPS_FROM = 3 };
 
+/* Rows in which peaks are sought at a time, and those that are kept for them. */
+enum { TRIPLE = 3, RING = 3 * TRIPLE };
+
 EXPORT void make_level(
     IMAGE(image), int64_t step, const level_rules_t *rules,
     SCRATCH(float, scratch, width + 4 + 3 * ((height - 3) / step + 1) * ((width - 3) / step + 1)),
@@ -47,7 +50,8 @@ EXPORT void make_level(
 EXPORT int64_t find_peaks(
     ARRAY(const float, smooth, height, width), int64_t height, int64_t width,
     ARRAY(const float, thresholds, height / STRIP_ROWS + 1, width / STRIP + 1),
-    SCRATCH(float, scratch, 5 * (width + STRIP + 4)), SCRATCH(uint8_t, high, 5 * (width / STRIP + 1)),
+    SCRATCH(float, scratch, (RING + 2) * (width + STRIP + 4)), SCRATCH(uint8_t, high, 2 * (width / STRIP + 1)),
+    SCRATCH(int32_t, columns, TRIPLE * (width / 3 + 1)),
     RESULT(int32_t, at, (height / 3 + 1) * (width / 3 + 1), 2), RESULT(float, response, (height / 3 + 1) * (width / 3 + 1)));
 EXPORT int64_t keep_strongest(
     ARRAY(int32_t, at, count, 2), ARRAY(float, response, count), int64_t count, int64_t height, int64_t width, int64_t side,

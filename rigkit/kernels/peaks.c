@@ -131,97 +131,186 @@ FOR_EACH_PROCESSOR void fill_thresholds(
         }
 }
 
-/* Return as bits, the lowest first, which of the pixels u to u + STRIP - 1 of a row may be peaks: above the threshold, and not
- * below any of the pixels beside, above and below (as `is_peak`). */
-INLINE uint64_t peaks_among(float *const rows[5], int64_t u, float threshold)
+/* Peaks are sought in three rows at a time, a triple: a peak is the highest pixel of its column there, and not lower than the
+ * highest ones of the two columns to either side. Few pixels are left to be compared with all of their neighbours. */
+
+#define LOWEST (-1e30f)
+
+/* What is no number, beside what float32 does not hold, is higher than nothing. */
+INLINE float higher_of(float one, float least)
 {
-    uint8_t peak[STRIP];
-    const float *above = rows[1] + u, *here = rows[2] + u, *below = rows[3] + u;
+    return one > least ? one : least;
+}
+
+/* Return as bits, the lowest first, which of the columns u to u + STRIP - 1 may have a peak: their highest pixel, in `most`, is
+ * above the threshold, and not below those of the columns beside. */
+INLINE uint64_t columns_among(const float *most, int64_t u, float threshold)
+{
+    uint8_t highest[STRIP];
+    const float *here = most + u;
     for (int k = 0; k < STRIP; k++) {
-        /* What is no number, beside what float32 does not hold, is above nothing. */
-        float most = here[k - 1] > threshold ? here[k - 1] : threshold;
-        most = above[k] > most ? above[k] : most;
-        peak[k] = (uint8_t)((here[k] > most) & !(here[k + 1] > here[k]) & !(below[k] > here[k]));
+        const float beside = higher_of(higher_of(here[k - 2], here[k - 1]), higher_of(here[k + 1], here[k + 2]));
+        highest[k] = (uint8_t)((here[k] > threshold) & !(beside > here[k]));
     }
     uint64_t bits = 0;
     for (int k = 0; k < STRIP; k += 8) {
         uint64_t eight;
-        memcpy(&eight, peak + k, 8);
+        memcpy(&eight, highest + k, 8);
         /* The product gathers the lowest bits of eight bytes (the first one the lowest) in the highest byte. */
         bits |= (eight * UINT64_C(0x0102040810204080)) >> 56 << k;
     }
     return bits;
 }
 
-/* Return whether pixel u of the middle row, one of `peaks_among`, is not lower than the neighbours that follow within two
- * pixels, and higher than those before: a corner between pixels makes two equal ones. */
+/* Return whether pixel u of the middle row is not lower than the neighbours that follow within two pixels, and higher than those
+ * before: a corner between pixels makes two equal ones. */
 INLINE int is_peak(float *const rows[5], int64_t u)
 {
-    const float here = rows[2][u];
-    if (rows[1][u - 1] >= here || rows[1][u + 1] >= here || rows[3][u - 1] > here || rows[3][u + 1] > here)
-        return 0;
-    int higher = (rows[2][u - 2] >= here) | (rows[2][u + 2] > here) | (rows[1][u - 2] >= here) | (rows[1][u + 2] >= here) |
-                 (rows[3][u - 2] > here) | (rows[3][u + 2] > here);
-    for (int k = -2; k <= 2; k++)
-        higher |= (rows[0][u + k] >= here) | (rows[4][u + k] > here);
-    return !higher;
+    float before = higher_of(rows[2][u - 1], higher_of(rows[2][u - 2], LOWEST));
+    float after = higher_of(rows[2][u + 1], higher_of(rows[2][u + 2], LOWEST));
+    for (int k = -2; k <= 2; k++) {
+        before = higher_of(rows[0][u + k], higher_of(rows[1][u + k], before));
+        after = higher_of(rows[3][u + k], higher_of(rows[4][u + k], after));
+    }
+    return (rows[2][u] > before) & !(after > rows[2][u]);
 }
 
-/* The saddle response at the `count` pixels from u on of a row, into `to`; whether any is above the threshold. */
-INLINE int32_t fill_response(const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict to)
+/* What is known of the rows that are looked at.
+ * rows : the responses, row v the v % RING-th, `stride` apart.
+ * most, high : the highest of each column, and whether any of a strip is above its threshold, of two triples in turns. */
+typedef struct {
+    const float *smooth, *thresholds;
+    int64_t height, width, stride, strips;
+    float *rows, *most;
+    uint8_t *high;
+} search_t;
+
+INLINE float *responses_of(const search_t s, int64_t v)
+{
+    return s.rows + v % RING * s.stride;
+}
+
+INLINE float threshold_at(const search_t s, int64_t v, int64_t strip)
+{
+    return s.thresholds[v / STRIP_ROWS * s.strips + strip];
+}
+
+/* The lower one of those of the triple from row v on, which may lie in two bands. */
+INLINE float lowest_threshold(const search_t s, int64_t v, int64_t strip)
+{
+    const float above = threshold_at(s, v, strip), below = threshold_at(s, v + TRIPLE - 1, strip);
+    return above < below ? above : below;
+}
+
+/* The saddle response at `count` pixels of a row and of the two below, and the highest of each column; whether any is above the
+ * threshold. */
+INLINE uint8_t fill_strip(
+    const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict first, float *restrict second,
+    float *restrict third, float *restrict most)
 {
     int32_t high = 0;
     for (int64_t k = 0; k < count; k++) {
-        const float response = saddle_response(from + k, width);
-        to[k] = response;
-        high |= response > threshold;
+        const float one = saddle_response(from + k, width), two = saddle_response(from + k + width, width);
+        const float three = saddle_response(from + k + 2 * width, width);
+        const float highest = higher_of(three, higher_of(two, higher_of(one, LOWEST)));
+        first[k] = one;
+        second[k] = two;
+        third[k] = three;
+        most[k] = highest;
+        high |= highest > threshold;
     }
-    return high;
+    return (uint8_t)high;
+}
+
+/* The same of the first or last rows of the image, of which some have no neighbours. */
+INLINE void fill_border(const search_t s, int64_t v)
+{
+    float *most = s.most + v / TRIPLE % 2 * s.stride;
+    for (int64_t u = 1; u < s.width - 1; u++)
+        most[u] = LOWEST;
+    for (int64_t row = v; row < v + TRIPLE; row++) {
+        float *to = responses_of(s, row);
+        const int inside = row > 0 && row < s.height - 1;
+        for (int64_t u = 1; u < s.width - 1; u++) {
+            to[u] = inside ? saddle_response(s.smooth + row * s.width + u, s.width) : LOWEST;
+            most[u] = higher_of(to[u], most[u]);
+        }
+    }
+    memset(s.high + v / TRIPLE % 2 * s.strips, 1, (size_t)s.strips);
+}
+
+INLINE void fill_triple(const search_t s, int64_t v)
+{
+    const int64_t last = v + TRIPLE - 1;
+    if (v == 0 || last >= s.height - 1) {
+        fill_border(s, v);
+        return;
+    }
+    float *one = responses_of(s, v), *two = responses_of(s, v + 1), *three = responses_of(s, last);
+    float *most = s.most + v / TRIPLE % 2 * s.stride;
+    uint8_t *high = s.high + v / TRIPLE % 2 * s.strips;
+    const float *from = s.smooth + v * s.width;
+    fill_strip(from + 1, s.width, STRIPS_FROM - 1, 0.0f, one + 1, two + 1, three + 1, most + 1);
+    for (int64_t u = STRIPS_FROM, strip = 0; u < s.width - 1; u += STRIP, strip++) {
+        const float least = lowest_threshold(s, v, strip);
+        /* The last strip begins in the one before, so that the compiler knows how many pixels there are. */
+        const int64_t at = u + STRIP < s.width ? u : s.width - 1 - STRIP;
+        high[strip] =
+            at >= STRIPS_FROM
+                ? fill_strip(from + at, s.width, STRIP, least, one + at, two + at, three + at, most + at)
+                : fill_strip(from + u, s.width, s.width - 1 - u, least, one + u, two + u, three + u, most + u);
+    }
+}
+
+/* Which columns of each row of the triple from v on have peaks: into `columns` (TRIPLE, width / 3 + 1), and how many. */
+INLINE void search_triple(const search_t s, int64_t v, int32_t *columns, int64_t found[TRIPLE])
+{
+    const float *most = s.most + v / TRIPLE % 2 * s.stride;
+    const uint8_t *high = s.high + v / TRIPLE % 2 * s.strips;
+    float *rows[TRIPLE + 4];
+    for (int k = 0; k < TRIPLE + 4; k++)
+        rows[k] = responses_of(s, v - 2 + k);
+    for (int64_t u = STRIPS_FROM, strip = 0; u < s.width - 3; u += STRIP, strip++) {
+        if (!high[strip])
+            continue;
+        for (uint64_t left = columns_among(most, u, lowest_threshold(s, v, strip)); left; left &= left - 1) {
+            const int64_t at = u + __builtin_ctzll(left);
+            if (at >= s.width - 3)
+                break;
+            /* The highest, of equal ones the first; without branches, whose ways are chance. */
+            const int64_t above = rows[2][at] != most[at], row = above + (above & (rows[3][at] != most[at]));
+            int32_t *next = columns + row * (s.width / 3 + 1) + found[row];
+            *next = (int32_t)at;
+            found[row] += (v + row < s.height - 3) & (most[at] > threshold_at(s, v + row, strip)) & is_peak(rows + row, at);
+        }
+    }
 }
 
 /* reference.front.peaks: (u, v) and response of the peaks, row by row; returns how many. There is at most one peak in
- * 3x3 pixels. `scratch` holds 5 * (width + STRIP + 4) floats, `high` 5 * (width / STRIP + 1) bytes. */
+ * 3x3 pixels. `scratch` holds RING + 2 rows of width + STRIP + 4 floats, `high` 2 * (width / STRIP + 1) bytes, `columns`
+ * TRIPLE * (width / 3 + 1) numbers. */
 FOR_EACH_PROCESSOR int64_t find_peaks(
-    const float *smooth, int64_t height, int64_t width, const float *thresholds, float *scratch, uint8_t *high, int32_t *at,
-    float *response)
+    const float *smooth, int64_t height, int64_t width, const float *thresholds, float *scratch, uint8_t *high, int32_t *columns,
+    int32_t *at, float *response)
 {
-    const int64_t stride = width + STRIP + 4, strips = width / STRIP + 1;
-    for (int64_t k = 0; k < 5 * stride; k++)
-        scratch[k] = -1e30f;
+    const int64_t stride = width + STRIP + 4;
+    const search_t s = {
+        smooth, thresholds, height, width, stride, width / STRIP + 1, scratch, scratch + RING * stride, high};
+    for (int64_t k = 0; k < (RING + 2) * stride; k++)
+        scratch[k] = LOWEST;
     int64_t count = 0;
-    for (int64_t v = 1; v < height - 1; v++) {
-        const float *from = smooth + v * width;
-        float *last = scratch + v % 5 * stride;
-        uint8_t *mark = high + v % 5 * strips;
-        const float *threshold = thresholds + v / STRIP_ROWS * strips;
-        last[1] = saddle_response(from + 1, width);
-        last[2] = saddle_response(from + 2, width);
-        for (int64_t u = STRIPS_FROM; u < width - 1; u += STRIP, mark++, threshold++)
-            /* Twice, so that the compiler knows how many there are. */
-            *mark = (uint8_t)(u + STRIP < width ? fill_response(from + u, width, STRIP, *threshold, last + u)
-                                                : fill_response(from + u, width, width - 1 - u, *threshold, last + u));
-        /* The middle one of the five rows is v - 2. */
-        if (v < 5)
-            continue;
-        float *rows[5];
-        for (int k = 0; k < 5; k++)
-            rows[k] = scratch + (v + 1 + k) % 5 * stride;
-        mark = high + (v - 2) % 5 * strips;
-        threshold = thresholds + (v - 2) / STRIP_ROWS * strips;
-        for (int64_t u = STRIPS_FROM; u < width - 3; u += STRIP, mark++, threshold++) {
-            if (!*mark)
-                continue;
-            for (uint64_t left = peaks_among(rows, u, *threshold); left; left &= left - 1) {
-                const int64_t at_u = u + __builtin_ctzll(left);
-                if (at_u >= width - 3)
-                    break;
-                if (!is_peak(rows, at_u))
-                    continue;
-                at[2 * count] = (int32_t)at_u;
-                at[2 * count + 1] = (int32_t)(v - 2);
-                response[count++] = rows[2][at_u];
+    fill_triple(s, 0);
+    fill_triple(s, TRIPLE);
+    for (int64_t v = TRIPLE; v < height - 3; v += TRIPLE) {
+        int64_t found[TRIPLE] = {0};
+        fill_triple(s, v + TRIPLE);
+        search_triple(s, v, columns, found);
+        for (int64_t row = 0; row < TRIPLE; row++)
+            for (int64_t k = 0; k < found[row]; k++, count++) {
+                at[2 * count] = columns[row * (width / 3 + 1) + k];
+                at[2 * count + 1] = (int32_t)(v + row);
+                response[count] = responses_of(s, v + row)[at[2 * count]];
             }
-        }
     }
     return count;
 }
