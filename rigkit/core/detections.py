@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,8 +84,9 @@ class BoardDetection:
 
     def named(self, board_id: str) -> BoardDetection:
         # Its corners were looked at when it was made, and do not change.
-        out = copy(self)
-        object.__setattr__(out, "board_id", board_id)
+        out = object.__new__(BoardDetection)
+        for name in self.__slots__:
+            object.__setattr__(out, name, board_id if name == "board_id" else getattr(self, name))
         return out
 
     def lattice(self) -> FloatArray:

@@ -109,6 +109,8 @@ def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
     over the edge to another board keeps its own corners.
     """
     candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
+    if len(candidates) < 2:
+        return candidates
     corners = [item.pixels[item.known] for item in candidates]
     low = np.array([mine.min(axis=0) for mine in corners]) - SHARED_PX
     high = np.array([mine.max(axis=0) for mine in corners])

@@ -97,6 +97,8 @@ def grow_all(
 
 def _covered(lattice: Lattice, corners: FloatArray) -> bool:
     """Return whether most of the corners of `lattice` are among `corners` (M, 2)."""
+    if not len(corners):
+        return False
     near = near_any(lattice.pixels[lattice.known], corners, GROWN_AGAIN_PX)
     return 2 * int(np.count_nonzero(near)) > len(near)
 

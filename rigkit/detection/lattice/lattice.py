@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import ClassVar
 
 import cv2
@@ -181,13 +182,13 @@ class LatticeStack:
 
     @classmethod
     def of(cls, lattices: Sequence[Lattice]) -> LatticeStack:
-        tops = np.cumsum([0, *(item.pixels.shape[0] + cls.GAP for item in lattices)])
+        tops = list(accumulate((item.pixels.shape[0] + cls.GAP for item in lattices), initial=0))
         columns = max((item.pixels.shape[1] for item in lattices), default=0)
-        pixels = np.full((int(tops[-1]), columns, 2), np.nan)
+        pixels = np.full((tops[-1], columns, 2), np.nan)
         contrast, signs = np.full(pixels.shape[:2], np.nan), np.zeros(pixels.shape[:2])
         parts = []
         for top, item in zip(tops, lattices, strict=False):
-            part = (slice(int(top), int(top) + item.pixels.shape[0]), slice(0, item.pixels.shape[1]))
+            part = (slice(top, top + item.pixels.shape[0]), slice(0, item.pixels.shape[1]))
             pixels[part], contrast[part], signs[part] = item.pixels, item.contrast, item.signs()
             parts.append(part)
         return cls(pixels, contrast, signs, tuple(parts))

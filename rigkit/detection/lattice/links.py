@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.detection.saddles.response import Level
-from rigkit.detection.saddles.ring import arm_vectors
+from rigkit.detection.saddles.ring import line_vectors
 from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels import front
 
@@ -71,7 +71,7 @@ def find_links(corners: Corners, level: Level, length_ratio: float = LENGTH_RATI
         return Links(np.full((count, 4), -1))
     to = front.links(
         corners.pixels,
-        arm_vectors(corners.angles)[:, :2],
+        line_vectors(corners.angles),
         corners.contrast,
         _bounds(corners.contrast),
         MAX_ASIDE_PX * corners.scale / level.scale,

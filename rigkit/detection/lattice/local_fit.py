@@ -137,7 +137,8 @@ def _rules(degree: int, radius: int, leave_out: bool, width: float, ridge: tuple
 
 def _local_fit(rows: FloatArray) -> LocalFit:
     """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
-    sides, bends = rows[:, 2:6].reshape(-1, 2, 2), rows[:, 6:10].reshape(-1, 2, 2)
+    # By themselves in memory, as kernels take them.
+    sides, bends = (np.ascontiguousarray(rows[:, k : k + 4]).reshape(-1, 2, 2) for k in (2, 6))
     return LocalFit(rows[:, :2], sides, bends, rows[:, 10], rows[:, 11])
 
 

@@ -185,7 +185,10 @@ def _sharpest_turn(rows: int, uneven: SpacingChange) -> int | None:
 
 def join_parts(lattices: Sequence[Lattice]) -> list[Lattice]:
     """Return `lattices` with those joined that continue each other's rows and columns across a short gap."""
-    parts = [_LatticePart.of(item) for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
+    ordered = [item for item in sorted(lattices, key=lambda item: -item.count) if item.count >= 6]
+    if len(ordered) < 2:
+        return ordered
+    parts = [_LatticePart.of(item) for item in ordered]
     done = False
     while not done:
         done = True

@@ -85,7 +85,6 @@ def ring_rules(max_odd: float = MAX_ODD, max_centre: float = MAX_CENTRE) -> Ring
     )
 
 
-def arm_vectors(angles: FloatArray) -> FloatArray:
-    """Return the unit vectors of the four arms (N, 4, 2), with growing angle: A, B, -A, -B."""
-    two = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    return np.concatenate([two, -two], axis=1)
+def line_vectors(angles: FloatArray) -> FloatArray:
+    """Return the unit vectors of the lines A and B (N, 2, 2); the other two arms of a corner point the other way."""
+    return np.stack([np.cos(angles), np.sin(angles)], axis=-1)

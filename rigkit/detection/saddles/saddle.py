@@ -55,7 +55,11 @@ class Corners:
 
     def of(self, which: BoolArray) -> Corners:
         """Return those `which` (N,)."""
-        return Corners(self.pixels[which], self.angles[which], self.contrast[which], self.scale[which])
+        at = which.nonzero()[0]
+        # `pixels[which]` takes four times as long.
+        return Corners(
+            self.pixels.take(at, axis=0), self.angles.take(at, axis=0), self.contrast.take(at), self.scale.take(at)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,8 +71,19 @@ def uneven_factors(
     return edges.uneven_factors(_noise_of(fit, good, sides, owner), usual, factor_rules(radius_px))
 
 
+def board_factors(
+    fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, boards: int, radius_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return `sigma_factors` (P,), and beside these `uneven_factors` (N,)."""
+    noise, rules = _noise_of(fit, good, sides, owner), factor_rules(radius_px)
+    factors = edges.sigma_factors(noise, boards, rules)
+    return factors, edges.uneven_factors(noise, factors, rules)
+
+
 def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray) -> edges.NoiseOfCorners:
-    return edges.NoiseOfCorners(fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used, good, owner)
+    # Copied here, once for both kernels, which take arrays that lie by themselves in memory.
+    columns = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
+    return edges.NoiseOfCorners(*(np.ascontiguousarray(values) for values in columns), good, owner)
 
 
 def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> float:

@@ -50,6 +50,10 @@ class RefinedLattice:
         relative: FloatArray = self.residual / self.lattice.contrast
         return relative
 
+    def of(self, lattice: Lattice) -> RefinedLattice:
+        """Return this with `lattice` instead of its own, which has the same corners, or more of them."""
+        return self._of(lattice, self._values())
+
     def without(self, drop: BoolArray) -> RefinedLattice:
         """Return this with the corners `drop` (R, C) forgotten."""
         rest = (np.where(drop, np.nan, values) for values in self._values())
@@ -67,6 +71,8 @@ class RefinedLattice:
 
     def turned(self, quarter_turns: int) -> RefinedLattice:
         """Return this numbered from another corner, as `Lattice.turned`."""
+        if quarter_turns % 4 == 0:
+            return self
         rest = (turned(values, quarter_turns) for values in self._values())
         return self._of(self.lattice.turned(quarter_turns), rest)
 

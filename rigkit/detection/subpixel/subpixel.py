@@ -16,7 +16,7 @@ from rigkit.detection.lattice.lattice import Lattice, LatticeStack
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.consistent import checked, confirmed, with_holes
-from rigkit.detection.subpixel.correlation import sigma_factors, uneven_factors
+from rigkit.detection.subpixel.correlation import board_factors
 from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
@@ -67,7 +67,7 @@ def refine(
     stack = LatticeStack.of(lattices)
     first = _first_pass(image, Lattice(stack.pixels, stack.contrast, True), stack.signs)
     start, holes = with_holes(first.lattice, stack.signs != 0.0)
-    before, blur = replace(first, lattice=start), _typical_blur(first, stack.parts)
+    before, blur = first.of(start), _typical_blur(first, stack.parts)
     shape = fit_cells(start.pixels, start.known)
     gaps = shape.gaps()
     sheet = _Stacked(
@@ -220,7 +220,7 @@ class _Stacked:
     def cut(self, item: RefinedLattice, number: int) -> RefinedLattice:
         """Return the lattice of that number of the whole sheet `item`."""
         mine = item.cut(*self.parts[number])
-        return replace(mine, lattice=replace(mine.lattice, rising=self.lattices[number].rising))
+        return mine.of(Lattice(mine.lattice.pixels, mine.lattice.contrast, self.lattices[number].rising))
 
     def windows(
         self, before: RefinedLattice, lines: tuple[FloatArray, FloatArray], blur: FloatArray, *, aslant: bool
@@ -300,8 +300,7 @@ def _last_pass(sheet: _Stacked, windows: _Windows, parts: Sequence[Part]) -> tup
     fit = windows.fit(sheet.image, sheet.signs, slice(None), windows.geometry, LAST_PASS[1:])
     fit, sides, radius_px = _beside_paper(sheet, windows, fit, mine, None), windows.geometry.sides, windows.radius_px
     good = fit.valid & (fit.contrast > 0.0)
-    factors = sigma_factors(fit, good, sides, mine, len(parts), radius_px)
-    uneven = uneven_factors(fit, good, sides, mine, factors, radius_px)
+    factors, uneven = board_factors(fit, good, sides, mine, len(parts), radius_px)
     return _spread(windows.lattice, fit, fit.sigma_px * factors[mine] * uneven), factors
 
 
@@ -324,9 +323,12 @@ def _reached_by_others(known: BoolArray, gaps: FloatArray, blur: FloatArray, par
 def _spread(start: Lattice, fit: EdgeFit, sigma_px: FloatArray) -> RefinedLattice:
     """Return the sheet `start` with its corners as fitted, without those that failed."""
     good = fit.valid & (fit.contrast > 0.0)
-    cells, shape = np.flatnonzero(start.known)[good], start.contrast.shape
+    cells, shape = start.known.reshape(-1).nonzero()[0], start.contrast.shape
     pixels, single = np.full((start.known.size, 2), np.nan), np.full((5, start.known.size), np.nan)
-    pixels[cells] = fit.pixels[good]
-    single[:, cells] = np.array([fit.contrast, sigma_px, fit.blur, fit.residual, fit.noise])[:, good]
+    fitted, values = fit.pixels, np.array([fit.contrast, sigma_px, fit.blur, fit.residual, fit.noise])
+    if not good.all():
+        cells, fitted, values = cells[good], fitted[good], values[:, good]
+    pixels[cells] = fitted
+    single[:, cells] = values
     contrast, *rest = single.reshape(-1, *shape)
     return RefinedLattice(Lattice(pixels.reshape(*shape, 2), contrast, start.rising), *rest)

@@ -20,7 +20,7 @@ from rigkit.detection.lattice.links import (
     _bounds,
 )
 from rigkit.detection.saddles.response import FloatImage, Level, sample
-from rigkit.detection.saddles.ring import arm_vectors
+from rigkit.detection.saddles.ring import line_vectors
 from rigkit.detection.saddles.saddle import Corners
 from rigkit.kernels.front import LinkRules
 
@@ -86,7 +86,7 @@ def _candidates(corners: Corners) -> tuple[IntArray, IntArray, IntArray, IntArra
     length, other = _nearest_alike(pixels, corners.contrast)
     chord_u = (pixels[other, 0] - pixels[:, :1]) / length
     chord_v = (pixels[other, 1] - pixels[:, 1:]) / length
-    lines = arm_vectors(corners.angles)[:, :2]
+    lines = line_vectors(corners.angles)
     along = [chord_u * lines[:, k, :1] + chord_v * lines[:, k, 1:] for k in (0, 1)]
     ratio = corners.contrast[:, None] / corners.contrast[other]
     alike = (ratio > CONTRAST_RATIO) & (ratio < 1.0 / CONTRAST_RATIO) & (other != np.arange(len(pixels))[:, None])
