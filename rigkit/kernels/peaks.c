@@ -43,13 +43,21 @@ INLINE void count_bins(const float *values, int64_t count, const bins_t bins, in
 INLINE float value_at_rank(
     const float *values, int64_t count, const bins_t bins, const int32_t often[RANKS], int64_t at, float *room)
 {
+    enum { BLOCK = 32 };
     int32_t bin = 0;
     for (; at >= often[bin] && bin < RANKS - 1; bin++)
         at -= often[bin];
     int64_t few = 0;
-    for (int64_t k = 0; k < count; k++)
-        if (bin_of(values[k], bins) == bin)
-            room[few++] = values[k];
+    for (int64_t first = 0; first < count; first += BLOCK) {
+        /* Most blocks have none of them, and are looked at as a whole. */
+        const int64_t here = count - first < BLOCK ? count - first : BLOCK;
+        int32_t any = here < BLOCK;
+        for (int64_t k = 0; k < BLOCK && here == BLOCK; k++)
+            any |= bin_of(values[first + k], bins) == bin;
+        for (int64_t k = first; any && k < first + here; k++)
+            if (bin_of(values[k], bins) == bin)
+                room[few++] = values[k];
+    }
     /* Hoare's FIND. */
     int64_t low = 0, high = few - 1;
     while (low < high) {
