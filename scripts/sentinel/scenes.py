@@ -67,7 +67,6 @@ def _pair(entry: dict[str, object], data: Path) -> ScenePair:
     direction = unit(np.array(entry["cam2_from_cam1_t_direction"], dtype=np.float64))
     true = Rigid3(np.array(entry["cam2_from_cam1_R"]), BASELINE_MM * direction)
     images = [read_image(data / "scenes" / str(entry[key])) for key in ("image1", "image2")]
-    matches = scene_matches(images[0], images[1])
     size = sum(camera.parameters.size for camera in cameras) + 6
     rig = Watched(
         names=("left", "right"),
@@ -77,7 +76,7 @@ def _pair(entry: dict[str, object], data: Path) -> ScenePair:
         sigma_px=BOARD_SIGMA_PX,
     )
     rig = replace(rig, covariance=_as_boards_tell(rig))
-    return ScenePair(str(entry["name"]), str(entry["set"]), rig, PairMatches(0, 1, matches.pixels1, matches.pixels2))
+    return ScenePair(str(entry["name"]), str(entry["set"]), rig, scene_matches(rig, (0, 1), *images))
 
 
 def _camera(told: object) -> Camera:

@@ -10,17 +10,20 @@ import pytest
 from helpers.calibration_scenes import lens, noisy_view
 from helpers.sentinel_scenes import NOISE_PX, poses_held
 
+from rigkit.affine.correspondences import Correspondences
+from rigkit.affine.refine_patches import HALF_WIDTH_OF_FEATURE, WINDOW_OF_PATCH
 from rigkit.cameras.base import Camera
+from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.io.history_file import HistoryEntry
 from rigkit.planning.candidates import Reach
 from rigkit.report.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, straightened
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
 from rigkit.workflows.next_pictures import TASK_CELLS, length_goals
@@ -45,6 +48,14 @@ def _rig() -> Watched:
     )
 
 
+BENT = Brown((1280, 960), np.array([640.0, 640.0, 639.5, 479.5, -0.22, 0.06, 2e-4, -2e-4, -0.006]))
+DISTORTED = replace(
+    _rig(),
+    cameras=(BENT, BENT),
+    cam_from_rig=(Rigid3.identity(), MOUNT),
+    covariance=np.diag([*[0.005] * 4, *[5e-6] * 5] * 2 + [*[5e-6] * 3, *[0.01] * 3]) ** 2,
+)
+"""Of 90 degrees."""
 NEAR = Reach(nearest_mm=300.0)
 
 
@@ -114,6 +125,34 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
         assert not alarmed.holds
         named += alarmed.change is not None and alarmed.change.cause.kind == "rotation"
     assert quiet == named == draws
+
+
+def _aligned(rng: np.random.Generator) -> tuple[PairMatches, PairMatches]:
+    """Patches of planes, aligned by affine warps without noise: as they are found, and as the rig straightens them."""
+    camera, offset = DISTORTED.cameras[0], np.arange(-HALF_WIDTH_OF_FEATURE, HALF_WIDTH_OF_FEATURE + 1.0)
+    pixels1 = rng.uniform([20.0, 20.0], [1260.0, 940.0], (1200, 2))
+    u = np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)
+    weight = np.exp(-0.25 * (u**2).sum(axis=1) / (WINDOW_OF_PATCH * HALF_WIDTH_OF_FEATURE) ** 2)
+    rays, seen1 = camera.unproject(pixels1[:, None] + u)
+    middle, _ = camera.unproject(pixels1)
+    normals = unit(-middle + 0.4 * rng.standard_normal(middle.shape))
+    distance = rng.uniform(700.0, 2000.0, len(middle)) * np.sum(normals * middle, axis=1)
+    points = rays * (distance[:, None] / np.einsum("nki,ni->nk", rays, normals))[..., None]
+    pixels2, seen2 = camera.project(MOUNT.apply(points))
+    kept = (seen1 & seen2 & camera.on_image(pixels2)).all(axis=1)
+    # The affine warp that is nearest within the window.
+    design = weight[:, None] * np.column_stack([np.ones(len(u)), u])
+    warp = np.linalg.pinv(design) @ (weight[:, None] * pixels2[kept])
+    found = Correspondences(pixels1[kept], warp[:, 0], np.swapaxes(warp[:, 1:], 1, 2))
+    return PairMatches(0, 1, found.pixels1, found.pixels2), straightened(DISTORTED, (0, 1), found)
+
+
+def test_what_an_affine_warp_leaves_of_the_map_between_lenses_is_taken_back(rng: np.random.Generator) -> None:
+    found, straight = _aligned(rng)
+    before, after = check_matches(DISTORTED, [found]), check_matches(DISTORTED, [straight])
+    # Half of what a match is taken to err by, but alike wherever it is.
+    assert before.rms_px > 0.008
+    assert after.holds and after.rms_px < 0.2 * before.rms_px
 
 
 def test_matches_that_say_nothing_are_told_from_those_that_say_little() -> None:
