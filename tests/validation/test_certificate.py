@@ -22,7 +22,14 @@ from rigkit.report.certificate_page import bound_figure
 from rigkit.report.figures import _drawn
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
-from rigkit.validation.certificate.propagation import OF_CORNERS, OF_LENSES, OF_MOUNTS, measured_points
+from rigkit.validation.certificate.propagation import (
+    OF_CORNERS,
+    OF_LENSES,
+    OF_MOUNTS,
+    gradients,
+    measured_points,
+    variances,
+)
 from rigkit.validation.sentinel.evidence import Watched
 
 TRIALS = 800
@@ -123,6 +130,26 @@ def test_bounds_of_a_rig_hold_as_often_as_they_say(quantity: Quantity, name: str
         found *= 1.0 + rig.scale_sigma * rng.normal()
         inside += np.abs(read_off(quantity, found) - exact) <= bounds[:, None]
     holds(inside)
+
+
+@pytest.mark.parametrize("quantity", [Quantity.LENGTH, Quantity.DEPTH, Quantity.ANGLE])
+def test_what_noise_along_the_rays_does_to_second_order_is_counted(
+    quantity: Quantity, rng: np.random.Generator
+) -> None:
+    """Points that are off along their rays by a twentieth of what is measured, many times as much as across."""
+    rig = replace(rig_of("kannala_brandt", np.zeros((2 * 8 + 6,) * 2), scale_sigma=0.0), sigma_px=0.25)
+    task = Task(quantity=quantity, size_mm=150.0, distance_mm=1500.0)
+    rays, _ = rig.cameras[0].unproject(np.array([[620.0, 500.0], [800.0, 300.0]]))
+    points, weights = measured_points(rays, task, True)
+    by_corner, by_calibration, by_pixel, _ = gradients(rig, points, weights)
+    stated = variances(rig, task, points, by_corner, by_calibration, by_pixel)[OF_CORNERS]
+    off = rig.sigma_px * np.einsum("nkip,snkp->snki", by_pixel, rng.normal(size=(8000, *by_pixel.shape[:2], 4)))
+    moved = read_off(quantity, (points + off).reshape(-1, *points.shape[1:])).reshape(8000, len(points), -1)
+    error = (moved - read_off(quantity, points)) * (np.radians(1.0) if quantity is Quantity.ANGLE else 1.0)
+    np.testing.assert_allclose((error**2).mean(axis=0), stated, rtol=0.08)
+    first = rig.sigma_px**2 * (by_corner**2).sum(axis=(-1, -2))
+    # What does not face the first order at all: depths, of which ends nearer or farther are that.
+    assert (first < (1.0 if quantity is Quantity.DEPTH else 0.9) * stated).all()
 
 
 def test_bounds_of_one_camera_hold_as_often_as_they_say(rng: np.random.Generator) -> None:

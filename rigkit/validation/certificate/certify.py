@@ -53,14 +53,14 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     shape = pixels.shape[:2]
     rays, valid = first.unproject(pixels.reshape(-1, 2))
     points, weights = measured_points(np.where(valid[:, None], rays, [0.0, 0.0, 1.0]), task, instrument.is_rig)
-    by_corner, by_calibration, farthest, seen = gradients(instrument, points, weights)
+    by_corner, by_calibration, by_pixel, seen = gradients(instrument, points, weights)
     seen &= valid
     if not seen.any():
         raise DegenerateError(
             f"certificate: nowhere is a {task.quantity} of {task.size_mm:g} mm at {task.distance_mm:g} mm in view of "
             f"{' and '.join(instrument.names)}; give a shorter length or another distance"
         )
-    variance = variances(instrument, task, by_corner, by_calibration)
+    variance = variances(instrument, task, points, by_corner, by_calibration, by_pixel)
     # Of several ways to hold the same thing the worst counts.
     worst = np.argmax(sum(variance.values()), axis=1)
     chosen = np.arange(len(worst))
@@ -73,6 +73,8 @@ def certify(instrument: Instrument, task: Task, *, cells: tuple[int, int] = MAP_
     quantile = _quantile(sigma, instrument.freedom, task.confidence)
     bound = quantile * np.sqrt(sum(s**2 for s in sigma.values()))
     whole = factor * (1.0 if task.quantity is Quantity.ANGLE else task.size_mm)
+    # How far a pixel's error moves the point that suffers most, mm.
+    farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
     uncertain = quantile * instrument.sigma_px * farthest.reshape(shape) > MAX_SHARE * task.size_mm
     in_view = seen.reshape(shape)
     certificate = Certificate(

@@ -9,9 +9,20 @@ where J = d q / d X and D = d q / d theta stack both cameras (the points are tri
 sees directions only: its points lie at the stated distance, and A = r d ray / d pixel moves them across the ray.
 Every corner's noise is its own, the calibration is common to all points of one measurement, the scale of the boards to
 all lengths. The bound is the normal quantile of the confidence times the root of the sum.
+
+Points are off along their rays by many times as much as across them, and what does not move a length or an angle to
+first order, its ends nearer or farther, does so to second: a length becomes longer, an angle smaller. With the Hessian
+H of g by the points, and C their covariance by the corners' noise, q = dX^T H dX / 2 has the mean square
+
+    E q^2 = tr(HC)^2 / 4 + tr(HCHC) / 2,
+
+which is counted to the corners (JCGM 100 "GUM", 5.1.2, note; q and dg are uncorrelated). How flat a plane looks moves
+by next to nothing to second order.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -71,11 +82,45 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
     return points, np.stack(ends, axis=1)
 
 
+def hessians(points: Points, quantity: Quantity) -> FloatArray:
+    """Return the second derivatives (N, M, 3 K, 3 K) of M lengths, depths or angles, as a rig measures them, by their
+    points (N, K, 3) as `measured_points` has them."""
+    count = points.shape[1]
+    if quantity is Quantity.ANGLE:
+        edges = points[:, 1:] - points[:, :1]
+        square = np.sum(edges[:, 0] ** 2, axis=-1)[:, None, None]
+        a, b = np.moveaxis(edges / np.sqrt(square), 1, 0)
+        along = np.cross(a, b)
+        # angle = -(da . r)(db . r) + (da . a)(da . b) + (db . a)(db . b) over the square, with r across both edges.
+        own = (a[:, :, None] * b[:, None, :] + b[:, :, None] * a[:, None, :]) / square
+        both = -along[:, :, None] * along[:, None, :] / square
+        by_edge = np.block([[own, both], [both, own]])
+        out = _differences([(0, 1), (0, 2)], count)
+        return np.asarray(out.T @ by_edge @ out)[:, None]
+    each = []
+    for first in range(0, count, 2):
+        way = points[:, first + 1] - points[:, first]
+        length = np.linalg.norm(way, axis=-1)[:, None, None]
+        unit = way / length[:, 0]
+        across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length
+        out = _differences([(first, first + 1)], count)
+        each.append(out.T @ across @ out)
+    return np.stack(each, axis=1)
+
+
+def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
+    """Return how differences of points (from, to), one below the other, follow from all `count` points."""
+    out = np.zeros((len(pairs), count))
+    for row, (start, end) in enumerate(pairs):
+        out[row, start], out[row, end] = -1.0, 1.0
+    return np.kron(out, np.eye(3))
+
+
 def gradients(
     instrument: Instrument, points: Points, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-    """Return d quantity / d pixel (N, M, K, 2 C) of C cameras, d quantity / d calibration (N, M, P), how far a pixel's
-    error moves the point that suffers most (N,) mm/px, and which of the N places all cameras see."""
+    """Return d quantity / d pixel (N, M, K, 2 C) of C cameras, d quantity / d calibration (N, M, P), d point / d pixel
+    (N, K, 3, 2 C), and which of the N places all cameras see."""
     size = len(instrument.covariance)
     rig_from_first = instrument.cam_from_rig[0].inverse()
     in_rig = rig_from_first.apply(points)
@@ -110,14 +155,18 @@ def gradients(
         # The pseudo-inverse of a 2x3 Jacobian moves a point across its ray alone.
         by_pixel = np.linalg.pinv(J)
     by_corner = np.einsum("nmkx,nkxp->nmkp", weights, by_pixel)
-    farthest = np.linalg.norm(by_pixel, ord=2, axis=(-2, -1)).max(axis=1)
-    return by_corner, -np.einsum("nmkp,nkpt->nmt", by_corner, D), farthest, seen
+    return by_corner, -np.einsum("nmkp,nkpt->nmt", by_corner, D), by_pixel, seen
 
 
 def variances(
-    instrument: Instrument, task: Task, by_corner: FloatArray, by_calibration: FloatArray
+    instrument: Instrument,
+    task: Task,
+    points: Points,
+    by_corner: FloatArray,
+    by_calibration: FloatArray,
+    by_pixel: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Return the variance (N, M) that each cause adds.
+    """Return the variance (N, M) that each cause adds, from `points` (N, K, 3) and what `gradients` returns of them.
 
     What the mounts share with the lenses they were estimated with is the lenses': dm = C_ml C_ll^-1 dl + rest.
     """
@@ -134,6 +183,9 @@ def variances(
         OF_CORNERS: instrument.sigma_px**2 * np.sum(by_corner**2, axis=(-1, -2)),
         OF_LENSES: np.einsum("nmi,ij,nmj->nm", with_lens, own, with_lens),
     }
+    if instrument.is_rig and task.quantity is not Quantity.PLANE:
+        bent = hessians(points, task.quantity)
+        variance[OF_CORNERS] = variance[OF_CORNERS] + _second_order(bent, by_pixel, instrument.sigma_px)
     if instrument.is_rig:
         rest = covariance[split:, split:] - follows @ covariance[:split, split:]
         variance[OF_MOUNTS] = np.einsum("nmi,ij,nmj->nm", mount, rest, mount)
@@ -142,3 +194,15 @@ def variances(
         cause = OF_SCALE if instrument.is_rig else OF_DISTANCE
         variance[cause] = np.full(by_calibration.shape[:2], (relative * task.size_mm) ** 2)
     return {cause: np.maximum(value, 0.0) for cause, value in variance.items()}
+
+
+def _second_order(bent: FloatArray, by_pixel: FloatArray, sigma_px: float) -> FloatArray:
+    """Return the mean square (N, M) of what the corners' noise moves to second order, with the `hessians` `bent` of
+    the quantities and d point / d pixel (N, K, 3, 2 C)."""
+    count = by_pixel.shape[1]
+    root = np.zeros((len(by_pixel), 3 * count, count * by_pixel.shape[-1]))
+    for k in range(count):
+        root[:, 3 * k : 3 * k + 3, k * by_pixel.shape[-1] : (k + 1) * by_pixel.shape[-1]] = sigma_px * by_pixel[:, k]
+    moved = np.swapaxes(root, -1, -2)[:, None] @ bent @ root[:, None]
+    trace = np.trace(moved, axis1=-2, axis2=-1)
+    return np.asarray(0.25 * trace**2 + 0.5 * (moved**2).sum(axis=(-1, -2)))
