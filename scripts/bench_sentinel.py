@@ -8,11 +8,13 @@ departs: lenses that no model is, calibrated with boards in the left part of the
 right: what they do there beyond their models is no change.
 rendered: pictures of all five lenses, detected; three or half of them are checked against the rest, and three pictures
 after a change.
+pupil: simulated fisheyes whose entrance pupils move (`measure_pupil.py`), calibrated from 20 near boards, checked with
+three.
 scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
 pairs: real pairs of textured scenes whose cameras and pose are known; the pose told is right, or 0.05 degrees off.
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
-    python scripts/bench_sentinel.py [lens] [rig] [departs] [rendered] [scene] [pairs] [real] [--seeds 20]
+    python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [--seeds 20]
         [--lens NAME ...] [--board 9x6x25] [--parameters-alone]
 """
 
@@ -31,6 +33,7 @@ import numpy as np
 from bench_planner import LENSES, Lens, by_hand, free_poses, see
 from scipy.special import ndtr, ndtri
 from sentinel.captures import SAID, left_out, real
+from sentinel.pupils import pupils
 from sentinel.scenes import pairs
 from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, TALLY, checked, tell, turned, unchanged
 from split_halves import identified
@@ -341,7 +344,7 @@ REAL = ("caliper", "camodocal", "ov-plane", "ocam", "fisheye-chess", "cylinder",
 
 
 def main() -> None:
-    kinds = ("lens", "rig", "departs", "rendered", "scene", "pairs", "real")
+    kinds = ("lens", "rig", "departs", "pupil", "rendered", "scene", "pairs", "real")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("kinds", nargs="*", choices=[*kinds, []], help="default all")
     parser.add_argument("--seeds", type=int, default=20)
@@ -360,6 +363,7 @@ def main() -> None:
         "lens": [partial(one_camera, n, args.seeds, args.noise) for n in args.lens],
         "rig": [partial(stereo, args.seeds, args.noise, n) for n in args.lens],
         "departs": [partial(departing, n, args.seeds, args.noise) for n in DEPARTING],
+        "pupil": [partial(pupils, args.seeds)],
         "rendered": [partial(rendered, n, args.seeds, args.cache) for n in args.lens],
         "scene": [partial(scene, args.seeds, args.noise, n) for n in args.lens],
         "pairs": [partial(pairs, args.data, args.seeds)],

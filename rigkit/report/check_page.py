@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import without_nan
 from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Table, cells, columns
@@ -194,7 +195,7 @@ def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) 
 
 def change_svg(check: SentinelCheck, c: int) -> str:
     """Draw how the best explanation moves the projection of camera `c` of what stays where it is, magnified."""
-    before, after = check.watched.cameras[c], check.fixed.cameras[c]
+    before, after = far_camera(check.watched.cameras[c]), far_camera(check.fixed.cameras[c])
     turn = check.fixed.cam_from_rig[c].rotation @ check.watched.cam_from_rig[c].rotation.T
     pixels = grid_pixels(before.size_px, ARROWS).reshape(-1, 2)
     rays, valid = before.unproject(pixels)

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import block_diag
 
-from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.pupil import SolvedPupil
-from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera
-from rigkit.core.arrays import IntArray, scaled_pinv
+from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
-from rigkit.io.calibration_file import load_calibration
 from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.rig_file import is_rig_file
 from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
-from rigkit.validation.sentinel.evidence import Watched
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.inputs.camera_files import called_bad
 from rigkit.workflows.provenance import digest_line, software_facts
@@ -99,36 +92,6 @@ def load_instrument(
     if cameras is not None and not rig:
         raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
     known, _ = load_watched(Path(path))
-    if known.pupils and not rig:
-        near = uncertain_camera(load_calibration(path), quoted=False, near=True)
-        known = replace(known, cameras=(near.camera,), covariance=near.covariance)
-    elif known.pupils:
-        known = _with_pupils(known, list(load_saved_rig(path).pupils.values()))
     if rig and len(known.names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
     return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)
-
-
-def _with_pupils(known: Watched, pupils: Sequence[SolvedPupil]) -> Watched:
-    """Return a rig with its cameras of points in mm, and the covariance of all their parameters.
-
-    A pupil e follows lenses and mounts x as their covariance has it, e = W x + rest; the rests of two pupils are taken
-    to be independent.
-    """
-    models, layout, order = known.of_models, known.layout, list[IntArray]()
-    follows, rest = [np.eye(layout.count)], [np.zeros((layout.count, layout.count))]
-    inverse = scaled_pinv(known.covariance[np.ix_(models, models)])
-    cameras, of = list(known.cameras), dict(zip(sorted(known.pupils), pupils, strict=True))
-    for k, run in enumerate(layout.cameras):
-        order.append(np.arange(run.start, run.stop))
-        if k in of:
-            order.append(sum(len(rows) for rows in follows) + np.arange(PUPIL_TERMS))
-            by = np.zeros((PUPIL_TERMS, layout.count))
-            by[:, models] = of[k].with_frame.T @ inverse
-            follows.append(by)
-            rest.append(of[k].covariance - by[:, models] @ of[k].with_frame)
-            cameras[k] = NearCamera.of(cameras[k], of[k].terms)
-    order.append(np.arange(layout.cameras[-1].stop, layout.count))
-    through, at = np.concatenate(follows), np.concatenate(order)
-    covariance = (through @ known.covariance @ through.T + block_diag(*rest))[np.ix_(at, at)]
-    return replace(known, cameras=tuple(cameras), covariance=covariance)

@@ -16,6 +16,7 @@ from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
@@ -42,7 +43,7 @@ from rigkit.validation.sentinel.epipolar import check_scene
 from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import watched_camera, with_pupils
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
@@ -172,7 +173,7 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
 def _watched_rig(known: SavedRig, source: Path) -> Watched:
     """Return what a rig's file says; raises InputError for one that does not say how sure it is."""
     lenses, covariance, sigma_px = known.stated(source)
-    return Watched(
+    central = Watched(
         names=tuple(known.cameras),
         cameras=lenses,
         cam_from_rig=tuple(pose for _, pose in known.cameras.values()),
@@ -181,8 +182,8 @@ def _watched_rig(known: SavedRig, source: Path) -> Watched:
         overdispersion=known.overdispersion,
         freedom=known.freedom,
         scale_sigma=known.scale_sigma,
-        pupils={k: known.pupils[name].terms for k, name in enumerate(known.cameras) if name in known.pupils},
     )
+    return with_pupils(central, known.pupils)
 
 
 def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
@@ -243,7 +244,7 @@ def _boards_seen(
             progress("corners", k * len(frame) + c, total)
             image = _image_of(watched.cameras[c], source, path, unreadable)
             if image is not None:
-                seen[c][str(path)] = detect_boards(image, boards, camera=watched.cameras[c])
+                seen[c][str(path)] = detect_boards(image, boards, camera=far_camera(watched.cameras[c]))
     progress("corners", total, total)
     return seen
 
@@ -265,7 +266,7 @@ def _views(
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [counted_alike(watched, FreshView(name, c, watched.from_afar(view, c)), out) for view in views]
+            out += [counted_alike(watched, FreshView(name, c, view), out) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out
@@ -310,14 +311,14 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
         f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
         "calibrate anew when there is time",
     )
-    # What the lenses may do beyond their models the file says by itself.
+    # What the lenses may do beyond their models the file says by itself; nothing that happens changes a pupil.
     covariance = np.array(data["covariance"]) + (check.covariance - check.watched.covariance)[np.ix_(own, own)]
     if "cameras" in data:
         for entry, camera, pose in zip(data["cameras"], fixed.cameras, fixed.cam_from_rig, strict=True):
-            entry["camera"] = camera_to_json(lens_of(camera))
+            entry["camera"] = camera_to_json(lens_of(far_camera(camera)))
             entry["cam_from_rig"] = pose.matrix()[:3].tolist()
     else:
-        data["camera"] = camera_to_json(lens_of(fixed.cameras[0]))
+        data["camera"] = camera_to_json(lens_of(far_camera(fixed.cameras[0])))
         frame = np.array(data["frame_covariance"], dtype=np.float64)
         if "pupil" in data:
             pupil = pupil_from_json(data["pupil"])

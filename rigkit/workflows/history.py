@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -95,7 +96,8 @@ def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c
         )
     with about(new, reference):
         # Both follow what the lens does beyond its model.
-        watched = watched_camera(before, reference.stem, beyond_model=False)
+        central = replace(before, pupil=None)
+        watched = watched_camera(central, reference.stem, beyond_model=False)
         check = judge_evidence(watched, lambda watched: _as_evidence(watched, now))
     places = as_seen_from(register, new), as_seen_from(register, reference)
     entry = HistoryEntry.of_check(

@@ -121,10 +121,10 @@ def plan_session(
             boards = without_parts(shape.board for shape in calibration.boards)
         if not boards:
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
-    warn_of_pupil(source, calibration)
     taken = calibration.corners.used[0]
     if options.check:
         return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)
+    warn_of_pupil(source, calibration)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
     return _shown(plan, options, f"Next pictures for {source.name}", source, taken)

@@ -42,7 +42,7 @@ def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") 
 
 def checked(known: Calibration, views: Sequence[BoardView]) -> SentinelCheck:
     watched = watched_camera(known, "camera", **COUNTED)
-    return check_views(watched, [FreshView(v.image, 0, watched.from_afar(v)) for v in views])
+    return check_views(watched, [FreshView(v.image, 0, v) for v in views])
 
 
 def unchanged(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -153,11 +154,32 @@ def test_diff_compares_what_is_far_away(saved: Path, tmp_path: Path, caplog: pyt
 
 def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
     watched, _ = load_watched(saved)
-    fresh = views_of(2, 6)
-    seen = [FreshView(f"{k}", 0, watched.from_afar(view)) for k, view in enumerate(fresh)]
+    seen = [FreshView(f"{k}", 0, view) for k, view in enumerate(views_of(2, 6))]
     assert check_views(watched, seen).rms_px < 0.06
-    raw = [FreshView(f"{k}", 0, view) for k, view in enumerate(fresh)]
-    assert check_views(watched, raw).rms_px > 0.2
+    near = watched.cameras[0]
+    assert isinstance(near, NearCamera)
+    # As if from one point; and the lens and the pupil as sure together as they were solved for.
+    central = replace(watched, cameras=(near.with_parameters([*near.lens.parameters, 0.0, 0.0]),))
+    assert check_views(central, seen).rms_px > 0.2
+    own, known = slice(near.lens.parameters.size, None), load_calibration(saved)
+    assert known.pupil is not None
+    assert (np.diag(watched.covariance[own, own]) >= 0.999 * np.diag(known.pupil.covariance)).all()
+    # What the lens may do beyond its model adds to both.
+    np.testing.assert_allclose(watched.covariance[:2, own], known.pupil.with_frame[:2], rtol=0.1)
+
+
+def test_a_pupil_that_is_not_known_well_alarms_nobody(saved: Path) -> None:
+    """What fresh views see of it is no change of the lens, where the calibration is as unsure."""
+    watched, _ = load_watched(saved)
+    near, p = watched.cameras[0], watched.cameras[0].parameters.size
+    sigma = 0.3
+    unsure = watched.covariance.copy()
+    unsure[p - 2, p - 2] += sigma**2
+    off = near.with_parameters(near.parameters + np.where(np.arange(p) == p - 2, 1.5 * sigma, 0.0))
+    views = random_views(off, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
+    seen = [FreshView(f"{k}", 0, view) for k, view in enumerate(views)]
+    assert not check_views(watched, seen).holds
+    assert check_views(replace(watched, covariance=unsure), seen).holds
 
 
 def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path: Path) -> None:
@@ -165,10 +187,10 @@ def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path:
     watched, _ = load_watched(saved)
     zoomed = watched.cameras[0].parameters.copy()
     zoomed[:2] *= 1.01
-    assert 0 in watched.pupils
-    changed = NearCamera.of(watched.cameras[0].with_parameters(zoomed), watched.pupils[0])
+    changed = watched.cameras[0].with_parameters(zoomed)
+    assert isinstance(changed, NearCamera)
     views = random_views(changed, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
-    check = check_views(watched, [FreshView(f"{k}", 0, watched.from_afar(v)) for k, v in enumerate(views)])
+    check = check_views(watched, [FreshView(f"{k}", 0, v) for k, v in enumerate(views)])
     assert not check.holds and check.change is not None
     path = tmp_path / "fixed.json"
     path.write_text(fixed_text(saved, check), encoding="utf-8")

@@ -10,6 +10,7 @@ from rigkit.calibration.displaced import lens_of
 from rigkit.calibration.uncertainty import projection_design
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
 from rigkit.planning.goal import GOAL_GRID, Goal, projection_goal
@@ -82,10 +83,12 @@ def causes_of(watched: Watched) -> list[Cause]:
 
 
 def lens_goals(watched: Watched) -> list[Goal]:
-    """Return for each camera the rms change of its projection, after the best rotation, over its image."""
+    """Return for each camera the rms change of its projection of what is far away, after the best rotation, over its
+    image."""
     out, layout = [], watched.layout
-    for camera, own in zip(watched.cameras, layout.cameras, strict=True):
-        goal = projection_goal(camera)
+    for camera, run in zip(watched.cameras, layout.cameras, strict=True):
+        far = far_camera(camera)
+        goal, own = projection_goal(far), slice(run.start, run.start + far.parameters.size)
         weight = np.zeros((layout.count, layout.count))
         weight[own, own] = goal.weight
         out.append(Goal(weight, goal.unit, goal.what))
@@ -95,6 +98,7 @@ def lens_goals(watched: Watched) -> list[Goal]:
 def turn_weight(camera: Camera) -> FloatArray:
     """Return W (3, 3): w^T W w is the mean square over the image, px^2, of how far a camera's turn w (rad) moves what
     is far away."""
+    camera = far_camera(camera)
     rays, valid = camera.unproject(grid_pixels(camera.size_px, GOAL_GRID).reshape(-1, 2))
     by_turn = projection_design(camera, rays[valid])[:, camera.parameters.size :]
     return np.asarray(np.einsum("ikm,ilm->kl", by_turn, by_turn) / by_turn.shape[2])
@@ -105,7 +109,7 @@ def _lens_directions(camera: Camera) -> FloatArray:
     down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius: as near as the model
     comes, whatever the lens may do beyond it."""
     out = np.zeros((camera.parameters.size, 6))
-    camera = lens_of(camera)
+    camera = lens_of(far_camera(camera))
     pixels = grid_pixels(camera.size_px, FIELD_GRID).reshape(-1, 2)
     rays, valid = camera.unproject(pixels)
     axis, seen = camera.project(np.array([0.0, 0.0, 1.0]))

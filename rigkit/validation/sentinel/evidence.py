@@ -21,8 +21,8 @@ from rigkit.calibration.solving.poses import refine_poses
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import board_from_afar, cam_from_seen_board
-from rigkit.cameras.moving_pupil import NearCamera
+from rigkit.cameras.board_pose import cam_from_seen_board
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Points
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
@@ -44,8 +44,9 @@ class Watched:
 
     Attributes
     ----------
-    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame. What a lens may do beyond its
-        model is among the parameters of a camera (`rigkit.calibration.displaced`), after those of the model.
+    names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame: cameras of points in mm, a
+        `NearCamera` where the pupil moves. What a lens may do beyond its model is among the parameters of a camera
+        (`rigkit.calibration.displaced`), after those of the model and before those of the pupil.
     covariance : (T, T) of theta.
     sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where
@@ -53,7 +54,6 @@ class Watched:
     freedom : degrees of freedom of the covariance.
     boards_mm : corners (N, 3) of boards, by name, as the calibration found them; others, and boards of another size
         that have the name, are as stated.
-    pupils : (2,) of each camera, by number, how its entrance pupil moves; others look from one point.
     """
 
     names: tuple[str, ...]
@@ -65,16 +65,6 @@ class Watched:
     freedom: float = float("inf")
     scale_sigma: float = 0.0
     boards_mm: Mapping[str, Points] = field(default_factory=dict)
-    pupils: Mapping[int, FloatArray] = field(default_factory=dict)
-
-    def from_afar(self, view: BoardView, c: int = 0) -> BoardView:
-        """Return a view of camera `c` as its central lens has it: with the pupil's motion taken out, as it was
-        calibrated; raises DegenerateError where the board has no pose."""
-        if c not in self.pupils:
-            return view
-        near = NearCamera.of(self.cameras[c], self.pupils[c])
-        # Of a board that is bent by less than its squares: what that does to the pupil's part is next to nothing.
-        return replace(view, pixels=board_from_afar(near, view.pixels, view.points()))
 
     @property
     def fresh_sigma_px(self) -> float:
@@ -91,10 +81,10 @@ class Watched:
     def of_models(self) -> IntArray:
         """Where in theta the parameters of the lenses' models and the mounts stand."""
         layout = self.layout
-        amounts = np.zeros(layout.count, dtype=bool)
+        others = np.zeros(layout.count, dtype=bool)
         for camera, own in zip(self.cameras, layout.cameras, strict=True):
-            amounts[own.start + lens_of(camera).parameters.size : own.stop] = True
-        return np.flatnonzero(~amounts)
+            others[own.start + lens_of(far_camera(camera)).parameters.size : own.stop] = True
+        return np.flatnonzero(~others)
 
     def state(self, c: int, observations: Observations, rotation: FloatArray, translation_mm: Points) -> State:
         """Return camera `c` before boards in these poses, with the shapes that are known of them."""

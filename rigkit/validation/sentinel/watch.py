@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
 from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.validation.sentinel.evidence import Watched
 
 
 def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Watched:
-    """Return a camera as it was calibrated, by default with what its lens may do beyond its model."""
+    """Return a camera as it was calibrated, by default with what its lens may do beyond its model; its pupil, where
+    that moves, is as unsure as it was solved for."""
     known = (
-        uncertain_camera(calibration, quoted=False)
+        uncertain_camera(calibration, quoted=False, near=True)
         if beyond_model
-        else UncertainCamera(calibration.camera, calibration.covariance)
+        else UncertainCamera(calibration.near, calibration.near_covariance[:-6, :-6])
     )
     return Watched(
         names=(name,),
@@ -26,14 +35,13 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
         overdispersion=calibration.overdispersion,
         freedom=calibration.freedom,
         boards_mm={shape.board_id: shape.points_mm for shape in calibration.boards},
-        pupils={} if calibration.pupil is None else {0: calibration.pupil.terms},
     )
 
 
 def watched_rig(rig: RigCalibration) -> Watched:
     """Return a rig as it was calibrated, with what its lenses may do beyond their models."""
     cameras, covariance = rig.with_departures
-    return Watched(
+    central = Watched(
         names=tuple(c.name for c in rig.cameras),
         cameras=cameras,
         cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
@@ -42,5 +50,40 @@ def watched_rig(rig: RigCalibration) -> Watched:
         overdispersion=rig.overdispersion,
         freedom=rig.freedom,
         scale_sigma=rig.scale_sigma,
-        pupils={k: rig.pupils[c.name].terms for k, c in enumerate(rig.cameras) if c.name in rig.pupils},
     )
+    return with_pupils(central, rig.pupils)
+
+
+def with_pupils(central: Watched, pupils: Mapping[str, SolvedPupil]) -> Watched:
+    """Return cameras with the pupils, by name, that move, and the covariance of all their parameters.
+
+    A pupil e follows lenses and mounts x as their covariance has it, e = W x + rest; the rests of two pupils are taken
+    to be independent.
+    """
+    if not pupils:
+        return central
+    models, layout, order = central.of_models, central.layout, list[IntArray]()
+    follows, rest = [np.eye(layout.count)], [np.zeros((layout.count, layout.count))]
+    inverse = scaled_pinv(central.covariance[np.ix_(models, models)])
+    cameras = list(central.cameras)
+    for k, (name, run) in enumerate(zip(central.names, layout.cameras, strict=True)):
+        order.append(np.arange(run.start, run.stop))
+        if name in pupils:
+            order.append(sum(len(rows) for rows in follows) + np.arange(PUPIL_TERMS))
+            by = np.zeros((PUPIL_TERMS, layout.count))
+            by[:, models] = pupils[name].with_frame.T @ inverse
+            follows.append(by)
+            rest.append(pupils[name].covariance - by[:, models] @ pupils[name].with_frame)
+            cameras[k] = NearCamera.of(cameras[k], pupils[name].terms)
+    order.append(np.arange(layout.cameras[-1].stop, layout.count))
+    through, at = np.concatenate(follows), np.concatenate(order)
+    covariance = (through @ central.covariance @ through.T + _blocks(rest))[np.ix_(at, at)]
+    return replace(central, cameras=tuple(cameras), covariance=covariance)
+
+
+def _blocks(parts: list[FloatArray]) -> FloatArray:
+    """Return a matrix with the parts along its diagonal."""
+    # Imported here: scipy.linalg is slow to import, and few lenses ask.
+    from scipy.linalg import block_diag
+
+    return np.asarray(block_diag(*parts))
