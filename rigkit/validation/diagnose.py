@@ -13,6 +13,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.board_pose import board_pose
+from rigkit.identification.wrong_squares import FittingSquares
 from rigkit.validation.check import Check
 from rigkit.validation.checks import ValidationReport
 
@@ -103,6 +104,16 @@ def diagnose_cameras(
                 f"leave {fit[name]:.2f} px; was the lens changed or refocused since?"
             )
     return tuple(out)
+
+
+def diagnose_squares(pair_id: str, fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
+    """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
+    boards = [
+        f"board '{one.board.board_id}' would fit the others with squares of "
+        f"{one.factor * one.board.square_x_mm:.1f} mm ({one.board.square_x_mm:g} is declared)"
+        for one in fitting
+    ]
+    return (f"pair '{pair_id}': {', or '.join(boards)}; measure them again",) if boards else ()
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:

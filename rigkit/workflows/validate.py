@@ -11,11 +11,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
+from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
+from rigkit.identification.wrong_squares import fitting_squares
 from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
@@ -30,7 +32,7 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.validation.diagnose import diagnose, diagnose_cameras
+from rigkit.validation.diagnose import diagnose, diagnose_cameras, diagnose_squares
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
 from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
@@ -138,10 +140,19 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
     known = {name: loaded.camera for name, loaded in job.cameras.known.items()}
     causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
+
+    def wrong_squares() -> tuple[str, ...]:
+        fitting = fitting_squares(found1, found2, pair.boards, far_camera(camera1), far_camera(camera2))
+        return diagnose_squares(pair.pair_id, fitting)
+
     try:
         matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)
+        if matched.identity.missing:
+            causes += wrong_squares()
         return _judge(job, matched, image1, image2, causes)
     except RigkitError as error:
+        # Without a board that is left out, nothing was matched at all.
+        causes = causes or wrong_squares()
         if not causes:
             raise
         raise type(error)(f"{'; '.join(causes)} ({error})") from error

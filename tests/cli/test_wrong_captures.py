@@ -184,6 +184,18 @@ def test_one_board_with_wrong_squares_is_named(
     assert "board 'plane2': its squares come out -2.9 % against the other boards" in text
 
 
+def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "plane2.toml"
+    path.write_text(path.read_text().replace("50.0", "43.0"))
+    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+    code, text, _ = validate(folder, capsys, "--no-crosscheck")
+    assert code == 1
+    said = "board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    assert f"probable cause: pair 'same': {said}" in text
+
+
 @pytest.mark.parametrize("what", ["images", "cameras"])
 def test_swapped_images_and_cameras_are_named(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], what: str

@@ -1,0 +1,61 @@
+"""A board whose squares were declared of another size is found with the size that it has."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.board_scenes import both_views, fisheye_camera, regular_camera, trihedral_scene
+
+from rigkit.cameras.base import Camera
+from rigkit.core.boards import Board
+from rigkit.core.detections import BoardDetection
+from rigkit.identification.identify import identify_pair
+from rigkit.identification.wrong_squares import fitting_squares
+
+FACTOR_REL = 2e-3
+"""48 corners with noise of 0.05 px, seen from a pose that 96 others give: a size comes out to 1e-4 or so."""
+EQUAL = tuple(Board(i, 8, 6, 50.0, 50.0) for i in "abc")
+DIFFERENT = tuple(Board(i, columns, 6, 50.0, 50.0) for i, columns in zip("abc", (9, 8, 7), strict=True))
+
+
+def declared(boards: tuple[Board, ...], wrong: int, square_mm: float) -> list[Board]:
+    """The boards with squares of one written wrongly."""
+    out = list(boards)
+    out[wrong] = replace(boards[wrong], square_x_mm=square_mm, square_y_mm=square_mm)
+    return out
+
+
+@pytest.mark.parametrize("camera", [regular_camera(), fisheye_camera()], ids=["regular", "fisheye"])
+@pytest.mark.parametrize("boards", [EQUAL, DIFFERENT], ids=["equal", "different"])
+def test_the_board_is_named_with_the_size_that_it_has(
+    boards: tuple[Board, ...], camera: Camera, rng: np.random.Generator
+) -> None:
+    for wrong, square_mm in enumerate((43.0, 45.0, 60.0)):
+        scene = trihedral_scene(rng, boards, camera)
+        one, two = both_views(scene, rng)
+        as_declared = declared(boards, wrong, square_mm)
+        assert identify_pair(one, two, as_declared, camera, camera).missing
+        (found,) = fitting_squares(one, two, as_declared, camera, camera)
+        assert found.board is as_declared[wrong]
+        assert found.factor == pytest.approx(50.0 / square_mm, rel=FACTOR_REL)
+
+
+def test_of_two_boards_either_may_be_wrong(rng: np.random.Generator) -> None:
+    scene = trihedral_scene(rng, DIFFERENT[:2], regular_camera())
+    one, two = both_views(scene, rng)
+    found = fitting_squares(one, two, declared(DIFFERENT[:2], 0, 40.0), scene.camera1, scene.camera2)
+    assert [(one.board.board_id, round(one.factor, 2)) for one in found] == [("a", 1.25), ("b", 0.8)]
+
+
+def test_nothing_is_said_of_boards_that_fit_are_covered_or_moved(rng: np.random.Generator) -> None:
+    scene = trihedral_scene(rng, EQUAL, regular_camera())
+    one, two = both_views(scene, rng)
+
+    def said(first: list[BoardDetection], second: list[BoardDetection]) -> int:
+        return len(fitting_squares(first, second, EQUAL, scene.camera1, scene.camera2))
+
+    assert said(one, two) == said(one[:2], two) == said(one[:1], two) == 0
+    moved = replace(two[0], pixels=two[0].pixels @ np.array([[0.9, 0.2], [-0.2, 0.9]]) + [90.0, -60.0])
+    assert said(one, [moved, *two[1:]]) == 0
