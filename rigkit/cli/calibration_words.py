@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from rigkit.core.boards import Board
     from rigkit.report.page_facts import PageFacts
 
+MAX_NAMED = 3
+
 
 def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
     """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
@@ -70,17 +72,19 @@ def describe(calibration: Calibration) -> str:
 
 
 def left_out(calibration: Calibration) -> list[str]:
-    """Return a line for each image left out, and one for each reason why something in an image that is used is."""
+    """Return a line for each reason why images are left out, or something in images that are used; the page and --json
+    name every image."""
     used = {view.image for view in calibration.views}
-    lines = [f"dropped {image}: {reason}" for image, reason in calibration.dropped if image not in used]
-    parts: dict[str, list[str]] = {}
+    images: dict[tuple[str, str], list[str]] = {}
     for image, reason in calibration.dropped:
-        if image in used:
-            parts.setdefault(reason, []).append(image)
-    for reason, images in parts.items():
-        more = f" and {len(images) - 1} more" if len(images) > 1 else ""
-        lines.append(f"left out of {images[0]}{more}: {reason}")
-    return lines
+        images.setdefault(("left out of" if image in used else "dropped", reason), []).append(image)
+    return [f"{how} {_named(some)}: {reason}" for (how, reason), some in sorted(images.items(), key=lambda i: i[0][0])]
+
+
+def _named(images: Sequence[str]) -> str:
+    """Return the first images by name: of a video hundreds may show nothing."""
+    more = len(images) - MAX_NAMED
+    return ", ".join(images[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _choices(candidates: Sequence[Candidate]) -> list[str]:
