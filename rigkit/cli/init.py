@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         **repeatable,
         metavar="[CAMERA=]FILE",
         help="calibration of the camera; of two, give that of the first image, then that of the second; of more, name "
-        "each (repeatable)",
+        "each; a rig.json stands for those beside it (repeatable)",
     )
     parser.add_argument(
         "--cameras",

@@ -39,7 +39,8 @@ def require_told(args: argparse.Namespace) -> None:
 
 def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
     """Return camera -> path of its calibration, as it stands in a manifest in `folder`; paths are as typed, or from
-    that folder."""
+    that folder. A rig's file stands for those of its cameras, under their names."""
+    told = _of_rigs(told)
     usual = TWO_CAMERAS if len(told) == 2 else ONE_CAMERA
     out: dict[str, str] = {}
     for k, words in enumerate(told):
@@ -54,6 +55,19 @@ def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
         if not typed.is_absolute() and typed.exists():
             path = Path(os.path.relpath(typed, folder)).as_posix()
         out[name] = path
+    return out
+
+
+def _of_rigs(told: Sequence[str]) -> list[str]:
+    """Return what is told with every rig's file replaced by those of its cameras, NAME=FILE."""
+    from rigkit.io.rig_file import is_rig_file
+    from rigkit.workflows.inputs.camera_files import own_files
+
+    out: list[str] = []
+    for words in told:
+        path = usable_path(words)
+        of_rig = own_files(path) if is_rig_file(path) else None
+        out += [words] if of_rig is None else [f"{name}={own}" for name, own in of_rig.items()]
     return out
 
 

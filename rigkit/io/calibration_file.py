@@ -29,7 +29,7 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.board_file import board_of_values, board_values
 from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import freedom, positive, read_json, real, reals, whole
+from rigkit.io.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
 from rigkit.io.reading import damage, usable_path
 from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
 
@@ -169,13 +169,10 @@ def _read(path: str | Path) -> dict[str, Any]:
     source = usable_path(path)
     if not source.exists():
         raise InputError(f"calibration '{source}' does not exist; run `rigkit calibrate` first")
-    return read_json(
-        source,
-        CALIBRATION_SCHEMA,
-        CALIBRATION_KEYS,
-        "calibration file",
-        remedy="calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`",
-    )
+    remedy = "calibrate again, or bring another program's camera in with `rigkit export FILE -o camera.json`"
+    if (json_schema(source) or "").startswith("rigkit.rig/"):
+        remedy = f"of a rig give the file of the one camera, which is called as '{source.stem}-NAME.json' beside it"
+    return read_json(source, CALIBRATION_SCHEMA, CALIBRATION_KEYS, "calibration file", remedy=remedy)
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

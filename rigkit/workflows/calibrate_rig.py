@@ -26,6 +26,7 @@ from rigkit.validation.check import Check, compare_angle, compare_baseline, comp
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
 from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.inputs.camera_files import own_file
 from rigkit.workflows.inputs.corners import SessionCorners, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.known_cameras import known_cameras, with_known, with_known_first
@@ -136,7 +137,7 @@ def _of_cameras(session: RigSession, options: CalibrateOptions) -> list[str]:
 
 def _beside(session: RigSession, target: Path, name: str) -> Path:
     """Return where the calibration of one camera goes."""
-    return target.with_name(f"{target.stem}-{name}.json") if len(session.cameras) > 1 else target
+    return own_file(target, name) if len(session.cameras) > 1 else target
 
 
 def _boards_file(target: Path) -> Path:

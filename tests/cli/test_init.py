@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 from itertools import combinations
 from pathlib import Path
@@ -8,6 +9,9 @@ import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
+from rigkit.core.errors import InputError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.calibration_file import load_calibration_or_camera
 from rigkit.io.manifest import load_dataset
 from rigkit.io.manifest_writer import ImageBoards, group_pairs
 from rigkit.io.rig_session import load_rig_session
@@ -152,6 +156,32 @@ def test_several_cameras_and_pose_types(
     assert cameras == [("w", "t"), ("t", "t")]
     for wrong in (["--cameras", "*=w,y"], ["--cameras", "w,t"], ["--pose-type", "sideways"]):
         assert main([*command, *three, *told, *wrong]) == 2
+
+
+def test_a_rig_stands_for_its_cameras(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`rigkit calibrate left right -o rig.json` writes rig-left.json and rig-right.json, too."""
+    shutil.copytree(IMAGES / "fisheye-general", tmp_path / "lab" / "images" / "first")
+    camera = json.loads(CALIBRATION.read_text())["camera"]
+    pose = Rigid3.identity().matrix()[:3].tolist()
+    cameras = [{"name": name, "camera": camera, "cam_from_rig": pose, "rms_px": 0.1} for name in ("left", "right")]
+    (tmp_path / "rig.json").write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": cameras}))
+    shutil.copy(CALIBRATION, tmp_path / "rig-left.json")
+    monkeypatch.chdir(tmp_path)
+    command = ["init", "lab", "--square-mm", "50", "--pose-type", "general", "--calibration", "rig.json"]
+    assert main(command) == 2
+    said = capsys.readouterr().err
+    assert "'rig-right.json' is not beside it; give each camera's own file" in said and said.count("\n") == 1
+    shutil.copy(CALIBRATION, tmp_path / "rig-right.json")
+    assert main(command) == 0
+    pair = load_dataset(tmp_path / "lab").pairs[0]
+    assert {entry.camera_id: entry.calibration.name for entry in (pair.camera1, pair.camera2)} == {
+        "left": "rig-left.json",
+        "right": "rig-right.json",
+    }
+    with pytest.raises(InputError, match="of a rig give the file of the one camera, which is called as 'rig-NAME"):
+        load_calibration_or_camera(tmp_path / "rig.json")
 
 
 def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -193,6 +193,23 @@ def import_rig(path: str | Path) -> dict[str, tuple[Camera, Rigid3]]:
     )
 
 
+def own_file(rig: Path, camera: str) -> Path:
+    """Return where the calibration of one camera of a rig goes, beside the rig's file."""
+    return rig.with_name(f"{rig.stem}-{camera}.json")
+
+
+def own_files(rig: Path) -> dict[str, Path]:
+    """Return the files of the calibrations of a rig's cameras, by name; raises InputError where they are not beside the
+    rig's file."""
+    files = {name: own_file(rig, name) for name in load_saved_rig(rig).cameras}
+    if missing := [f"'{path.name}'" for path in files.values() if not path.is_file()]:
+        raise InputError(
+            f"'{rig}': the calibrations of its cameras are needed, and {', '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} not beside it; give each camera's own file"
+        )
+    return files
+
+
 def import_pair(
     path: str | Path, names: tuple[str, str] | None = None, *, near: bool = False
 ) -> tuple[tuple[str, str], tuple[Camera, Camera], Rigid3]:
