@@ -6,7 +6,7 @@ give the pose of the cameras, and a board that both images show then has one unk
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,19 +15,27 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.board_pose import point_residuals
+from rigkit.identification.assignments import ranked_assignments
 from rigkit.identification.board_matches import BoardMatch, ImageObservations, matches_between
-from rigkit.identification.identify import identify_pair
-from rigkit.identification.placements import SAME_SQUARE_REL, BoardKind
+from rigkit.identification.placements import SAME_SQUARE_REL, BoardKind, board_kinds, describe
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FittingSquares:
-    """A board with the factor by which its squares, as declared, would have to grow to fit the others of its pair."""
+    """A board that fits the others of its pair with squares of another size.
 
-    board: Board
+    Attributes
+    ----------
+    boards : those that it may be: they were declared alike.
+    factor : by which its squares would have to grow.
+    where : words by which a person finds it in image 1.
+    """
+
+    boards: tuple[Board, ...]
     factor: float
+    where: str
 
 
 def fitting_squares(
@@ -37,56 +45,55 @@ def fitting_squares(
     camera1: Camera,
     camera2: Camera,
 ) -> tuple[FittingSquares, ...]:
-    """Return the boards that fit all others of a pair with squares of another size, and with which; arguments as of
-    `identify_pair`. Of two boards either may be the wrong one."""
-    found = (_fitting(detections1, detections2, board, boards, camera1, camera2) for board in boards)
-    return tuple(one for one in found if one is not None)
+    """Return the boards that fit all others of a pair with squares of another size; arguments as of `identify_pair`.
+
+    Of two boards either may be the wrong one. Nothing is returned where the others do not fit by themselves, or what
+    else the images show fits at no size, or at about the declared one.
+    """
+    kinds = board_kinds(boards)
+    view1 = ImageObservations.of(detections1, kinds, camera1, "image 1")
+    view2 = ImageObservations.of(detections2, kinds, camera2, "image 2")
+    matches, _, _ = matches_between(view1, view2, kinds)
+    out = []
+    for k, kind in enumerate(kinds):
+        sized = [
+            (*_sized(match, view2, kind.board, pose), match.first)
+            for pose, free in _poses_by_others(k, matches, view1, view2, kinds)
+            for match in free
+        ]
+        off, factor, first = min(sized, default=(np.inf, 1.0, 0))
+        # Sizes that look alike are no reason why a board was given up.
+        if off <= 1.0 and abs(factor - 1.0) > SAME_SQUARE_REL:
+            out.append(FittingSquares(kind.boards, factor, describe(view1.detections[first])))
+    return tuple(out)
 
 
-def _fitting(
-    detections1: Sequence[BoardDetection],
-    detections2: Sequence[BoardDetection],
-    board: Board,
-    boards: Sequence[Board],
-    camera1: Camera,
-    camera2: Camera,
-) -> FittingSquares | None:
-    """Return the size at which `board` fits all the others; None where these do not fit by themselves, the images show
-    nothing else, what they show fits at no size, or at about the declared one."""
-    others = [other for other in boards if other is not board]
-    # What can only be this board is kept out: it would pass for a part of a larger one with squares as large as it has.
-    of_others = [
-        [d for d in found if sorted((d.columns, d.rows)) != sorted(board.size) or _has_size(others, board.size)]
-        for found in (detections1, detections2)
-    ]
+def _poses_by_others(
+    k: int,
+    matches: Sequence[BoardMatch],
+    view1: ImageObservations,
+    view2: ImageObservations,
+    kinds: Sequence[BoardKind],
+) -> Iterator[tuple[FloatArray, list[BoardMatch]]]:
+    """Yield each cam2_from_cam1 (4, 4) at which all boards but one of kind `k` fit, with the matches of that kind among
+    the detections that are left: two boards may fit in several ways, and the third one tells."""
+    one_less = [BoardKind(kind.boards[:-1] or kind.boards) if j == k else kind for j, kind in enumerate(kinds)]
+    of_others = [match for match in matches if match.kind != k or len(kinds[k].boards) > 1]
+    if not of_others:
+        return
     try:
-        identity = identify_pair(*of_others, others, camera1, camera2)
-    except (DegenerateError, InputError):
-        return None
-    if identity.missing:
-        return None
-    kinds = (BoardKind((board,)),)
-    left1 = ImageObservations.of(_not_among(detections1, identity.detections1), kinds, camera1, "image 1")
-    left2 = ImageObservations.of(_not_among(detections2, identity.detections2), kinds, camera2, "image 2")
-    pose = identity.cam2_from_cam1.matrix()
-    sized = [_sized(match, left1, left2, board, pose) for match in matches_between(left1, left2, kinds)[0]]
-    off, factor = min(sized, default=(np.inf, 1.0))
-    # Sizes that look alike are no reason why a board was given up.
-    return FittingSquares(board, factor) if off <= 1.0 and abs(factor - 1.0) > SAME_SQUARE_REL else None
-
-
-def _has_size(boards: Sequence[Board], size: tuple[int, int]) -> bool:
-    return any(sorted(board.size) == sorted(size) for board in boards)
-
-
-def _not_among(detections: Sequence[BoardDetection], named: Sequence[BoardDetection]) -> list[BoardDetection]:
-    """Return the detections none of whose corners is one of those that are `named`."""
-    taken = {tuple(pixel) for one in named for pixel in one.pixels.tolist()}
-    return [one for one in detections if not taken & {tuple(pixel) for pixel in one.pixels.tolist()}]
+        ranked = ranked_assignments(of_others, view1, view2, one_less)
+    except DegenerateError:
+        return
+    for assignment in ranked:
+        if len(assignment.matches) == sum(len(kind.boards) for kind in kinds) - 1:
+            first, second = ({getattr(m, side) for m in assignment.matches} for side in ("first", "second"))
+            free = [m for m in matches if m.kind == k and m.first not in first and m.second not in second]
+            yield assignment.pose.cam2_from_cam1, free
 
 
 def _sized(
-    match: BoardMatch, view1: ImageObservations, view2: ImageObservations, board: Board, cam2_from_cam1: FloatArray
+    match: BoardMatch, view2: ImageObservations, board: Board, cam2_from_cam1: FloatArray
 ) -> tuple[float, float]:
     """Return by how many gates (rms) image 2 contradicts a board that image 1 places, at its best size, and the factor
     of that size.

@@ -108,12 +108,15 @@ def diagnose_cameras(
 
 def diagnose_squares(pair_id: str, fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
     """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
-    boards = [
-        f"board '{one.board.board_id}' would fit the others with squares of "
-        f"{one.factor * one.board.square_x_mm:.1f} mm ({one.board.square_x_mm:g} is declared)"
-        for one in fitting
-    ]
-    return (f"pair '{pair_id}': {', or '.join(boards)}; measure them again",) if boards else ()
+    said = []
+    for one in fitting:
+        ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
+        of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}"
+        said.append(
+            f"{of}, {one.where} in image 1, would fit the others with squares of {one.factor * declared_mm:.1f} mm "
+            f"({declared_mm:g} is declared)"
+        )
+    return (f"pair '{pair_id}': {', or '.join(said)}; measure them again",) if said else ()
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.board_scenes import both_views, fisheye_camera, regular_camera, trihedral_scene
+from helpers.board_scenes import both_views, fisheye_camera, lab_scene, regular_camera, trihedral_scene
 
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
@@ -38,15 +38,36 @@ def test_the_board_is_named_with_the_size_that_it_has(
         as_declared = declared(boards, wrong, square_mm)
         assert identify_pair(one, two, as_declared, camera, camera).missing
         (found,) = fitting_squares(one, two, as_declared, camera, camera)
-        assert found.board is as_declared[wrong]
+        assert found.boards == (as_declared[wrong],)
         assert found.factor == pytest.approx(50.0 / square_mm, rel=FACTOR_REL)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", ["regular-general", "fisheye-general"])
+def test_two_boards_that_fit_in_several_ways_are_told_by_the_third(name: str, rng: np.random.Generator) -> None:
+    """The laboratory's boards stand so that any two of them look like any other two."""
+    scene = lab_scene(name)
+    one, two = both_views(scene, rng)
+    (found,) = fitting_squares(one, two, declared(scene.boards, 1, 45.0), scene.camera1, scene.camera2)
+    assert [board.board_id for board in found.boards] == ["plane2"]
+    assert found.factor == pytest.approx(50.0 / 45.0, rel=FACTOR_REL)
+
+
+def test_of_boards_declared_alike_the_odd_one_is_shown(rng: np.random.Generator) -> None:
+    real = declared(EQUAL, 1, 42.0)
+    scene = trihedral_scene(rng, tuple(real), regular_camera())
+    one, two = both_views(scene, rng)
+    (found,) = fitting_squares(one, two, EQUAL, scene.camera1, scene.camera2)
+    u, v = scene.pixels1["b"].mean(axis=0)
+    assert found.boards == EQUAL and found.where == f"the 8x6 grid round ({u:.0f}, {v:.0f})"
+    assert found.factor == pytest.approx(42.0 / 50.0, rel=FACTOR_REL)
 
 
 def test_of_two_boards_either_may_be_wrong(rng: np.random.Generator) -> None:
     scene = trihedral_scene(rng, DIFFERENT[:2], regular_camera())
     one, two = both_views(scene, rng)
     found = fitting_squares(one, two, declared(DIFFERENT[:2], 0, 40.0), scene.camera1, scene.camera2)
-    assert [(one.board.board_id, round(one.factor, 2)) for one in found] == [("a", 1.25), ("b", 0.8)]
+    assert [(one.boards[0].board_id, round(one.factor, 2)) for one in found] == [("a", 1.25), ("b", 0.8)]
 
 
 def test_nothing_is_said_of_boards_that_fit_are_covered_or_moved(rng: np.random.Generator) -> None:
