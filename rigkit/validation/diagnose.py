@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -123,9 +124,7 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
     """Return the probable causes of the checks that failed in a data set; give one report a pair."""
     if all(report.passed for report in reports):
         return ()
-    out: list[str] = []
-    for report in reports:
-        out += _diagnose_boards(report)
+    out = _diagnose_boards(reports)
     odd = bool(out)
     failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
     if failed and not odd:
@@ -152,35 +151,81 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
     return best if worse and best != declared else None
 
 
-def _diagnose_boards(report: ValidationReport) -> list[str]:
-    """Return boards whose squares do not agree with those of the others, or that are mirrored."""
-    out = []
-    ratios = {b.board.board_id: b.size_ratio for b in report.boards}
-    middle = float(np.median(list(ratios.values())))
-    for result in report.boards:
-        name, board = result.board.board_id, result.board
-        if not result.right_handed:
-            out.append(f"board '{name}' comes out mirrored: its corners are numbered the wrong way round")
-        off = ratios[name] / middle - 1.0
-        if len(ratios) >= 3 and abs(off) > ODD_BOARD:
+@dataclass(frozen=True, eq=False, slots=True)
+class _Squares:
+    """How a board's squares come out in some pairs (medians): as parts of what is declared, their size against that of
+    the other boards (1 where fewer than three tell), and width over height."""
+
+    board: Board
+    size: float
+    aspect: float
+
+    @property
+    def no_board(self) -> bool:
+        return abs(np.log(self.aspect)) > NO_BOARD
+
+    @property
+    def stretched(self) -> bool:
+        return not self.no_board and abs(self.aspect - 1.0) > ODD_BOARD
+
+    @property
+    def would_fit(self) -> str:
+        x_mm, y_mm = np.array(self.board.squares_mm) * self.size * self.aspect ** np.array([0.5, -0.5])
+        declared_x_mm, declared_y_mm = self.board.squares_mm
+        if not self.stretched and declared_x_mm == declared_y_mm:
+            return f"{x_mm:.2f} mm would fit, {declared_x_mm:g} is declared"
+        return f"{x_mm:.2f} x {y_mm:.2f} mm would fit, {declared_x_mm:g} x {declared_y_mm:g} is declared"
+
+
+def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
+    """Return boards whose squares do not agree with those of the others, or that are mirrored: each once, whatever the
+    number of pairs."""
+    found = _squares(reports)
+    mirrored = [b.board.board_id for r in reports for b in r.boards if not b.right_handed]
+    out = [f"board '{i}' comes out mirrored: its corners are numbered the wrong way round" for i in mirrored]
+    out += [
+        f"board '{name}' comes out with another shape than any board: corners of different boards were matched (boards "
+        "of this kind that stand there and are not listed?), or the pose is wrong"
+        for name, squares in found.items()
+        if squares.no_board
+    ]
+    stretched = {name: squares for name, squares in found.items() if squares.stretched}
+    aspects = [squares.aspect for squares in stretched.values()]
+    if len(stretched) > 1 and len(stretched) == len(found) and np.ptp(aspects) < ODD_BOARD:
+        names = ", ".join(f"'{name}'" for name in stretched)
+        words = f"boards {names}: their squares come out {_stretch(float(np.median(aspects)))}"
+        return [*out, f"{words}; measure square_x_mm and square_y_mm, or look at the calibration's aspect"]
+    for name, squares in found.items():
+        if squares.stretched:
             out.append(
-                f"board '{name}': its squares come out {100.0 * off:+.1f} % against the other boards; measure them "
-                f"again ({board.square_x_mm * (1.0 + off):.2f} mm would fit, {board.square_x_mm:g} is declared)"
+                f"board '{name}': its squares come out {_stretch(squares.aspect)} ({squares.would_fit}); measure "
+                "square_x_mm and square_y_mm"
             )
-        aspect = result.square_x_ratio / result.square_y_ratio - 1.0
-        if abs(np.log1p(aspect)) > NO_BOARD:
+        elif abs(squares.size - 1.0) > ODD_BOARD and not squares.no_board:
             out.append(
-                f"board '{name}' comes out with another shape than any board: corners of different boards were matched "
-                "(boards of this kind that stand there and are not listed?), or the pose is wrong"
-            )
-        elif abs(aspect) > ODD_BOARD:
-            longer, other = ("wider", "high") if aspect > 0.0 else ("higher", "wide")
-            longer_by = max(aspect, 1.0 / (1.0 + aspect) - 1.0)
-            out.append(
-                f"board '{name}': its squares come out {100.0 * longer_by:.1f} % {longer} than {other} against what is "
-                "declared; measure square_x_mm and square_y_mm, or look at the calibration's aspect"
+                f"board '{name}': its squares come out {100.0 * (squares.size - 1.0):+.1f} % against the other boards; "
+                f"measure them again ({squares.would_fit})"
             )
     return out
+
+
+def _squares(reports: Sequence[ValidationReport]) -> dict[str, _Squares]:
+    """Return how the squares of each board come out, by its id."""
+    seen: dict[str, list[tuple[Board, float, float]]] = {}
+    for report in reports:
+        middle = float(np.median([b.size_ratio for b in report.boards])) if len(report.boards) >= 3 else None
+        for b in report.boards:
+            size = 1.0 if middle is None else b.size_ratio / middle
+            seen.setdefault(b.board.board_id, []).append((b.board, size, b.square_x_ratio / b.square_y_ratio))
+    return {
+        name: _Squares(some[0][0], float(np.median([s for _, s, _ in some])), float(np.median([a for *_, a in some])))
+        for name, some in seen.items()
+    }
+
+
+def _stretch(aspect: float) -> str:
+    longer, other = ("wider", "high") if aspect > 1.0 else ("higher", "wide")
+    return f"{100.0 * (max(aspect, 1.0 / aspect) - 1.0):.1f} % {longer} than {other} against what is declared"
 
 
 def _diagnose_lengths(failed: Sequence[tuple[str, Check]], reports: Sequence[ValidationReport]) -> list[str]:

@@ -100,6 +100,26 @@ def test_one_board_of_another_size_is_named() -> None:
     assert "50.00 mm would fit" in found[0]
 
 
+def test_a_board_that_was_stretched_is_named_once_with_both_sides() -> None:
+    """A print that is 97 % as high as was declared, of which two pairs tell."""
+    wrong = replace(BOARDS[1], square_y_mm=50.0 / 0.97)
+    boards = (BOARDS[0], wrong, BOARDS[2])
+    found = diagnose([reported(boards=boards, scale=1.01, pair_id=name) for name in ("near", "far")])
+    assert found == (
+        "board 'plane2': its squares come out 3.1 % wider than high against what is declared (50.00 x 50.00 mm would "
+        "fit, 50 x 51.5464 is declared); measure square_x_mm and square_y_mm",
+    )
+
+
+def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
+    boards = tuple(replace(board, square_y_mm=50.0 / 0.97) for board in BOARDS)
+    found = diagnose([reported(boards=boards, scale=1.02, pair_id=name) for name in ("near", "far")])
+    assert found == (
+        "boards 'plane1', 'plane2', 'plane3': their squares come out 3.1 % wider than high against what is declared; "
+        "measure square_x_mm and square_y_mm, or look at the calibration's aspect",
+    )
+
+
 def test_a_board_that_stands_otherwise_is_named() -> None:
     found = diagnose([reported(angles=(91.6, 90.0, 88.4), distances=False)])
     assert len(found) == 1
