@@ -125,10 +125,12 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
     if all(report.passed for report in reports):
         return ()
     out = _diagnose_boards(reports)
-    odd = bool(out)
+    odd = _longest_by_boards(reports)
     failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
-    if failed and not odd:
-        out += _diagnose_lengths(failed, reports)
+    # What boards that are odd cannot explain has another cause, which comes first.
+    failed = [(pair, c) for pair, c in failed if abs(c.difference) > c.measured * odd + c.limit_k * c.combined_sigma]
+    if failed:
+        out = [*_diagnose_lengths(failed, reports), *out]
     for report in reports:
         out += _diagnose_angles(report)
     return tuple(dict.fromkeys(out))
@@ -189,17 +191,20 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
         for name, squares in found.items()
         if squares.no_board
     ]
-    stretched = {name: squares for name, squares in found.items() if squares.stretched}
-    aspects = [squares.aspect for squares in stretched.values()]
-    if len(stretched) > 1 and len(stretched) == len(found) and np.ptp(aspects) < ODD_BOARD:
-        names = ", ".join(f"'{name}'" for name in stretched)
+    aspects = [squares.aspect for squares in found.values() if squares.stretched]
+    all_alike = len(aspects) == len(found) and np.ptp(aspects) < ODD_BOARD
+    measure_sides = "measure square_x_mm and square_y_mm" + (
+        ", or look at the calibration's aspect" if all_alike else ""
+    )
+    if all_alike and len(found) > 1:
+        names = ", ".join(f"'{name}'" for name in found)
         words = f"boards {names}: their squares come out {_stretch(float(np.median(aspects)))}"
-        return [*out, f"{words}; measure square_x_mm and square_y_mm, or look at the calibration's aspect"]
+        return [*out, f"{words}; {measure_sides}"]
     for name, squares in found.items():
         if squares.stretched:
             out.append(
-                f"board '{name}': its squares come out {_stretch(squares.aspect)} ({squares.would_fit}); measure "
-                "square_x_mm and square_y_mm"
+                f"board '{name}': its squares come out {_stretch(squares.aspect)} ({squares.would_fit}); "
+                f"{measure_sides}"
             )
         elif abs(squares.size - 1.0) > ODD_BOARD and not squares.no_board:
             out.append(
@@ -207,6 +212,15 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
                 f"measure them again ({squares.would_fit})"
             )
     return out
+
+
+def _longest_by_boards(reports: Sequence[ValidationReport]) -> float:
+    """Return by which part boards that are odd may make lengths wrong; infinite where they are no boards as listed."""
+    found = _squares(reports).values()
+    if any(squares.no_board for squares in found) or not all(b.right_handed for r in reports for b in r.boards):
+        return float("inf")
+    off = [float(np.exp(abs(np.log(part)))) - 1.0 for squares in found for part in (squares.size, squares.aspect)]
+    return max((part for part in off if part > ODD_BOARD), default=0.0)
 
 
 def _squares(reports: Sequence[ValidationReport]) -> dict[str, _Squares]:

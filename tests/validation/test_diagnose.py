@@ -111,6 +111,13 @@ def test_a_board_that_was_stretched_is_named_once_with_both_sides() -> None:
     )
 
 
+def test_a_board_that_is_a_little_odd_explains_no_length_that_is_far_off() -> None:
+    boards = (BOARDS[0], replace(BOARDS[1], square_y_mm=50.3), BOARDS[2])
+    found = diagnose([reported(boards=boards, stated_mm=1.15 * BASELINE_MM)])
+    assert "baseline comes out -13.0 % while other lengths hold: it was probably misread" in found[0]
+    assert "0.6 % wider than high" in found[1] and len(found) == 2
+
+
 def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
     boards = tuple(replace(board, square_y_mm=50.0 / 0.97) for board in BOARDS)
     found = diagnose([reported(boards=boards, scale=1.02, pair_id=name) for name in ("near", "far")])
