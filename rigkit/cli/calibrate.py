@@ -90,6 +90,5 @@ def _said(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tu
     words = rig_words.describe(done.rig, done.checks)
     if not json:
         return {}, words, done.passed
-    boards = {name: session.boards for name, session in done.session.cameras.items()}
-    page = rig_words.page(done.rig, done.checks, boards)
+    page = rig_words.page(done.rig, done.checks, done.session)
     return rig_words.summary(done.rig, done.checks) | {"page": page.to_dict()}, words, done.passed

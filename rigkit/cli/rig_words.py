@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +11,18 @@ from rigkit.core.findings import gravest_first
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
-    from rigkit.core.boards import Board
+    from rigkit.io.rig_session import RigSession
     from rigkit.report.page_facts import PageFacts
     from rigkit.validation.check import Check
 
 
-def page(rig: RigCalibration, checks: Sequence[Check], boards: Mapping[str, Sequence[Board]]) -> PageFacts:
-    """Return what the page says of a rig, and of each camera, before which there were `boards`."""
+def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> PageFacts:
+    """Return what the page says of a rig, and of each camera, calibrated as its session asks for."""
     from rigkit.report.calibration_facts import rig_facts
     from rigkit.workflows.calibrate_rig import shown_cameras
 
-    cameras = {name: calibration_words.page(c, boards[name]) for name, c in shown_cameras(rig).items()}
+    shown = shown_cameras(rig, session)
+    cameras = {name: calibration_words.page(c, session.cameras[name].boards) for name, c in shown.items()}
     return rig_facts(rig, checks, cameras)
 
 

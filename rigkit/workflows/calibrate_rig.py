@@ -21,7 +21,7 @@ from rigkit.io.files import ensure_writable, write_together
 from rigkit.io.reading import about
 from rigkit.io.rig_file import board_rigs_text, rig_text
 from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
-from rigkit.io.session import load_session
+from rigkit.io.session import Session, load_session
 from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
@@ -97,12 +97,12 @@ def calibrate_rig_session(
             files |= foreign_rig_files(mounted, options.output, options.exports, outlines)
         for camera in rig.cameras:
             own = _beside(session, options.output, camera.name)
-            files[own] = calibration_text(judged(camera.calibration), origin)
+            files[own] = calibration_text(judged(camera.calibration, session.cameras[camera.name]), origin)
             files |= foreign_files(camera.calibration, own, _of_cameras(session, options))
         if session.rigid_boards:
             files[_boards_file(options.output)] = board_rigs_text(rig.board_rigs)
     if options.report is not None:
-        files[options.report] = rig_page(session, rig, shown_cameras(rig), checks, corners, files)
+        files[options.report] = rig_page(session, rig, shown_cameras(rig, session), checks, corners, files)
     write_together(files, force=options.force)
     unreadable = {image: reason for one in corners.values() for image, reason in one.unreadable.items()}
     return RigSessionCalibration(
@@ -155,21 +155,24 @@ def calibrate_camera(path: Path, *, progress: Progress = silent) -> Calibration:
         return calibration_from(own, session_corners(own, progress=progress), progress=progress)
     require_distinct(session)
     corners = {name: session_corners(own, progress=progress) for name, own in session.cameras.items()}
-    return judged(rig_from(session, corners, progress=progress).cameras[0].calibration)
+    (camera,) = rig_from(session, corners, progress=progress).cameras
+    return judged(camera.calibration, session.cameras[camera.name])
 
 
-def shown_cameras(rig: RigCalibration) -> dict[str, Calibration]:
+def shown_cameras(rig: RigCalibration, session: RigSession) -> dict[str, Calibration]:
     """Return each camera as the page shows it: as calibrated alone, but one camera as its boards on one mount have it,
     which is what its file says."""
     if len(rig.cameras) == 1:
-        return {rig.cameras[0].name: judged(rig.cameras[0].calibration)}
+        (camera,) = rig.cameras
+        return {camera.name: judged(camera.calibration, session.cameras[camera.name])}
     return {camera.name: alone for camera, alone in zip(rig.cameras, rig.single, strict=True)}
 
 
-def judged(calibration: Calibration) -> Calibration:
+def judged(calibration: Calibration, session: Session) -> Calibration:
     """Return a camera's calibration with the verdicts on it as it is in the rig: there it has another held-out error
-    than alone, and is surer."""
-    return replace(calibration, verdicts=judge(calibration))
+    than alone, and is surer. What its `session` leaves to be chosen is no remedy."""
+    chosen = [name for name in ("model", "board_shape") if getattr(session, name) == "auto"]
+    return replace(calibration, verdicts=judge(calibration, in_force=chosen))
 
 
 def rig_from(

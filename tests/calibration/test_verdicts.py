@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +25,8 @@ from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Severity, worst
+from rigkit.io.session import Session
+from rigkit.workflows.calibrate_rig import judged
 
 
 def said(result: Calibration, words: str) -> bool:
@@ -113,7 +117,13 @@ def test_more_scatter_at_the_rim_is_not_a_bad_view(rng: np.random.Generator) -> 
 
 def test_a_lens_that_no_model_tried_fits(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("fish"), 20, rng, reach_deg=92.5)
-    assert said(calibrate(views, SIZE, model="brown"), 'try model = "auto"')
+    brown = calibrate(views, SIZE, model="brown")
+    assert said(brown, 'try model = "auto"')
+    # A camera's file of a rig has its own verdicts.
+    asked: dict[str, Any] = {"path": Path("s.toml"), "images": (), "boards": (), "degree": None, "board_shape": "auto"}
+    of_a_rig = [judged(brown, Session(model=model, **asked)) for model in ("brown", "auto")]
+    assert [said(one, 'try model = "auto"') for one in of_a_rig] == [True, False]
+    assert said(of_a_rig[1], "neither the lens models nor the boards' shapes follow all of it")
 
 
 def test_images_left_out_are_named(rng: np.random.Generator) -> None:
