@@ -11,6 +11,7 @@ from helpers.textured_scene import Corner
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
+from rigkit.affine.refine_patches import FLOOR_PX
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cameras.uncertain import UncertainCamera
@@ -19,6 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_both_ways
+from rigkit.reconstruction.growing.surface import PairRays
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.workflows.reconstruct_scene import _grown
@@ -80,6 +82,19 @@ def test_a_corner_is_grown_densely_and_its_errors_are_as_stated(lens: str) -> No
     np.testing.assert_array_equal(r.pixels1, dense.grown.pixels1.reshape(-1, 2)[dense.nodes])
     # The grid's own planes are the cloud.
     np.testing.assert_allclose(dense.surface.points.reshape(-1, 3)[dense.nodes], cloud.points_mm)
+
+
+def test_texture_does_not_make_a_patch_surer_than_its_interpolation() -> None:
+    _, dense, _ = grown_corner("pinhole")
+    camera, grown = LENSES["pinhole"], dense.grown
+    measured = PairRays.of(grown, camera, camera).measured(dense.scene.reconstruction.cam2_from_cam1)
+    sigma_px = np.sqrt(measured.covariance[..., 0, 0]) * measured.slope
+    patches = grown.valid & ~grown.swept & np.isfinite(sigma_px)
+    stated = np.sqrt(np.einsum("nii->ni", grown.covariance[patches])[:, :2].max(axis=1))
+    assert np.median(stated) < 0.5 * FLOOR_PX
+    assert sigma_px[patches].min() >= FLOOR_PX
+    # Along the epipolar line, as the direction of the largest is not known here.
+    assert np.all(sigma_px[patches] <= 1.01 * np.hypot(np.sqrt(2.0) * stated, FLOOR_PX * 2.0 ** grown.coarser[patches]))
 
 
 @pytest.mark.parametrize("lens", LENSES)

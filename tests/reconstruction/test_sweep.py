@@ -69,8 +69,10 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
 def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
     grown, measured, views, corner = grown_with_hole(lens)
     done, _ = filled(grown, measured, *views, CAM2_FROM_CAM1)
-    assert (done.swept & ~grown.valid).sum() == done.swept.sum()
-    np.testing.assert_array_equal(done.pixels2[grown.valid], grown.pixels2[grown.valid])
+    # Only beside the seams of the walls the sweep contradicts patches.
+    assert (done.swept & grown.valid).sum() < 0.005 * grown.valid.sum()
+    kept = grown.valid & ~done.swept
+    np.testing.assert_array_equal(done.pixels2[kept], grown.pixels2[kept])
     hole = np.zeros(done.valid.shape, dtype=bool)
     hole[HOLE] = True
     camera = LENSES[lens]
@@ -86,6 +88,29 @@ def test_what_patches_leave_open_is_filled_as_well_as_stated(lens: str) -> None:
     # Of one component the median is 0.67 standard deviations.
     assert 0.3 < np.median(off / sigma) < 1.2
     assert np.mean(off > 3.0) < 0.02
+
+
+def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
+    grown, measured, views, corner = grown_with_hole("pinhole")
+    wrong = np.zeros(grown.valid.shape, dtype=bool)
+    wrong[30:50, 80:95] = True
+    wrong &= grown.valid
+    # By three pixels along the epipolar line.
+    z = measured.z.copy()
+    z[wrong, 0] += 3.0 / measured.slope[wrong]
+    done, sweep = filled(grown, replace(measured, z=z), *views, CAM2_FROM_CAM1)
+    assert wrong.sum() > 200 and sweep is not None
+    assert done.swept[wrong].mean() > 0.95
+    expected, _ = LENSES["pinhole"].project(
+        CAM2_FROM_CAM1.apply(corner.surface(LENSES["pinhole"], done.pixels1[wrong])[0])
+    )
+    assert np.median(np.linalg.norm(done.pixels2[wrong] - expected, axis=1)) < 0.5
+    # Nor is a plane there distinct, whatever lies in it.
+    at = wrong & np.isfinite(measured.z[..., 0])
+    plane = np.linalg.solve(measured.frame[at], measured.z[at][..., None])[..., 0]
+    off = np.linalg.solve(measured.frame[at], z[at][..., None])[..., 0]
+    told = [sweep.distinct(grown.pixels1[at], p, measured.slope[at], np.ones(at.sum())) for p in (plane, off)]
+    assert told[0].mean() > 0.95 and told[1].mean() < 0.05
 
 
 def test_nothing_is_filled_where_there_is_no_texture() -> None:
@@ -161,7 +186,7 @@ def cloud_of_the_card() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 def test_a_wall_too_dull_for_patches_is_not_as_near_as_the_card_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     depth, outside = cloud_of_the_card()
-    for limit in ("MAX_OF_RIVAL", "MAX_OF_RIVAL_AT_END"):
+    for limit in ("MAX_OF_RIVAL", "MAX_FROM_WINNER_PX"):
         monkeypatch.setattr(sweep_module, limit, np.inf)
     all_depths, all_outside = cloud_of_the_card()
     near, all_near = (np.abs(z / CARD_MM - 1.0) < 0.2 for z in (depth, all_depths))

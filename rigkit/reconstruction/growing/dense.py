@@ -141,7 +141,7 @@ def grow_scene(
     if sweep is not None:
         at = surface.valid
         keep = at.copy()
-        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.at_end[at])
+        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.support[at])
         surface = surface.where(keep)
     by_pose, of_pose = _moved_planes(rays, pose, covariance)
     moves = _moves(even, r, moved, pose_is_known=pose_is_known)

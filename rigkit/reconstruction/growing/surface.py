@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rigkit.affine.refine_patches import WINDOW_OF_PATCH
+from rigkit.affine.refine_patches import FLOOR_PX, WINDOW_OF_PATCH
 from rigkit.affine.surface import linear_gauge
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Normals, Points
@@ -33,10 +33,8 @@ PLANE_REACH_PX = 2.0 * HALF_WIDTH
 SMOOTHING_ROUNDS = 5
 TURN_OF_LOSS = 2.385
 """In standard deviations a component: from there on a neighbour is on another surface rather than noisy."""
-MIN_NODE_SUPPORT = 0.2
-"""Share of the nodes around, in sum of weights, that a plane needs: fewer agree by chance, or across an edge."""
-MAX_STEP_PX = 1.0
-"""By which planes differ from node to node on one surface."""
+MIN_NODE_SUPPORT = 0.1
+"""Share of the nodes around, in sum of weights, below which a plane is fitted to hardly more than its own node."""
 MIN_COMPARED = 200
 """Pairs of planes whose median says by how much they disagree: to a tenth."""
 GROUPS_A_DOUBLING = 2
@@ -74,14 +72,14 @@ class GrownSurface:
     points : (R, C, 3) in the frame of camera 1, lengths in those of the translation.
     normals : (R, C, 3) unit, towards camera 1.
     plane : (R, C, 3) m of the plane m . X = 1; covariance : (R, C, 3, 3) of m.
-    at_end : (R, C) bool, no further than a patch reaches from where the surface ends.
+    support : (R, C) share of the nodes around that lie in the plane, in sum of weights.
     """
 
     points: Points
     normals: Normals
     plane: FloatArray
     covariance: FloatArray
-    at_end: BoolArray
+    support: FloatArray
 
     @property
     def valid(self) -> BoolArray:
@@ -90,7 +88,7 @@ class GrownSurface:
 
     def where(self, keep: BoolArray) -> GrownSurface:
         """Return the planes of the nodes `keep` (R, C) alone."""
-        known: dict[str, Any] = {f.name: only(keep, getattr(self, f.name)) for f in fields(self) if f.name != "at_end"}
+        known: dict[str, Any] = {f.name: only(keep, getattr(self, f.name)) for f in fields(self)}
         return replace(self, **known)
 
 
@@ -136,7 +134,7 @@ class PairRays:
         to_z = np.zeros((len(z), 3, 6))
         with np.errstate(divide="ignore", invalid="ignore"):
             to_z[:, 0, 0:2] = to_z[:, 1, 2::2] = to_z[:, 2, 3::2] = along / slope[:, None]
-        covariance = to_z @ self.grown.covariance[self.grown.valid] @ np.swapaxes(to_z, 1, 2)
+        covariance = to_z @ (self.grown.covariance[self.grown.valid] + self._unexplained()) @ np.swapaxes(to_z, 1, 2)
         good &= np.isfinite(covariance).all(axis=(1, 2))
         return NodeMeasurements(
             z=self._spread(z, good),
@@ -145,6 +143,16 @@ class PairRays:
             slope=self._spread(slope, good),
             swept=self.grown.swept,
         )
+
+    def _unexplained(self) -> FloatArray:
+        """Return the covariance (K, 6, 6) of patches' errors that is no noise: much texture does not make these less.
+
+        Without it patches of strong texture contradict each other, and hardly any plane has neighbours.
+        """
+        at = self.grown.valid
+        place = np.where(self.grown.swept[at], 0.0, FLOOR_PX * 2.0 ** self.grown.coarser[at])
+        affinity = np.where(self.grown.swept[at], 0.0, FLOOR_PX / HALF_WIDTH)
+        return np.square(np.repeat(np.stack([place, affinity], axis=1), [2, 4], axis=1))[:, :, None] * np.eye(6)
 
     def planes(self, cam2_from_cam1: Rigid3) -> FloatArray:
         """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
@@ -204,7 +212,8 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
     with np.errstate(divide="ignore", invalid="ignore"):
         ray = measured.frame[..., 0, :]
         inverse = np.sum(plane * ray, axis=-1)
-        keep = (inverse > 0.0) & (fits.support >= MIN_NODE_SUPPORT * (2 * reach + 1) ** 2)
+        support = fits.support / (2 * reach + 1) ** 2
+        keep = (inverse > 0.0) & (support >= MIN_NODE_SUPPORT)
         points = ray / inverse[..., None]
         normals = -plane / np.linalg.norm(plane, axis=-1, keepdims=True)
     spread = np.full(fits.normals.shape, np.nan)
@@ -215,7 +224,6 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         valid.astype(np.float64), -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT
     )
     freedom = np.maximum(3.0 * around * step**2 / (0.5 * WINDOW_AREA_PX), 1.0)
-    at_end = _at_ends(only(keep, plane), measured, step)
     for alike in (keep & measured.swept, keep & ~measured.swept):
         local = np.full(valid.shape, np.nan)
         local[alike] = shrunk_variances(missed[alike], freedom[alike])
@@ -230,24 +238,8 @@ def fit_surface(measured: NodeMeasurements, step: int, shared_px: float = 0.0) -
         normals=only(keep, normals),
         plane=only(keep, plane),
         covariance=spread,
-        at_end=at_end,
+        support=only(keep, support),
     )
-
-
-def _at_ends(plane: FloatArray, measured: NodeMeasurements, step: int) -> BoolArray:
-    """Return which nodes (R, C), `step` px apart, are no further than a patch reaches from where their surface ends.
-
-    It ends where `plane` (R, C, 3) is not known, and where that of the next node is elsewhere.
-    """
-    ray, slope = measured.frame[..., 0, :], measured.slope
-    end = ~np.isfinite(plane[..., 0])
-    with np.errstate(invalid="ignore"):
-        for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-            apart = np.abs(np.sum((plane[other] - plane[one]) * ray[one], axis=-1)) * slope[one] > MAX_STEP_PX
-            end[one] |= apart
-            end[other] |= apart
-    far = cv2.distanceTransform((~end).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(far * step <= HALF_WIDTH + step)
 
 
 def _disagreement(
