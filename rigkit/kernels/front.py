@@ -39,12 +39,6 @@ class LevelRules(Struct):
 class RingRules(Struct):
     """How rings are read."""
 
-    @classmethod
-    def make(cls, circle: Image, gains: FloatArray, **numbers: float) -> RingRules:
-        """Return the rules; `circle` (2 * HALF, 2) are the samples of a ring of radius 1."""
-        samples = np.ascontiguousarray(circle, np.float32)
-        return cls.of(circle=samples, gains=gains, **numbers)
-
 
 @structure("link_rules_t")
 class LinkRules(Struct):

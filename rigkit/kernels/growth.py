@@ -71,9 +71,8 @@ def grown(
 
     Returns the rings that are left if the lattice has reached the border of its arrays, -1 if it has grown all it can.
     """
-    brightness = np.ascontiguousarray(image, np.float32)
     sheet = _Sheet.of(pixels=pixels, contrast=contrast, due=np.ones((2, *contrast.shape), np.uint8), sign=sign)
-    level = _PyramidLevel.of(image=ImageOf.of(brightness=brightness), scale=scale, offset=offset)
+    level = _PyramidLevel.of(image=ImageOf.of(brightness=image), scale=scale, offset=offset)
     return int(kernels().grow_lattice(sheet, level, saddles, rules, rings))
 
 

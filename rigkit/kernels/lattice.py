@@ -71,8 +71,8 @@ def shifts_of_edges(
     most: int,
 ) -> FloatArray:
     """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, from about `most` edges."""
-    level = ImageOf.of(brightness=np.ascontiguousarray(image, np.float32))
-    places, sign = np.array(along, np.float64), 1.0 if rising else -1.0
+    level, sign = ImageOf.of(brightness=image), 1.0 if rising else -1.0
+    places = np.array(along)
     return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, reach, places, steps, most))
 
 

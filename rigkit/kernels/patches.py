@@ -25,7 +25,7 @@ class Pyramid(Struct):
 
     @classmethod
     def make(cls, levels: Sequence[NDArray[np.float32]]) -> Pyramid:
-        images = [ImageOf.of(brightness=np.ascontiguousarray(level, np.float32)) for level in levels[:MAX_LEVELS]]
+        images = [ImageOf.of(brightness=level) for level in levels[:MAX_LEVELS]]
         blank = ImageOf.of(brightness=np.zeros((1, 1), np.float32))
         out = cls.of(levels=(ImageOf * MAX_LEVELS)(*images, *[blank] * (MAX_LEVELS - len(images))), count=len(images))
         out._kept["images"] = images, blank

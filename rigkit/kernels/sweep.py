@@ -39,9 +39,8 @@ def swept_costs(
     shows nothing it is half of the bits. K' is K and what fills up vectors: levels of high cost.
     """
     rows, columns = samples1.shape
-    sweep = _SweptRanges.of(table=np.ascontiguousarray(table, np.float32), spacing=spacing, rows=rows, columns=columns)
-    image = ImageOf.of(brightness=np.ascontiguousarray(image2, np.float32))
-    return np.asarray(kernels().sweep_costs(sweep, image, np.ascontiguousarray(samples1, np.float32)))
+    sweep = _SweptRanges.of(table=table, spacing=spacing, rows=rows, columns=columns)
+    return np.asarray(kernels().sweep_costs(sweep, ImageOf.of(brightness=image2), samples1))
 
 
 def swept_surfaces(
@@ -54,7 +53,7 @@ def swept_surfaces(
     """
     rows, columns = samples1.shape
     rules = _SurfaceRules.of(rows=rows, columns=columns, levels=levels, bend=bend, jump=jump, even=even)
-    total = kernels().sweep_surfaces(rules, costs, np.ascontiguousarray(samples1, np.float32))
+    total = kernels().sweep_surfaces(rules, costs, samples1)
     winners: tuple[NDArray[np.int32], NDArray[np.int32]] = kernels().sweep_winners(rules, total)
     return winners
 
@@ -87,4 +86,4 @@ def swept_rivals(
         radius=radius,
         alike=alike,
     )
-    return np.asarray(kernels().sweep_rivals(claims, costs, np.ascontiguousarray(samples1, np.float32)))
+    return np.asarray(kernels().sweep_rivals(claims, costs, samples1))

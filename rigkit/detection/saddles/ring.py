@@ -70,9 +70,9 @@ def _gains() -> FloatArray:
 @functools.cache
 def ring_rules(max_odd: float = MAX_ODD, max_centre: float = MAX_CENTRE) -> RingRules:
     """Return the constants of this module for the kernels."""
-    return RingRules.make(
-        CIRCLE,
-        _gains(),
+    return RingRules.of(
+        circle=CIRCLE,
+        gains=_gains(),
         most_odd=max_odd,
         most_centre=max_centre,
         even_odd=EVEN_ODD,
