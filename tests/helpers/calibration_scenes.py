@@ -14,7 +14,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, unit
+from rigkit.geometry.rotation import cross, exp_so3, unit
 
 SIZE = (1624, 1240)
 BOARD = Board("9x6", 9, 6, 30.0, 30.0)
@@ -68,9 +68,11 @@ def random_views(
         rotation = facing @ exp_so3(tilt * np.array([np.cos(axis), np.sin(axis), 0.0]))
         translation = distance * direction - rotation @ middle
         in_cam = points @ rotation.T + translation
-        pixels, valid = camera.project(in_cam)
         off_axis = np.degrees(np.arctan2(np.linalg.norm(in_cam[:, :2], axis=1), in_cam[:, 2]))
-        if not (valid.all() and (off_axis <= reach_deg).all() and camera.on_image(pixels).all()):
+        if not (off_axis <= reach_deg).all():
+            continue
+        pixels, valid = camera.project(in_cam)
+        if not (valid.all() and camera.on_image(pixels).all()):
             continue
         noisy = pixels + noise_px * rng.normal(size=pixels.shape)
         noisy = np.clip(noisy, -0.5, np.array(camera.size_px) - 0.5)
@@ -145,8 +147,8 @@ def projection_difference(
 def _facing(direction: FloatArray) -> FloatArray:
     """Return the rotation of a board that looks straight at the camera from `direction`."""
     helper = np.array([1.0, 0.0, 0.0]) if abs(direction[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    x = unit(np.cross(np.cross(direction, helper), direction))
-    return np.stack([x, np.cross(direction, x), direction], axis=-1)
+    x = unit(cross(cross(direction, helper), direction))
+    return np.stack([x, cross(direction, x), direction], axis=-1)
 
 
 def heldout(result: Calibration | Candidate) -> float:
