@@ -15,6 +15,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points, Rays, as_array
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation, skew
+from rigkit.kernels import board_pose as kernel
 from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
@@ -146,12 +147,18 @@ def ray_residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals (..., N, 2) of a rigid target against rays, and their derivatives (..., N, 2, 6) by (w, v).
 
-    `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v. Else as
-    `point_residuals`.
+    `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v. Rays (N, 3) are for all
+    poses, or (..., N, 3) one set for each. Else as `point_residuals`.
     """
-    turned = points @ np.swapaxes(rotation, -1, -2)
-    residual, by_x = point_residuals(rays, bases, turned + translation[..., None, :])
-    return residual, np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
+    n, poses = len(points), rotation.shape[:-2]
+    residual, jacobian = kernel.ray_residuals(
+        rays.reshape(-1, n, 3),
+        bases.reshape(-1, n, 2, 3),
+        points,
+        rotation.reshape(-1, 3, 3),
+        translation.reshape(-1, 3),
+    )
+    return residual.reshape(*poses, n, 2), jacobian.reshape(*poses, n, 2, 6)
 
 
 def point_residuals(rays: Rays, bases: FloatArray, points: Points) -> tuple[FloatArray, FloatArray]:
@@ -225,11 +232,12 @@ def _refine(
     rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Levenberg-Marquardt on weighted ray residuals, all start poses (K, ...) at once; returns poses and costs (K,)."""
+    # Residuals are in units of the bases.
+    weighted = bases * weight[:, None, None]
 
     def linearise(poses: tuple[FloatArray, ...]) -> BatchedProblem:
-        residual, jacobian = ray_residuals(rays, bases, flat, *poses)
-        residual = (residual * weight[:, None]).reshape(len(poses[0]), -1)
-        jacobian = (jacobian * weight[:, None, None]).reshape(len(poses[0]), -1, 6)
+        residual, jacobian = ray_residuals(rays, weighted, flat, *poses)
+        residual, jacobian = residual.reshape(len(poses[0]), -1), jacobian.reshape(len(poses[0]), -1, 6)
         transposed = np.swapaxes(jacobian, 1, 2)
         descent = -(transposed @ residual[..., None])[..., 0]
         return BatchedProblem(transposed @ jacobian, descent, (residual**2).sum(axis=1))

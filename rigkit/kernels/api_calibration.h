@@ -39,6 +39,15 @@ EXPORT void average_amounts(
     ARRAY(const double, information, DISPLACEMENTS, DISPLACEMENTS), ARRAY(const double, score, DISPLACEMENTS),
     ARRAY(const double, sizes, count), int64_t count, RESULT(double, out, DISPLACEMENTS, DISPLACEMENTS));
 
+/* board_pose.c */
+
+/* One set of rays for all poses, or one for each. */
+EXPORT void ray_residuals(
+    ARRAY(const double, rays, sets, count, 3), ARRAY(const double, bases, sets, count, 2, 3), int64_t sets,
+    ARRAY(const double, points, count, 3), int64_t count, ARRAY(const double, rotation, poses, 3, 3),
+    ARRAY(const double, translation, poses, 3), int64_t poses, ARRAY(double, residuals, poses, count, 2),
+    ARRAY(double, jacobian, poses, count, 2, POSE));
+
 /* linearise.c */
 
 /* Views of boards, padded to so many corners each, and what their residuals weigh (calibration.linearise): poses, the boards'

@@ -58,9 +58,9 @@ def minimise_each(
         diagonal = np.einsum("kii->ki", here.normal)
         diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
         added = level[:, None] * diagonal
-        unknowns = np.arange(diagonal.shape[1])
         damped = here.normal.copy()
-        damped[:, unknowns, unknowns] += added
+        on_diagonal = np.einsum("kii->ki", damped)
+        on_diagonal += added
         step: FloatArray = np.asarray(np.linalg.solve(damped, here.descent[..., None])[..., 0], dtype=np.float64)
         predicted = (step * (added * step + here.descent)).sum(axis=-1)
         trial = moved(state, step)
@@ -73,8 +73,11 @@ def minimise_each(
         done |= predicted <= stop.promise * here.cost
         if small is not None:
             done |= small(state, step)
-        state = tuple(_chosen(better, new, old) for new, old in zip(trial, state, strict=True))
-        here = BatchedProblem(*(_chosen(better, new, old) for new, old in zip(there, here, strict=True)))
+        if better.all():
+            state, here = trial, there
+        else:
+            state = tuple(_chosen(better, new, old) for new, old in zip(trial, state, strict=True))
+            here = BatchedProblem(*(_chosen(better, new, old) for new, old in zip(there, here, strict=True)))
         level = np.where(better, np.maximum(damping.shrink * level, damping.floor), damping.growth * level)
         active = ~done if until_all else active & ~done
     return state, here.cost
