@@ -5,13 +5,18 @@
 /* Numbers are counted in so many bins to rank them, those of so many bits. */
 enum { RANK_BITS = 11, RANKS = 1 << RANK_BITS };
 
-/* Minus the determinant of the Hessian at one pixel. */
+/* Minus the determinant of the Hessian at one pixel of a row, between the row above and that below. */
+INLINE float saddle_between(const float *above, const float *row, const float *below)
+{
+    const float here = 2.0f * row[0];
+    const float uu = row[1] + row[-1] - here, vv = below[0] + above[0] - here;
+    const float uv = 0.25f * ((below[1] + above[-1]) - (above[1] + below[-1]));
+    return uv * uv - uu * vv;
+}
+
 INLINE float saddle_response(const float *at, int64_t width)
 {
-    const float here = 2.0f * at[0];
-    const float uu = at[1] + at[-1] - here, vv = at[width] + at[-width] - here;
-    const float uv = 0.25f * ((at[width + 1] + at[-width - 1]) - (at[-width + 1] + at[width - 1]));
-    return uv * uv - uu * vv;
+    return saddle_between(at - width, at, at + width);
 }
 
 /* How values are counted, the smaller ones first: by their highest bits where they span magnitudes and are not negative, else
@@ -216,10 +221,13 @@ INLINE uint8_t fill_strip(
     const float *restrict from, int64_t width, int64_t count, float threshold, float *restrict first, float *restrict second,
     float *restrict third, float *restrict most)
 {
+    /* Rows by pointers of their own: a register for each, and none for each of their pixels. */
+    const float *above = from - width, *middle = from + width, *last = middle + width, *below = last + width;
     int32_t high = 0;
     for (int64_t k = 0; k < count; k++) {
-        const float one = saddle_response(from + k, width), two = saddle_response(from + k + width, width);
-        const float three = saddle_response(from + k + 2 * width, width);
+        const float one = saddle_between(above + k, from + k, middle + k);
+        const float two = saddle_between(from + k, middle + k, last + k);
+        const float three = saddle_between(middle + k, last + k, below + k);
         const float highest = higher_of(three, higher_of(two, higher_of(one, LOWEST)));
         first[k] = one;
         second[k] = two;
