@@ -25,10 +25,12 @@ from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
+from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_rig
 from rigkit.workflows.certify import certify_file
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.inputs.camera_files import import_pair
+from rigkit.workflows.next_pictures import next_frames
 
 BOARD = Board("near", 9, 6, 12.0, 12.0)
 NOISE_PX = 0.03
@@ -181,3 +183,12 @@ def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) ->
             np.testing.assert_allclose(watched.covariance[pupil, pupil], known, rtol=0.05)
     lenses = [camera.with_parameters([*camera.parameters[:-2], 0.0, 0.0]) for camera in watched.cameras]
     assert check_views(replace(watched, cameras=tuple(lenses)), seen).rms_px > 0.1
+
+
+def test_frames_are_planned_with_them(saved: Path) -> None:
+    watched, boards = load_watched(saved)
+    assert all(isinstance(camera, NearCamera) for camera in watched.cameras)
+    plan, (told, powers) = next_frames(watched, boards, 2), views_that_tell(watched, boards, 2)
+    assert len(plan.views) == len(told.views) == 2
+    assert plan.views[1].error < plan.views[0].error < plan.error
+    assert {power.kind for power in powers} >= {"focus", "rotation"}

@@ -105,7 +105,7 @@ def hessians(points: Points, quantity: Quantity) -> FloatArray:
         across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length
         out = _differences([(first, first + 1)], count)
         each.append(out.T @ across @ out)
-    return np.stack(each, axis=1)
+    return np.asarray(np.stack(each, axis=1))
 
 
 def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
@@ -113,7 +113,7 @@ def _differences(pairs: Sequence[tuple[int, int]], count: int) -> FloatArray:
     out = np.zeros((len(pairs), count))
     for row, (start, end) in enumerate(pairs):
         out[row, start], out[row, end] = -1.0, 1.0
-    return np.kron(out, np.eye(3))
+    return np.asarray(np.kron(out, np.eye(3)))
 
 
 def gradients(
