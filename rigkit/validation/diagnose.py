@@ -124,6 +124,22 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
     """Return the probable causes of the checks that failed in a data set; give one report a pair."""
     if all(report.passed for report in reports):
         return ()
+    # A prior that does not hold bends all that is found with it: there nothing else is to be suspected.
+    free = [report for report in reports if not _contradicted(report)]
+    out = [f"pair '{r.pair_id}': {_contradicted(r)}" for r in reports if _contradicted(r)]
+    out += [] if all(report.passed for report in free) else _diagnose_free(free)
+    return tuple(dict.fromkeys(out))
+
+
+def _contradicted(report: ValidationReport) -> str:
+    """Return in words which declarations of the pose the images contradict; "" where none."""
+    off = [check.name for check in report.checks if check.kind in ("pose type", "level") and not check.passed]
+    remedy = "declare what they speak for, or a level as good as it was; what else fails there may come of it"
+    return f"the images contradict the declared {' and '.join(off)}: {remedy}" if off else ""
+
+
+def _diagnose_free(reports: Sequence[ValidationReport]) -> list[str]:
+    """Return the probable causes of checks that failed where no declaration of the pose is contradicted."""
     out = _diagnose_boards(reports)
     odd = _longest_by_boards(reports)
     failed = [(r.pair_id, c) for r in reports for c in r.checks if c.kind in ("baseline", "distance") and not c.passed]
@@ -133,7 +149,7 @@ def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
         out = [*_diagnose_lengths(failed, reports), *out]
     for report in reports:
         out += _diagnose_angles(report)
-    return tuple(dict.fromkeys(out))
+    return out
 
 
 def _of_that_shape(detection: BoardDetection, boards: Sequence[Board]) -> Board | None:
@@ -154,7 +170,7 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Squares:
+class _SquareSizes:
     """How a board's squares come out in some pairs (medians): as parts of what is declared, their size against that of
     the other boards (1 where fewer than three tell), and width over height."""
 
@@ -223,7 +239,7 @@ def _longest_by_boards(reports: Sequence[ValidationReport]) -> float:
     return max((part for part in off if part > ODD_BOARD), default=0.0)
 
 
-def _squares(reports: Sequence[ValidationReport]) -> dict[str, _Squares]:
+def _squares(reports: Sequence[ValidationReport]) -> dict[str, _SquareSizes]:
     """Return how the squares of each board come out, by its id."""
     seen: dict[str, list[tuple[Board, float, float]]] = {}
     for report in reports:
@@ -232,7 +248,9 @@ def _squares(reports: Sequence[ValidationReport]) -> dict[str, _Squares]:
             size = 1.0 if middle is None else b.size_ratio / middle
             seen.setdefault(b.board.board_id, []).append((b.board, size, b.square_x_ratio / b.square_y_ratio))
     return {
-        name: _Squares(some[0][0], float(np.median([s for _, s, _ in some])), float(np.median([a for *_, a in some])))
+        name: _SquareSizes(
+            some[0][0], float(np.median([s for _, s, _ in some])), float(np.median([a for *_, a in some]))
+        )
         for name, some in seen.items()
     }
 

@@ -118,6 +118,14 @@ def test_a_board_that_is_a_little_odd_explains_no_length_that_is_far_off() -> No
     assert "0.6 % wider than high" in found[1] and len(found) == 2
 
 
+def test_a_declaration_that_is_contradicted_comes_alone() -> None:
+    """A level that is stated far too well bends squares and angles."""
+    bent = reported(boards=(BOARDS[0], replace(BOARDS[1], square_y_mm=51.0), BOARDS[2]), angles=(88.9, 88.4, 90.0))
+    off = replace(bent.checks[0], name="level", kind="level", passed=False)
+    found = diagnose([reported(pair_id="well"), replace(bent, checks=(*bent.checks, off))])
+    assert len(found) == 1 and found[0].startswith("pair 'made': the images contradict the declared level: declare")
+
+
 def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
     boards = tuple(replace(board, square_y_mm=50.0 / 0.97) for board in BOARDS)
     found = diagnose([reported(boards=boards, scale=1.02, pair_id=name) for name in ("near", "far")])
