@@ -143,8 +143,8 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
     usual_px, size_px = usual_distance_px(observations, cost), _boards_px(seen)
     if usual_px > NOTHING_IN_COMMON * size_px:
         raise DegenerateError(
-            f"rig: views that should share their boards' poses disagree by {usual_px:.2g} px on where the boards are, "
-            f"which are {size_px:.2g} px large; {_advice(seen)}"
+            f"rig: views that should share their boards' poses disagree by {usual_px:.0f} px on where the boards are, "
+            f"which are {size_px:.0f} px large; {_advice(seen)}"
         )
     if usual_sigmas > DISAGREES:
         observations = replace(observations, held=_held(single, sigma, usual_sigmas**2 - 1.0))
@@ -309,5 +309,5 @@ def _require_agreement(views: RigViews, left: int, shared: int) -> None:
 
 def _advice(seen: Sequence[FrameObservations]) -> str:
     if len(seen) > 1:
-        return "check that the images of a frame were taken at one moment"
+        return "check that the images of a frame were taken at one moment, and none is among those of another camera"
     return "check that the boards do not move against each other"
