@@ -112,10 +112,9 @@ def diagnose_squares(pair_id: str, fitting: Sequence[FittingSquares]) -> tuple[s
     said = []
     for one in fitting:
         ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
-        of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}"
+        of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}, {one.where} in image 1,"
         said.append(
-            f"{of}, {one.where} in image 1, would fit the others with squares of {one.factor * declared_mm:.1f} mm "
-            f"({declared_mm:g} is declared)"
+            f"{of} would fit the others with squares of {one.factor * declared_mm:.1f} mm ({declared_mm:g} is declared)"
         )
     return (f"pair '{pair_id}': {', or '.join(said)}; measure them again",) if said else ()
 

@@ -14,8 +14,9 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
+from rigkit.identification.wrong_squares import FittingSquares
 from rigkit.validation.checks import ValidationReport, validate
-from rigkit.validation.diagnose import camera_fit, diagnose, diagnose_cameras
+from rigkit.validation.diagnose import camera_fit, diagnose, diagnose_cameras, diagnose_squares
 
 BASELINE_MM = float(np.linalg.norm(CAM2_FROM_CAM1.translation_mm))
 CENTRES_MM = 330.0
@@ -132,6 +133,16 @@ def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
     assert found == (
         "boards 'plane1', 'plane2', 'plane3': their squares come out 3.1 % wider than high against what is declared; "
         "measure square_x_mm and square_y_mm, or look at the calibration's aspect",
+    )
+
+
+def test_a_board_that_fits_nowhere_is_named_with_its_size_or_its_place() -> None:
+    one, alike = (FittingSquares(b, 1.25, "the 8x6 grid round (9, 7)") for b in (BOARDS[:1], BOARDS[1:]))
+    size = "would fit the others with squares of 62.5 mm (50 is declared)"
+    assert diagnose_squares("made", []) == ()
+    assert diagnose_squares("made", [one, alike]) == (
+        f"pair 'made': board 'plane1' {size}, or one of 'plane2', 'plane3', the 8x6 grid round (9, 7) in image 1, "
+        f"{size}; measure them again",
     )
 
 
