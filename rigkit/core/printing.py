@@ -54,6 +54,11 @@ def _value(value: Any) -> str:
     return words.splitlines()[0] if len(words) <= MAX_LENGTH else f"{words.splitlines()[0][:MAX_LENGTH]}..."
 
 
+def digits(value: float) -> str:
+    """Return a number with two digits that count, and no exponent where it is large: 520, 5.2, 0.052."""
+    return f"{float(f'{value:.2g}'):.12g}"
+
+
 def counted(count: int, noun: str) -> str:
     """Return a number with its noun: 1 image, 2 images."""
     return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -14,6 +14,7 @@ from rigkit.cameras.plausible import fault_of_lens
 from rigkit.cameras.registry import camera_model
 from rigkit.core.arrays import FloatArray, Pixels
 from rigkit.core.errors import InputError
+from rigkit.core.printing import digits
 
 MM_PER_M = 1000.0
 WORTH_A_WORD_PX = 0.1
@@ -85,9 +86,9 @@ def best_accepted(
             continue
         fewer = any(k.model == camera.model for k in accepted)
         lacks = f"{camera.model} model" + (" with these terms" if fewer else "")
-        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {c.max_px:.2g} px at most"
+        note = f"{format_name} has no {lacks}: refitted as {kind.model}, off by {digits(c.max_px)} px at most"
         if outline is not None:
-            note += f" where boards were and {c.outside_px:.2g} px elsewhere"
+            note += f" where boards were and {digits(c.outside_px)} px elsewhere"
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"

@@ -13,6 +13,7 @@ from rigkit.calibration.uncertainty import FarProjection, uncertainty_map
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Severity, gravest_first, worst
+from rigkit.core.printing import digits
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_drawings import MAP_GRID
@@ -99,12 +100,12 @@ def _reach(c: Calibration) -> str:
     grid = uncertainty_map(c, grid=MAP_GRID)
     beyond = grid.worst_px[np.isfinite(grid.worst_px) & ~covered_by_boards(c, grid.pixels)]
     words = (
-        f"A far point is projected to ±{far.usual_px:.2g} px where boards were (±{far.worst_px:.2g} px at worst; "
-        "one standard deviation)"
+        f"A far point is projected to ±{digits(far.usual_px)} px where boards were "
+        f"(±{digits(far.worst_px)} px at worst; one standard deviation)"
     )
     if not beyond.size:
         return words + "."
-    words += f", and to ±{beyond.max():.2g} px at worst outside, if the lens goes on there as lens models do"
+    words += f", and to ±{digits(beyond.max())} px at worst outside, if the lens goes on there as lens models do"
     if worst(c.verdicts) is Severity.BAD:
         return words + "."
     if beyond.max() < MAX_RATIO_BEYOND * far.worst_px:

@@ -16,7 +16,7 @@ import rigkit
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.compare import compare_cameras
 from rigkit.core.findings import Finding, Severity
-from rigkit.core.printing import brief
+from rigkit.core.printing import brief, digits
 from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.metric import MetricPose
 from rigkit.relative_pose.refinement.refine import RefinedPose
@@ -98,3 +98,7 @@ def test_it_prints_in_a_few_lines(name: str) -> None:
 def test_values_are_shown_where_they_are_short() -> None:
     found = rigkit.BoardDetection("a", 3, 2, np.array([[0, 0], [1, 0]]), np.zeros((2, 2)), np.full(2, 0.1))
     assert repr(found) == "BoardDetection(board_id='a', columns=3, rows=2, grid=<2x2>, pixels=<2x2>, sigma_px=<2>)"
+
+
+def test_large_numbers_have_no_exponent() -> None:
+    assert [digits(value) for value in (523.4, 5.23, 0.0523)] == ["520", "5.2", "0.052"]

@@ -17,6 +17,7 @@ from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.printing import digits
 
 FEW_IMAGES = 8
 FAR_TOO_FEW = 3
@@ -193,7 +194,7 @@ def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Fin
     return [
         Finding.look(
             f"in the {100 - round(100.0 * extent.share)} % of the image where no boards were the lens is extrapolated, "
-            f"and uncertain by {usual:.2g} px (one standard deviation, rms)",
+            f"and uncertain by {digits(usual)} px (one standard deviation, rms)",
             "hold the board there as well, up to the corners of the image",
         )
     ]

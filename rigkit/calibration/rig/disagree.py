@@ -18,6 +18,7 @@ import numpy as np
 from rigkit.calibration.rig.observations import FrameObservations
 from rigkit.calibration.rig.state import Key, RigObservations, RigState
 from rigkit.calibration.solving.solver import Solution
+from rigkit.core.printing import digits
 
 FAR_APART = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
@@ -97,7 +98,7 @@ def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> 
     out = []
     for key in sorted(shared):
         if off_px[key] > max(FAR_APART * usual, 0.5 * worst):
-            words = f"by {off_px[key]:.2g} px, {off_px[key] / usual:.0f} times the usual"
+            words = f"by {digits(off_px[key])} px, {off_px[key] / usual:.0f} times the usual"
             out.append((*key, why(seen, key, words)))
             part(seen, key)
     return out
