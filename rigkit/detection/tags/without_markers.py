@@ -17,10 +17,10 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import extended
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.subpixel.unsure import unsure
 from rigkit.detection.subpixel.whole_board import (
     AROUND,
     MAP_RINGS,
-    MAX_HOLES,
     PICTURE_SIGMAS,
     SHARP_PX,
     spline_coefficients,
@@ -35,6 +35,9 @@ MAX_SQUARE = 64
 
 MIN_LINES = 3
 """Steps between corners have neighbours: of fewer rows and columns nobody says where their squares end."""
+
+AROUND_CORNER = np.ones((3, 3), np.uint8)
+"""Corners around those known are foretold so well that markers are wiped out around them, too."""
 
 SHADE_SQUARES = 1.0
 """Black and white are asked of the pixels around, weighted by a Gaussian of this standard deviation, squares."""
@@ -55,33 +58,61 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     refined : the corners, on the grid of the board; those unknown are foretold by the others.
     blur : s of the edges, px.
     """
-    known, pixels = refined.lattice.known, refined.lattice.pixels
-    if min(known.shape) < MIN_LINES or np.count_nonzero(~known) > MAX_HOLES * known.size:
+    # What is half covered is foretold by the others rather than believed.
+    seen = _seen(np.where(unsure(refined.sigma_px)[..., None], np.nan, refined.lattice.pixels))
+    if seen is None:
         return None
-    if not known.all():
-        pixels = pixels.copy()
-        pixels[~known] = foretold(pixels, ~known).pixels
+    pixels, known, (row, column) = seen
     around = extended(pixels, MAP_RINGS)
     if not np.isfinite(around).all():
         return None
     left, top, width, height = box = _box(image, around, PICTURE_SIGMAS * blur)
     places = board_places(spline_coefficients(around), box, AROUND) - MAP_RINGS
-    square_px = float(np.median(fit_cells(pixels, np.ones_like(known), degree=1).cell_px()))
+    square_px = float(np.median(fit_cells(pixels, known, degree=1).cell_px()))
     rest_blur = float(np.sqrt(max(blur**2 - SHARP_PX**2, 0.25)))
-    size = (board.rows, board.columns)
-    ends = np.array([[-1.0, board.columns], [-1.0, board.rows]])
+    first, ends = np.array([column, row]), np.array([[-1.0, board.columns], [-1.0, board.rows]])
     ink = board.ink()
-    white = -1.0 if ink.first_black else 1.0
-    squares = _blurred(board_picture(places, size, ends, np.zeros(4), SHARP_PX)[0], rest_blur)
-    marks = _blurred(_ink(board, places, square_px), rest_blur)
+    white = -1.0 if ink.first_black == ((row + column) % 2 == 0) else 1.0
+    squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX)[0]
+    squares, marks = (_blurred(plane, rest_blur) for plane in (squares, _ink(board, places + first, square_px)))
     part = image[top : top + height, left : left + width].astype(np.float32)
-    with np.errstate(invalid="ignore"):
-        near = (places > -WINDOW_REACH) & (places < np.array(board.size) - 1.0 + WINDOW_REACH)
-    used = np.asarray(near.all(axis=2))
+    used, told = _beside(places, known, WINDOW_REACH), cv2.dilate(known.astype(np.uint8), AROUND_CORNER) > 0
     taken = marks * _contrast(part, white * squares - 2.0 * marks, used, SHADE_SQUARES * square_px)
     out = image.astype(np.float32)
-    out[top : top + height, left : left + width] += 2.0 * taken
+    out[top : top + height, left : left + width] += 2.0 * np.where(_beside(places, told, 1.0), taken, 0.0)
     return out
+
+
+def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] | None:
+    """Return the part of a board's corners (R, C, 2), NaN where unknown, that is known, and one more all around, with
+    those unknown foretold; which are known; and row and column of the first. None where they are not foretold."""
+    known = np.isfinite(pixels[..., 0])
+    spans = []
+    for axis in (1, 0):
+        lines = np.flatnonzero(known.any(axis=axis))
+        if len(lines) < MIN_LINES:
+            return None
+        spans.append(slice(max(int(lines[0]) - 1, 0), int(lines[-1]) + 2))
+    part, known = pixels[spans[0], spans[1]].copy(), known[spans[0], spans[1]]
+    while np.isnan(part[..., 0]).any():
+        # Ring by ring: far from all that are known polynomials run wild.
+        missing = np.isnan(part[..., 0])
+        beside = missing & (cv2.dilate((~missing).astype(np.uint8), AROUND_CORNER) > 0)
+        part[beside] = foretold(part, beside).pixels
+        if np.isnan(part[beside]).any():
+            return None
+    areas = fit_cells(part, np.ones_like(known), degree=1).areas()
+    return (part, known, (spans[0].start, spans[1].start)) if (areas > 0.0).all() else None
+
+
+def _beside(places: FloatArray, corners: BoolArray, reach: float) -> BoolArray:
+    """Return which pixels at `places` (H, W, 2), in squares, are nearest to one of the `corners` (R, C), and within
+    `reach` of it along columns and rows."""
+    last = np.array(corners.shape[::-1]) - 1
+    nearest = np.rint(np.nan_to_num(places, nan=-9.0)).astype(np.int64).clip(0, last)
+    with np.errstate(invalid="ignore"):
+        near = (np.abs(places - nearest) < reach).all(axis=2)
+    return np.asarray(near & corners[nearest[..., 1], nearest[..., 0]])
 
 
 def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int, int, int]:

@@ -14,14 +14,15 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray, known_median
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.checks.validate import has_edge_offset
 from rigkit.detection.guided.corner_fit import MARKER_BLURS, RADIUS_PX, fit_corners, gap_to_markers
-from rigkit.detection.guided.guided import completed
+from rigkit.detection.guided.guided import MAX_ADDED_RESIDUAL_MARKED, completed
 from rigkit.detection.guided.relit import relit
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
@@ -48,6 +49,10 @@ MIN_VOTES, AGREEING_VOTES = 3, 0.7
 WIPES = 2
 """Times that markers are wiped out and corners fitted anew: the second time from corners without their ink."""
 
+MOVED_PX, MIN_MOVED, LEAST_DRAWN = 0.05, 12, -0.5
+"""By how much markers are wiped out beside their places, corner by corner this way or that, to see how corners follow;
+coordinates that say it at least; and the least that is believed: sigmas are doubled then."""
+
 SEED_CONTRAST = 100.0
 """Contrast that a corner starts with, grey levels: the fit measures it."""
 
@@ -65,6 +70,24 @@ class CharucoFinder(Finder):
             return every
         pairs = zip(every, found, strict=True)
         return [relit(search.grey, detection, item.refined, item.board) for detection, item in pairs]
+
+
+def _too_unlike(fitted: RefinedLattice, sure: BoolArray) -> BoolArray:
+    """Return which corners (R, C), but for those that are `sure`, leave too much for corners beside them."""
+    left = fitted.relative_residual
+    with np.errstate(invalid="ignore"):
+        return np.asarray(~sure & (left > MAX_ADDED_RESIDUAL_MARKED * known_median(left[sure])))
+
+
+def _with_more(refined: RefinedLattice, detection: BoardDetection, board: Board) -> RefinedLattice:
+    """Return `refined` with the corners of a detection on its grid that it has not; itself where there are none."""
+    more = _of(board, detection.grid, detection.pixels)
+    sigma = np.full(refined.sigma_px.shape, np.nan)
+    sigma[detection.grid[:, 1], detection.grid[:, 0]] = detection.sigma_px
+    if not (more.known & ~refined.lattice.known).any():
+        return refined
+    usual = np.full(sigma.shape, known_median(refined.blur_px))
+    return refined.filled(replace(refined, lattice=more, sigma_px=sigma, blur_px=usual))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -98,7 +121,7 @@ def _charuco_boards(
             whole, left = _by_outlines(pictures, rest, board)
         if not whole.count:
             continue
-        placed = _beside_markers(image, refine(image, [whole])[0], board)
+        placed = _beside_markers(image, refine(image, [whole])[0], board, search.camera)
         if placed.refined.lattice.count >= search.min_corners:
             out.append(placed)
             rest = left
@@ -249,7 +272,7 @@ def _onto(lattice: Lattice, shift: IntArray, board: Board) -> Lattice:
     return out
 
 
-def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> _MarkedBoard:
+def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, camera: Camera | None) -> _MarkedBoard:
     """Return the corners fitted anew with windows that leave the markers out; those that then fail are dropped."""
     known = refined.lattice.known
     if not known.any():
@@ -259,19 +282,57 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board) -> 
     if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
         return _MarkedBoard(narrow, board, image, board)
     # Their ink reaches into any window.
-    picture, empty = image, replace(board, pattern=Chessboard())
-    every = (slice(0, known.shape[0]), slice(0, known.shape[1]))
-    for _ in range(WIPES):
-        wiped = without_markers(image, narrow, board, blur)
+    told = narrow
+    if not narrow.lattice.known.all():
+        # Markers are wiped out around all that is seen, so that their ink is no reason to leave corners out.
+        seen = completed(image, _detection(_MarkedBoard(narrow, board, image, board)), [board], camera)
+        told = _with_more(narrow, seen, board)
+    return _wiped(image, told, narrow.lattice.known, board, blur) or _MarkedBoard(narrow, board, image, board)
+
+
+def _wiped(image: GreyImage, told: RefinedLattice, sure: BoolArray, board: Board, blur: float) -> _MarkedBoard | None:
+    """Return the corners `told` fitted anew in the picture without the markers, but for those that are not `sure` (R,
+    C) and fit badly there; None where markers cannot be wiped out."""
+    empty, some_more = replace(board, pattern=Chessboard()), bool((told.lattice.known & ~sure).any())
+    picture, before, after, narrow = image, blur, blur, told
+    # The places of those that were added are rough.
+    for turn in range(WIPES + some_more):
+        wiped = without_markers(image, narrow, board, after)
         if wiped is None:
-            return _MarkedBoard(narrow, board, image, board)
-        picture = wiped
-        narrow = placed_together(wiped, _fitted(wiped, narrow, empty, blur))
-        blur = float(np.median(narrow.blur_px[narrow.lattice.known]))
+            return None
+        picture, told, before = wiped, narrow, after
+        fitted = _fitted(wiped, told, empty, before)
+        if turn > 0 and some_more:
+            fitted = fitted.without(_too_unlike(fitted, sure))
+        narrow = placed_together(wiped, fitted)
+        after = float(np.median(narrow.blur_px[narrow.lattice.known]))
     # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
-    alone = narrow.sigma_px / narrow.scatter
+    alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, told, narrow, board, before))
+    every = (slice(0, sure.shape[0]), slice(0, sure.shape[1]))
     scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
     return _MarkedBoard(replace(narrow, sigma_px=scatter * alone, scatter=scatter), board, picture, empty)
+
+
+def _drawn_by_markers(
+    image: GreyImage, told: RefinedLattice, found: RefinedLattice, board: Board, blur: float
+) -> float:
+    """Return how far corners go back, in parts of the shift, where their markers are wiped out a little beside.
+
+    What is left of such markers draws a corner to where it belongs: wiped out beside corners that are off by e, they
+    leave corners off by P n - c e, n being the noise, P n what it does on a chessboard, and c what is returned. Done
+    over and over that ends at e = P n / (1 + c): markers, too, say where corners are.
+
+    told, found : the corners around which markers were wiped out, and where they were then found.
+    """
+    off = MOVED_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
+    aside = replace(told, lattice=replace(told.lattice, pixels=told.lattice.pixels + off))
+    wiped = without_markers(image, aside, board, blur)
+    if wiped is None:
+        return 0.0
+    empty = replace(board, pattern=Chessboard())
+    moved = placed_together(wiped, _fitted(wiped, told, empty, blur)).lattice.pixels - found.lattice.pixels
+    back = -(moved / off)[np.isfinite(moved)]
+    return max(float(np.median(back)), LEAST_DRAWN) if len(back) >= MIN_MOVED else 0.0
 
 
 def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> RefinedLattice:
