@@ -116,9 +116,10 @@ def split_necks(lattice: Lattice) -> list[Lattice]:
         return [lattice]
     groups: list[BoolArray] = []
     for broad in _broad_parts(known):
-        part = _LatticePart.of(lattice.without(~broad))
+        # Mostly there is one, which nothing is compared with.
+        part = _LatticePart.of(lattice.without(~broad)) if groups else None
         for number, group in enumerate(groups):
-            if _same_board(_LatticePart.of(lattice.without(~group)), part):
+            if part is not None and _same_board(_LatticePart.of(lattice.without(~group)), part):
                 groups[number] = group | broad
                 break
         else:

@@ -82,8 +82,11 @@ def board_factors(
 
 def _noise_of(fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray) -> edges.NoiseOfCorners:
     # Copied here, once for both kernels, which take arrays that lie by themselves in memory.
-    columns = (fit.products, fit.pairs, fit.noise, fit.pixels, sides, fit.blur, fit.used)
-    return edges.NoiseOfCorners(*(np.ascontiguousarray(values) for values in columns), good, owner)
+    alone = np.ascontiguousarray
+    return edges.NoiseOfCorners(
+        *(alone(fit.products), alone(fit.pairs), alone(fit.noise), alone(fit.pixels), alone(sides)),
+        *(alone(fit.blur), alone(fit.used), good, owner),
+    )
 
 
 def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: bool) -> float:
