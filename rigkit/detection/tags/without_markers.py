@@ -7,11 +7,14 @@ squares around: without it the image is that of a chessboard.
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
+from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.local_fit import fit_cells, foretold
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import extended
@@ -71,8 +74,8 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     square_px = float(np.median(fit_cells(pixels, known, degree=1).cell_px()))
     rest_blur = float(np.sqrt(max(blur**2 - SHARP_PX**2, 0.25)))
     first, ends = np.array([column, row]), np.array([[-1.0, board.columns], [-1.0, board.rows]])
-    ink = board.ink()
-    white = -1.0 if ink.first_black == ((row + column) % 2 == 0) else 1.0
+    assert isinstance(board.pattern, Charuco)
+    white = -1.0 if board.pattern.first_black(board.rows) == ((row + column) % 2 == 0) else 1.0
     squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX)[0]
     squares, marks = (_blurred(plane, rest_blur) for plane in (squares, _ink(board, places + first, square_px)))
     part = image[top : top + height, left : left + width].astype(np.float32)
@@ -128,6 +131,15 @@ def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int
 def _ink(board: Board, places: FloatArray, square_px: float) -> Picture:
     """Return how much of each pixel at `places` (H, W, 2) is ink of markers, blurred by SHARP_PX."""
     each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
+    smooth = _blurred(_sheet(board, each), SHARP_PX * each / square_px)
+    where = np.where(np.isfinite(places), (places + 1.0) * each - 0.5, -2.0 * each).astype(np.float32)
+    return np.asarray(cv2.remap(smooth, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+
+
+@functools.lru_cache(maxsize=8)
+def _sheet(board: Board, each: int) -> Picture:
+    """Return the ink of a board's markers, 1, on squares of `each` x `each` samples, from the one before the first
+    corner."""
     columns, rows = board.size
     sheet = np.zeros(((rows + 1) * each, (columns + 1) * each), np.float32)
     scale = np.tile(each / np.array(board.squares_mm), 2)
@@ -135,10 +147,7 @@ def _ink(board: Board, places: FloatArray, square_px: float) -> Picture:
         # Sides of modules fall between samples.
         down, across = _covered(sheet.shape[0], y + each, high), _covered(sheet.shape[1], x + each, wide)
         sheet[down[0], across[0]] += np.outer(down[1], across[1]).astype(np.float32)
-    sharp = SHARP_PX * each / square_px
-    smooth = _blurred(sheet, sharp)
-    where = np.where(np.isfinite(places), (places + 1.0) * each - 0.5, -2.0 * each).astype(np.float32)
-    return np.asarray(cv2.remap(smooth, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return sheet
 
 
 def _covered(length: int, start: float, extent: float) -> tuple[slice, FloatArray]:
