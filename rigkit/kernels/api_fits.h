@@ -285,8 +285,9 @@ enum { CIRCLE_OUTCOMES = 26, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
 typedef struct {
-    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px, near_beside;
-    int64_t iterations, fewest;
+    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px,
+        converged_sigmas, near_beside;
+    int64_t iterations, plain_iterations, fewest;
 } circle_rules_t;
 
 EXPORT void fit_circles(

@@ -6,6 +6,9 @@
  * be, nobody sees), the blur s, and the light (1 + g . x) (a + b S), S the share of the disc. */
 #include "circle_model.h"
 
+/* Steps are taken no shorter or longer than this. */
+static const double SHORTEST = 0.3, LONGEST = 4.0;
+
 /* Gather the pixels near the edge and within `reach` radii, at most `most`. */
 INLINE void gather(
     const circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t most,
@@ -73,6 +76,26 @@ INLINE double linearise(const group_t *at, const spots_t *spots, double N[PARAME
         memcpy(N + i * PARAMETERS, sums[i], PARAMETERS * sizeof(double));
     }
     return sums[OFF][OFF];
+}
+
+/* Take an unknown that is at its limit out of the normal equations: the rest of the step is then what is best there. */
+INLINE void leave(double N[PARAMETERS * PARAMETERS], double right[PARAMETERS], int out)
+{
+    for (int i = 0; i < PARAMETERS; i++)
+        N[i * PARAMETERS + out] = N[out * PARAMETERS + i] = 0.0;
+    N[out * PARAMETERS + out] = 1.0;
+    right[out] = 0.0;
+}
+
+/* Return by how much to take a step longer or shorter than it is, `times` having been that of the one before: where edges
+ * are not the model's, steps go to and fro or creep. Aitken's relaxation for vectors, Irons and Tuck 1969, eq. 12, in the
+ * metric of the normal equations: `moves` is a step's square, `along` its product with the one before, `before` the square of
+ * that. */
+INLINE double relaxed(double times, double moves, double along, double before)
+{
+    const double change = moves - 2.0 * along + before;
+    const double fresh = times * (before - along) / (change > 1e-12 * before ? change : 1e-12 * before);
+    return fresh < SHORTEST ? SHORTEST : fresh > LONGEST ? LONGEST : fresh;
 }
 
 /* Let the map grow by the symmetric matrix of `step`. */
@@ -241,23 +264,40 @@ void fit_circles(
         if (!inverted(at))
             continue;
         gather(at, grey, bytes, width, height, reach[n], band, most, &spots);
-        double N[PARAMETERS * PARAMETERS], step[PARAMETERS];
+        double N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
         if (!(spots.count >= rules->fewest) || !set_brightness(at, &spots))
             continue;
+        double before[PARAMETERS] = {0.0}, times = 1.0, moved_before = 0.0;
         int solved = 1, settled = 0, still = 0;
         for (int64_t k = 0; k < rules->iterations && solved && !settled; k++) {
-            linearise(&group, &spots, N, step);
+            const double variance = linearise(&group, &spots, N, right) / (double)(spots.count - PARAMETERS);
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
+            if (at->s <= rules->least_blur && right[S] < 0.0)
+                leave(N, right, S);
             solved = cholesky(N, PARAMETERS);
             if (!solved)
                 break;
+            memcpy(step, right, sizeof step);
             cholesky_solve(N, PARAMETERS, step);
+            /* Nothing moves by more of its sigmas than the root of this over the variance. */
+            double moves = 0.0, along = 0.0;
+            for (int i = 0; i < PARAMETERS; i++) {
+                moves += right[i] * step[i];
+                along += right[i] * before[i];
+            }
+            if (k >= rules->plain_iterations)
+                times = relaxed(times, moves, along, moved_before);
+            moved_before = moves;
+            memcpy(before, step, sizeof step);
+            for (int i = 0; i < PARAMETERS; i++)
+                step[i] *= times;
             solved = moved(&group, step, rules);
+            const int certain = moves < rules->converged_sigmas * rules->converged_sigmas * variance;
             /* Size and slant tell how sure the centre is, and settle later. */
             const double grown = fabs(step[E1]) + fabs(step[E2]) + fabs(step[E3]);
-            still = fabs(step[X]) + fabs(step[Y]) < rules->converged_px;
-            settled = still && grown * at->size < rules->converged_px;
+            still = certain || fabs(step[X]) + fabs(step[Y]) < rules->converged_px;
+            settled = certain || (still && grown * at->size < rules->converged_px);
         }
         if (!solved)
             continue;

@@ -6,11 +6,13 @@ import json
 
 import numpy as np
 import pytest
+from detectors.degradations import degraded
 from helpers.data import read_grey, shared_data
 from helpers.detection_scenes import errors_by_position, match
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.aprilgrid import AprilGrid
+from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.unknown import guess_board
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
@@ -131,6 +133,19 @@ def test_overexposed_tags(gain: float) -> None:
     # Of ten; the finest level alone shows two and none.
     assert seen >= (6 if gain == 2.0 else 3)
     assert np.median(off) < 1.5 * MEDIAN_OF_RAYLEIGH
+
+
+def test_circles_that_a_webcam_sharpens() -> None:
+    """Steps of the fit go to and fro where edges are steeper than any blur: none of these two grids was found."""
+    paths = sorted(shared_data("public/circles-regular").glob("*.jpg"))[:2]
+    board = Board("dots", 10, 8, 2.5, 2.5, pattern=Circles(diameter_mm=1.5))
+    for path in paths:
+        grey = read_grey(path)
+        sharper = degraded("sharpened", 3.0, grey, np.random.default_rng(0))[0]
+        (clear,), (found,) = detect_boards(grey, [board]), detect_boards(sharper, [board])
+        assert clear.complete and found.complete
+        off = np.linalg.norm(found.pixels[:, None] - clear.pixels, axis=2).min(axis=1)
+        assert off.max() < 0.2
 
 
 def test_a_wide_board_is_not_taken_for_a_square_one() -> None:
