@@ -195,6 +195,18 @@ def test_white_tags_are_found_where_black_ones_are_in_the_negative(squares: bool
     assert detect_boards(image, [black]) == ()
 
 
+def test_tags_of_a_hundredth_of_an_images_brightness(rng: np.random.Generator) -> None:
+    """A heat image: what is hot beside the board takes nearly all of its 16 bits."""
+    scene = facing(KALIBR)
+    clear = scene.render(optics=Optics(0.8), noise_levels=1.0, rng=rng).astype(np.float64)
+    heat = 7000.0 + 0.4 * clear
+    heat[:40, :60] = 14000.0
+    (found,) = detect_boards(np.rint(heat).astype(np.uint16), [KALIBR])
+    assert found.complete and found.board_id == "k"
+    z = errors_by_place(found, scene.truth()[0]) / found.sigma_px[:, None]
+    assert 0.7 < np.sqrt((z**2).mean()) < 1.4
+
+
 def test_tags_that_light_parts_from_the_squares_between_them_are_sought_alone() -> None:
     """Of the saddles a few are left, which say that it is this board."""
     board, rng = Board("grid", 8, 8, 60.0, 60.0, pattern=AprilGrid(0.3)), np.random.default_rng(0)

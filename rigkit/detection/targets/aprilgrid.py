@@ -14,6 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.lattice.lattice import build_lattices
 from rigkit.detection.lattice.links import LENGTH_RATIO, find_links
+from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage, Level, each_level
 from rigkit.detection.saddles.saddle import Corners, each_once, find_corners
 from rigkit.detection.tags.codes import read_tags
@@ -32,12 +33,21 @@ class AprilGridFinder(Finder):
     """Corners of tags are linked as those of chessboards are, only that opposite neighbours may lie further apart."""
 
     def find(self, search: Search, boards: Sequence[Board]) -> list[BoardDetection]:
+        found = self._found(search, search.grey, boards)
+        if found or search.grey.dtype == np.uint8:
+            return found
+        # As of chessboards: beyond 8 bits a board may have a hundredth of the range of brightness.
+        seen = self._found(search, equalised(search.grey), boards)
+        return self._found(search, stretched(search.grey, [item.lattice() for item in seen]), boards) if seen else []
+
+    def _found(self, search: Search, image: GreyImage, boards: Sequence[Board]) -> list[BoardDetection]:
+        """Return what is seen of the boards in the image of a search, or in that image with other grey levels."""
         every = [TagBoard.of(board) for board in boards]
         found = []
         for inverted in (False, True):
             tags = [item for item in every if item.pattern.inverted == inverted]
             # The negative of an image has its corners in the same places.
-            grey = 255 - search.grey if inverted and tags else search.grey
+            grey = 255 - image if inverted and tags else image
             for item, pixels in self._placed(grey, tags):
                 seen = tag_corners(grey, item, pixels, search.camera) if np.isfinite(pixels).any() else None
                 if seen is None or len(seen.grid) < search.min_corners:
