@@ -48,6 +48,8 @@ MOVED_RAD = np.deg2rad(0.5)
 MAX_GROWTHS = 3
 POSE_STEP_RAD = 1e-5
 """For differences of planes: far above rounding, far below where they bend."""
+EXACT = 1e-12
+"""Share of the pose's largest variance up to which another is rounding: one more axis would cost as much as any."""
 SHARED_ERROR = 0.5
 """Of the errors of pairs, in their median: no pair is much better than the others (measured: by likelihood)."""
 WINDOW_OVERLAP = WINDOW_AREA_PX / POSE_STEP**2
@@ -143,10 +145,10 @@ def grow_scene(
         keep = at.copy()
         keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.support[at])
         surface = surface.where(keep)
-    by_pose, of_pose = _moved_planes(rays, pose, covariance)
+    by_pose = _moved_planes(rays, pose, covariance)
     moves = _moves(even, r, moved, pose_is_known=pose_is_known)
     covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))
-    uncertain = _UncertainPlanes(surface, by_pose, of_pose, _planes_of_moves(rays, pose, moves))
+    uncertain = _UncertainPlanes(surface, by_pose, _planes_of_moves(rays, pose, moves))
     cloud, nodes, of_calibrations = _cloud(grown, uncertain, image1)
     cloud = replace(cloud, calibration_in_sigmas=calibrations is not None)
     scene = _scene(sparse, grown, cloud, nodes, known, pose, covariance)
@@ -254,22 +256,28 @@ def _knowledge(matches: Matches, pose: Rigid3) -> LineKnowledge:
     return LineKnowledge(essential_from_pose(pose), max(MAX_DISTANCE_PX, GATE * sigma), sigma, sigma_A)
 
 
-def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the derivatives (R, C, 3, 5) of the nodes' own planes by the pose, and the pose's covariance (5, 5) so."""
+def _moved_planes(rays: PairRays, pose: Rigid3, covariance: FloatArray) -> FloatArray:
+    """Return how the nodes' own planes change (R, C, 3, K) with the pose, by a standard deviation along each of the K
+    axes of its covariance along which it is not exact."""
     length = float(np.linalg.norm(pose.translation_mm))
     t = pose.translation_mm / length
     directions = np.zeros((5, 6))
     directions[:3, :3], directions[3:, 3:] = np.eye(3), translation_basis(t)
+    to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
+    variances, axes = np.linalg.eigh(to_five @ covariance @ to_five.T)
+    moves = np.flatnonzero(variances > EXACT * variances[-1])
 
     def planes(step: FloatArray) -> FloatArray:
         there = Rigid3(exp_so3(step[:3]) @ pose.rotation, length * unit(t + step[3:]))
         return rays.planes(there)
 
+    changes = np.zeros((*rays.grown.valid.shape, 3, len(moves)))
+    here = rays.planes(pose) if len(moves) else changes
     # Sigmas need no better derivatives than forward differences.
-    here = rays.planes(pose)
-    each = [(planes(POSE_STEP_RAD * d) - here) / POSE_STEP_RAD for d in directions]
-    to_five = directions / np.array([1.0, 1.0, 1.0, length, length, length])
-    return np.stack(each, axis=-1), np.asarray(to_five @ covariance @ to_five.T)
+    for k, axis in enumerate(moves):
+        change = planes(POSE_STEP_RAD * axes[:, axis] @ directions) - here
+        changes[..., k] = np.sqrt(variances[axis]) / POSE_STEP_RAD * change
+    return changes
 
 
 class _Moved(NamedTuple):
@@ -306,8 +314,8 @@ def _change_of_pose(even: _EvenPose, r: Reconstruction, cameras: tuple[Camera, C
 
 def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> FloatArray:
     """Return how the nodes' own planes change with each move (R, C, 3, M)."""
-    here = rays.planes(pose)
-    planes = np.zeros((*here.shape, len(moves)))
+    planes = np.zeros((*rays.grown.valid.shape, 3, len(moves)))
+    here = rays.planes(pose) if moves else planes
     for k, (cameras, change) in enumerate(moves):
         there = Rigid3(exp_so3(change[:3]) @ pose.rotation, pose.translation_mm + change[3:])
         planes[..., k] = PairRays.of(rays.grown, *cameras).planes(there) - here
@@ -315,12 +323,11 @@ def _planes_of_moves(rays: PairRays, pose: Rigid3, moves: list[_Moved]) -> Float
 
 
 class _UncertainPlanes(NamedTuple):
-    """Planes at nodes, their derivatives (R, C, 3, 5) by the pose, its covariance (5, 5), and how they change with each
-    move of the calibrations (R, C, 3, M)."""
+    """Planes at nodes, and how they change with each axis of the pose's covariance (R, C, 3, K) and with each move of
+    the calibrations (R, C, 3, M)."""
 
     surface: GrownSurface
     by_pose: FloatArray
-    of_pose: FloatArray
     by_calibrations: FloatArray
 
 
@@ -340,7 +347,7 @@ def _cloud(
     )
     by_pose, moves = flat(planes.by_pose), flat(planes.by_calibrations)
     of_calibrations = moves @ np.swapaxes(moves, 1, 2)
-    covariance = covariance + by_pose @ planes.of_pose @ np.swapaxes(by_pose, 1, 2) + of_calibrations
+    covariance = covariance + by_pose @ np.swapaxes(by_pose, 1, 2) + of_calibrations
     size = np.linalg.norm(points, axis=1)
     ray = points / size[:, None]
     across = np.eye(3) - normals[:, :, None] * normals[:, None, :]

@@ -30,8 +30,11 @@ MAX_SIGMA_PX = 0.15
 """Along the axis of which least is known; beyond, a patch slides along an edge."""
 MAX_SIGMA_ON_LINE_PX = 0.3
 """The same where the epipolar line is known, on which alone it slides; beyond, a sweep knows the surface better."""
-GROWN_SETTLED_PX = 0.01
-"""Move of a patch's border at which it is done: a few times less than what its noise leaves open."""
+GROWN_SETTLED_PX = 0.03
+"""Move of a patch's border at which it is done: less than what interpolation leaves open (`FLOOR_PX`), and the next one
+would be several times smaller."""
+RETURN_SETTLED_PX = 0.1
+"""The same of one that grows back: a tenth of MAX_RETURN_PX."""
 MAX_TRIES = 3
 """Of a node, from different neighbours."""
 MAX_RETURN_PX = 1.0
@@ -178,11 +181,13 @@ def grow(
     step: int,
     known: LineKnowledge | None = None,
     min_correlation: float = MIN_CORRELATION,
+    settled_px: float = GROWN_SETTLED_PX,
     wanted: BoolArray | None = None,
 ) -> GrownPatches:
     """Return the pairs that grow from `seeds`, which have affinities, on a grid every `step` px of image 1.
 
-    Where only some of its nodes (R, C) are `wanted`, none grows elsewhere.
+    They are done when their borders move by less than `settled_px`. Where only some of its nodes (R, C) are `wanted`,
+    none grows elsewhere.
     """
     at = view1.nodes(step)
     rays, seen = view1.camera.unproject(at)
@@ -202,7 +207,7 @@ def grow(
         coarsest=COARSEST,
         most_move=MAX_GROWTH_MOVE_PX,
         least_correlation=min_correlation,
-        settled_px=GROWN_SETTLED_PX,
+        settled_px=settled_px,
         most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
     assert seeds.A21 is not None
@@ -238,7 +243,7 @@ def grow_both_ways(
     node = np.clip(row, 0, (height - 1) // step), np.clip(column, 0, (width - 1) // step)
     wanted = np.zeros(((height - 1) // step + 1, (width - 1) // step + 1), dtype=bool)
     wanted[node] = True
-    back = grow(view2, view1, ends, step=step, known=known.swapped(), wanted=wanted)
+    back = grow(view2, view1, ends, step=step, known=known.swapped(), settled_px=RETURN_SETTLED_PX, wanted=wanted)
     found = back.pixels2[node] + np.einsum("nij,nj->ni", back.A21[node], pixels2 - back.pixels1[node])
     keep = at.copy()
     # Where nothing grows back that distance is NaN, and no return.

@@ -82,7 +82,8 @@ def pose_with_lens_errors(
     rows_of_lenses, families = _lens_rows(matches, lenses, R, t)
     count = len(free)
     basis = translation_basis(t)
-    for _ in range(LENS_STEPS):
+    # A pose that is not free stays, and so do the weights.
+    for _ in range(LENS_STEPS if count else 1):
         basis = translation_basis(t)
         r, J = point_terms(matches, R, t, basis)
         weight = cauchy_weights(r) / overlap
