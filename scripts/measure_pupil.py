@@ -231,10 +231,11 @@ def real_pairs(folder: Path, size: str, model: str) -> None:
 
 
 def rigs(seeds: range, pupil: FloatArray, model: str) -> None:
-    """Print baselines and lenses of rigs whose pupils move, as found with them and without."""
+    """Print baselines, lenses and pupils of rigs whose pupils move, as found with them and without."""
     lenses = {"left": NearCamera.of(TRUTH, pupil), "right": NearCamera.of(TRUTH, 0.8 * pupil)}
     mounts = [Rigid3.identity(), Rigid3(exp_so3(np.array([0.02, -0.05, 0.03])), [-60.0, 2.0, 3.0])]
     found: dict[str, list[list[tuple[float, float]]]] = {"central": [], "auto": []}
+    terms: list[FloatArray] = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in lenses}
@@ -252,10 +253,15 @@ def rigs(seeds: range, pupil: FloatArray, model: str) -> None:
             off = length - float(np.linalg.norm(mounts[1].translation_mm))
             far = [far_errors(camera.calibration) for camera in rig.cameras]
             rows.append([(off, off / sigma), *((error, error / stated) for error, stated in far)])
+            for name, solved in rig.pupils.items():
+                wrong = solved.terms - lenses[name].pupil
+                terms.append(np.stack([wrong, wrong / (rig.widening * np.sqrt(np.diag(solved.covariance)))], axis=1))
             print(seed, asked, f"held-out {rig.heldout_rms_px:.3f} px", np.round(rows[-1], 3).tolist(), flush=True)
     for asked, rows in found.items():
         for k, what in enumerate(("baseline, mm", "left lens far away, px", "right lens far away, px")):
             print(f"SIMULATED rigs, {asked}, {what}: {in_words(np.array(rows)[:, k])}")
+    for k, what in enumerate(("e1, mm rad^-2", "e2, mm rad^-4")):
+        print(f"SIMULATED rigs, pupils, {what}: {in_words(np.array(terms)[:, k])}")
 
 
 def in_words(errors: FloatArray) -> str:
