@@ -45,8 +45,8 @@ EXPORT void average_amounts(
 EXPORT void ray_residuals(
     ARRAY(const double, rays, sets, count, 3), ARRAY(const double, bases, sets, count, 2, 3), int64_t sets,
     ARRAY(const double, points, count, 3), int64_t count, ARRAY(const double, rotation, poses, 3, 3),
-    ARRAY(const double, translation, poses, 3), int64_t poses, ARRAY(double, residuals, poses, count, 2),
-    ARRAY(double, jacobian, poses, count, 2, POSE));
+    ARRAY(const double, translation, poses, 3), int64_t poses, RESULT(double, residuals, poses, count, 2),
+    RESULT(double, jacobian, poses, count, 2, POSE));
 
 /* linearise.c */
 

@@ -5,7 +5,7 @@
 /* Of the opposite ray: its residual is large, and finite. */
 #define MIN_CLOSENESS 1e-9
 
-EXPORT FOR_EACH_PROCESSOR void ray_residuals(
+FOR_EACH_PROCESSOR void ray_residuals(
     const double *rays, const double *bases, int64_t sets, const double *points, int64_t count, const double *rotation,
     const double *translation, int64_t poses, double *residuals, double *jacobian)
 {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from rigkit.core.arrays import FloatArray, Mat3, Points, Rays
 from rigkit.kernels import kernels
 
@@ -13,9 +11,5 @@ def ray_residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals (K, N, 2) of points (N, 3) at poses (K, 3, 3), (K, 3), and their derivatives (K, N, 2, 6) by a
     turn and a shift, against rays (S, N, 3) with bases (S, N, 2, 3): S is K, or 1 for all poses."""
-    residuals = np.empty((len(rotation), len(points), 2))
-    jacobian = np.empty((len(rotation), len(points), 2, 6))
-    kernels().ray_residuals(
-        rays, bases, len(rays), points, len(points), rotation, translation, len(rotation), residuals, jacobian
-    )
+    residuals, jacobian = kernels().ray_residuals(rays, bases, points, rotation, translation)
     return residuals, jacobian
