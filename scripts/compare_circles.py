@@ -48,6 +48,7 @@ WORSE = (
     *(("motion", px) for px in (5.0, 10.0)),
     *(("noise", levels) for levels in (5.0, 15.0)),
     ("jpeg", 10.0),
+    ("sharpened", 3.0),
     ("glare", 200.0),
     ("vignetting", 0.1),
     *(("run over", px) for px in (1.0, 2.0, -1.0, -2.0)),
