@@ -152,7 +152,8 @@ class PairRays:
         at = self.grown.valid
         place = np.where(self.grown.swept[at], 0.0, FLOOR_PX * 2.0 ** self.grown.coarser[at])
         affinity = np.where(self.grown.swept[at], 0.0, FLOOR_PX / HALF_WIDTH)
-        return np.square(np.repeat(np.stack([place, affinity], axis=1), [2, 4], axis=1))[:, :, None] * np.eye(6)
+        sigmas = np.repeat(np.stack([place, affinity], axis=1), [2, 4], axis=1)
+        return np.asarray(sigmas[:, :, None] ** 2 * np.eye(6), np.float64)
 
     def planes(self, cam2_from_cam1: Rigid3) -> FloatArray:
         """Return m (R, C, 3) of the planes m . X = 1 that the nodes say by themselves; NaN where they say nothing."""
