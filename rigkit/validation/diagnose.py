@@ -179,7 +179,7 @@ class _SquareSizes:
 
     @property
     def no_board(self) -> bool:
-        return abs(np.log(self.aspect)) > NO_BOARD
+        return bool(abs(np.log(self.aspect)) > NO_BOARD)
 
     @property
     def stretched(self) -> bool:
