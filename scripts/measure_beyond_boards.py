@@ -36,7 +36,7 @@ BANDS = ((0.0, 0.0), (0.0, 0.06), (0.06, 0.14), (0.14, 0.25), (0.25, 0.4))
 """Distances to the cover, in parts of half the diagonal; the first is the cover itself."""
 IMAGES = 8, 14
 """So many of a set are taken for a session."""
-LEAST_CORNERS, LEAST_VIEWS, LEAST_PIXELS = 12, 4, 5
+MIN_CORNERS, MIN_VIEWS, MIN_PIXELS = 12, 4, 5
 DEFAULT = ["lab-regular", "lab-fisheye", "bouguet-left", "bouguet-right", "caliper", "camodocal", "ocam", "ov-plane"]
 DEFAULT += ["charuco-stereo-left", "charuco-stereo-right", "charuco-lifecam", "aprilgrid-mocap", "cylinder"]
 
@@ -84,7 +84,7 @@ def middle_of(views: Views, size_px: tuple[int, int], middle: tuple[float, float
         own = []
         for view in views[name]:
             inside = (((view.pixels - centre) / axes) ** 2).sum(axis=1) <= 1.0
-            if inside.sum() >= LEAST_CORNERS:
+            if inside.sum() >= MIN_CORNERS:
                 grid, pixels, sigma_px = view.grid[inside], view.pixels[inside], view.sigma_px[inside]
                 own.append(replace(view, grid=grid, pixels=pixels, sigma_px=sigma_px))
         if own:
@@ -115,7 +115,7 @@ def bands_of(
     out = {}
     for k, (low, high) in enumerate(BANDS):
         inside = known & np.isfinite(stated) & (covered if high == 0.0 else ~covered & (away > low) & (away <= high))
-        if inside.sum() >= LEAST_PIXELS:
+        if inside.sum() >= MIN_PIXELS:
             e, s = error[inside], stated[inside]
             out[k] = Band(float((e / s).mean()), float(e.mean()), float(s.mean()))
     return out
@@ -140,7 +140,7 @@ def sessions(name: str, loaded: Loaded, args: argparse.Namespace) -> list[dict[i
     for seed in range(args.first, args.first + args.sessions):
         rng = np.random.default_rng([seed, sum(map(ord, name))])
         part = middle_of(views, size, tuple(args.middle), rng)
-        if len(part) < LEAST_VIEWS:
+        if len(part) < MIN_VIEWS:
             continue
         try:
             small = calibrated(part, size, args.model)

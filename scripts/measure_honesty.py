@@ -66,10 +66,10 @@ def drawn_lens(kind: str, rng: np.random.Generator) -> Camera:
     """Return a lens whose image radius is f (theta + k theta^3 + m theta^5 + ...), its centre off the middle."""
     focal = LENSES[kind][0] * rng.uniform(0.95, 1.05)
     centre = np.array(SIZE_PX) / 2.0 + rng.normal(0.0, 8.0, 2)
-    bends = (
+    curvatures = (
         rng.normal(0.0, [0.03, 0.006, 0.0, 0.0]) if kind == "fisheye" else [-0.2 + rng.normal(0.0, 0.05), 0.05, 0, 0]
     )
-    return KannalaBrandt(SIZE_PX, np.array([focal, focal * (1.0 + rng.normal(0.0, 1e-3)), *centre, *bends]))
+    return KannalaBrandt(SIZE_PX, np.array([focal, focal * (1.0 + rng.normal(0.0, 1e-3)), *centre, *curvatures]))
 
 
 def drawn_light(rng: np.random.Generator) -> Photometry:

@@ -70,9 +70,9 @@ def patch_rules(
     half_width: int,
     *,
     coarsest: int = 0,
-    most_move: float,
-    least_correlation: float = -1.0,
-    most_sigma: float = np.inf,
+    max_move: float,
+    min_correlation: float = -1.0,
+    max_sigma: float = np.inf,
     excess_noise: float = 1.0,
     settled_px: float = PATCH_SETTLED_PX,
 ) -> PatchRules:
@@ -82,22 +82,22 @@ def patch_rules(
     ----------
     half_width : of the patch, px of the level that it is read from.
     coarsest : levels up to which a patch is aligned more coarsely where it has too little texture.
-    most_move : px of its level by which a patch may move.
-    least_correlation, most_sigma : of a good one; sigma in px of image 2, along the axis of which least is known.
+    max_move : px of its level by which a patch may move.
+    min_correlation, max_sigma : of a good one; sigma in px of image 2, along the axis of which least is known.
     excess_noise : factor of the variance that the patches show.
     settled_px : move of a patch's border at which it is done.
     """
     return PatchRules(
         half=half_width,
         coarsest=coarsest,
-        most_steps=PATCH_STEPS,
+        max_steps=PATCH_STEPS,
         width=WINDOW_OF_PATCH * half_width,
         settled=settled_px,
-        most_move=most_move,
-        least_contrast=MIN_CONTRAST,
-        least_correlation=least_correlation,
-        most_sigma=most_sigma,
-        least_noise=QUANTISATION,
+        max_move=max_move,
+        min_contrast=MIN_CONTRAST,
+        min_correlation=min_correlation,
+        max_sigma=max_sigma,
+        min_noise=QUANTISATION,
         excess_noise=excess_noise,
     )
 
@@ -118,7 +118,7 @@ def refine_patches(
     pixels1, pixels2 : (N, 2); pixels2 good to a few px.
     A21 : (N, 2, 2) good to a few tenths.
     """
-    rules = patch_rules(HALF_WIDTH_OF_FEATURE, most_move=0.5 * HALF_WIDTH_OF_FEATURE, excess_noise=EXCESS_NOISE)
+    rules = patch_rules(HALF_WIDTH_OF_FEATURE, max_move=0.5 * HALF_WIDTH_OF_FEATURE, excess_noise=EXCESS_NOISE)
     found = aligned(pyramid1, pyramid2, rules, starts_of(pixels1, pixels2, A21))
     # Detail that only the sharper image 1 shows stays in the differences, alike over a pixel of image 2.
     with np.errstate(invalid="ignore"):

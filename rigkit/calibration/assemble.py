@@ -9,7 +9,7 @@ import numpy as np
 from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.board_shape import BoardShape
 from rigkit.calibration.clustered import Clustered
-from rigkit.calibration.covariance import Carried, GlobalCovariance
+from rigkit.calibration.covariance import GlobalCovariance, PoseJacobians
 from rigkit.calibration.pupil import without_pupil
 from rigkit.calibration.result import Calibration, Candidate, Outlier, ViewResult
 from rigkit.calibration.solving.fit import Fit
@@ -75,7 +75,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
         raise not_identifiable(far_camera(fit.state.camera).model)
     prior = (fit.normal.gg - fit.data.gg)[:n, :n]
     known = GlobalCovariance.of(fit.normal, fit.data.products[0], prior, observations.clusters(), fit.sigma_px)
-    views = Carried.alone(len(observations.views))
+    views = PoseJacobians.alone(len(observations.views))
     return known.of_camera(slice(0, p), [views], fit.state.translation_mm), known.clustered
 
 

@@ -3,7 +3,7 @@
 One moment is what repeats (`clustered`): of a camera its image, of a rig its frame, whatever all cameras saw of all
 boards then. Light, a board that bends, cameras that are not quite of one moment touch all of it. The unknowns are the
 globals, but for released corners, which follow: the intrinsics and warps of the boards, in a rig also mounts and places
-of boards. Nothing here asks which it is: how views follow from poses and globals is `Carried`.
+of boards. Nothing here asks which it is: how views follow from poses and globals is `PoseJacobians`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rigkit.geometry.rotation import skew
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Carried:
+class PoseJacobians:
     """How N views of one camera, of different poses each, follow from the poses and the globals.
 
     Attributes
@@ -73,7 +73,7 @@ class GlobalCovariance:
         return self._of(self.normal.covariance[0])
 
     def of_camera(
-        self, lens: slice, parts: Sequence[Carried], translation_mm: Points, more: FloatArray | None = None
+        self, lens: slice, parts: Sequence[PoseJacobians], translation_mm: Points, more: FloatArray | None = None
     ) -> FloatArray:
         """Return the covariance (P + 6, P + 6) of the P parameters of a camera and of the mean motion (w, t) of the
         boards before it: they move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
@@ -103,7 +103,7 @@ class GlobalCovariance:
         found = self.clustered
         return with_block(unit * self.sigma_px**2, found.covariance, found.overdispersion**2)
 
-    def _mean_motion(self, parts: Sequence[Carried], translation_mm: Points) -> tuple[FloatArray, FloatArray]:
+    def _mean_motion(self, parts: Sequence[PoseJacobians], translation_mm: Points) -> tuple[FloatArray, FloatArray]:
         """Return how the mean motion of the boards follows the globals, (6, G), and the covariance of what is its own,
         (6, 6), for corners of variance one."""
         _, back, own = self.normal.covariance

@@ -179,7 +179,7 @@ class CaptureGuide:
         plan = self._planned(glance.size_px)
         target = self.asked(glance.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        worth, least_worth = self._worth(glance.view, plan, photo=photo), least_worth_of(photo=photo)
+        worth, min_worth = self._worth(glance.view, plan, photo=photo), min_worth_of(photo=photo)
         left = () if self.calibration is None else self._left_now
         would_do = bool(left) and self.has_many
         would_do = would_do and (all(own.reached for own in left) or plan.gain < WORTH_GOING_ON)
@@ -189,7 +189,7 @@ class CaptureGuide:
             words = CHECKING
         elif steady:
             words = enough_words(left, plan.gain, plan.knowledge.camera)
-        elif glance.view is not None and worth >= least_worth and glance.complaint:
+        elif glance.view is not None and worth >= min_worth and glance.complaint:
             words = glance.complaint.capitalize()
         elif would_do:
             words = f"One more, to see that it is steady: {where}"
@@ -197,7 +197,7 @@ class CaptureGuide:
             words=words,
             target_px=where.outline_px,
             worth=worth,
-            take=not glance.complaint and worth >= least_worth and steady is False,
+            take=not glance.complaint and worth >= min_worth and steady is False,
             enough=steady is True,
             waits=steady is None,
             left=left,
@@ -318,7 +318,7 @@ def enough_words(left: Sequence[Left], gain: float, camera: Camera | None = None
     return f"Enough: {said}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"
 
 
-def least_worth_of(*, photo: bool) -> float:
+def min_worth_of(*, photo: bool) -> float:
     """Return what a frame has to be worth to be taken."""
     return WORTH_OF_PHOTO if photo else WORTH_TAKING
 

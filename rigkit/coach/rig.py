@@ -23,7 +23,7 @@ from rigkit.coach.guide import (
     GuideOptions,
     enough_words,
     held_view,
-    least_worth_of,
+    min_worth_of,
 )
 from rigkit.coach.look import Glance
 from rigkit.coach.rig_whole import RigKnown, WholeRig, whole_rig
@@ -120,9 +120,9 @@ class RigGuide:
         else:
             speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
             said = self._of_mount(replace(said, speaks=speaks), glances)
-        seeing, least_worth = [g for g in glances if g.view is not None], least_worth_of(photo=photo)
+        seeing, min_worth = [g for g in glances if g.view is not None], min_worth_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
-        if said.enough or said.waits or not seeing or said.worth < least_worth:
+        if said.enough or said.waits or not seeing or said.worth < min_worth:
             return said
         return replace(said, take=not complaint, words=complaint.capitalize() or TAKING)
 
@@ -268,7 +268,7 @@ class RigGuide:
         motions = [shared.in_b.pose(k) @ shared.in_a.pose(k).inverse() for k in range(len(shared.in_a))]
         board = self.options.boards[0]
         in_a = held_boards(shared.a, board, self.options.reach)
-        in_b = in_a.carried(mean_motion(motions))
+        in_b = in_a.transformed(mean_motion(motions))
         pixels, valid = shared.b.project(in_b.in_cam(outline_mm(board)))
         both = np.all(valid & shared.b.on_image(pixels), axis=1)
         if not both.any():

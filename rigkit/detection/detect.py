@@ -66,7 +66,7 @@ def detect_boards(
         if own or (kind == Chessboard.type and (search.has_lattices or not search.boards)):
             found += finder.find(search, own)
     sizes = search.chessboard_sizes
-    if search.fewest < min_corners:
+    if search.min_corners_seen < min_corners:
         found = [item for item in found if len(item.grid) >= min_corners or _whole(item, sizes)]
     ordered = sorted(found, key=_rank) if len(found) > 1 else found
     # Grids of circles are named where they are placed, and not where a larger board may be meant.

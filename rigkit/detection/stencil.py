@@ -15,5 +15,5 @@ def by_differences(pixels: FloatArray, step: float) -> tuple[FloatArray, FloatAr
     from the `pixels` (5, M, 2) of places `step` times STENCIL away."""
     here, right, left, below, above = pixels
     sides = np.stack([right - left, below - above], axis=1) / (2.0 * step)
-    bends = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / step**2
-    return here, sides, bends
+    curvatures = np.stack([right - 2.0 * here + left, below - 2.0 * here + above], axis=1) / step**2
+    return here, sides, curvatures

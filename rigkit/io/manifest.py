@@ -86,7 +86,7 @@ DATASET_FILE = file(
                 **optional(BOARD_KEYS),
             },
             "the boards that stand there",
-            least=1,
+            min_items=1,
         ),
         "cameras": rows(
             {
@@ -97,9 +97,9 @@ DATASET_FILE = file(
                 ),
             },
             "the cameras; one that was moved is one",
-            least=1,
+            min_items=1,
         ),
-        "pairs": rows(_PAIR_KEYS, "two images of the same boards each", least=1),
+        "pairs": rows(_PAIR_KEYS, "two images of the same boards each", min_items=1),
         "images?": said(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
         "planes?": said(
             choice(*PLANE_CHOICES),

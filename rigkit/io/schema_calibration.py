@@ -144,7 +144,7 @@ RIG_FILE = file(
                 "pupil?": _PUPIL,
             },
             "the first is the rig's frame",
-            least=1,
+            min_items=1,
         ),
         "rms_px?": said(NUMBER, "training error of all cameras together"),
         "heldout_rms_px?": said(nullable(NUMBER), "of frames that took no part, one pose for all cameras"),

@@ -37,14 +37,14 @@ def nullable(schema: Schema) -> Schema:
     return {ANY_OF: [schema, {"type": "null"}]}
 
 
-def array(items: Schema, least: int = 0) -> Schema:
+def array(items: Schema, min_items: int = 0) -> Schema:
     """Return the schema of a list of at least so many."""
-    return {"type": "array", "items": items, **({"minItems": least} if least else {})}
+    return {"type": "array", "items": items, **({"minItems": min_items} if min_items else {})}
 
 
-def texts(least: int = 0, items: Schema = TEXT) -> Schema:
+def texts(min_items: int = 0, items: Schema = TEXT) -> Schema:
     """Return the schema of a list of at least so many words, all different."""
-    return {**array(items, least), "uniqueItems": True}
+    return {**array(items, min_items), "uniqueItems": True}
 
 
 def row(length: int, items: Schema = NUMBER) -> Schema:
@@ -73,9 +73,9 @@ def optional(keys: Mapping[str, Schema], *names: str) -> dict[str, Schema]:
     return {f"{key.removesuffix('?')}?" if not names or key in names else key: schema for key, schema in keys.items()}
 
 
-def rows(keys: Mapping[str, Schema], words: str = "", *, least: int = 0) -> Schema:
+def rows(keys: Mapping[str, Schema], words: str = "", *, min_items: int = 0) -> Schema:
     """Return the schema of a list of at least so many objects."""
-    out = array(obj(keys), least)
+    out = array(obj(keys), min_items)
     return said(out, words) if words else out
 
 

@@ -73,7 +73,7 @@ SESSION_FILE = file(
         "rig?": said(
             TEXT, "file of a rig whose cameras stay as they are, lens and mount: others are added to it", "rig.json"
         ),
-        "cameras?": rows(_CAMERA_KEYS, "several cameras, instead of images; the first is the rig's frame", least=2),
+        "cameras?": rows(_CAMERA_KEYS, "several cameras, instead of images; the first is the rig's frame", min_items=2),
         "baselines?": said(
             array(between("mm", "a camera", "left", "right")),
             "what a person measured between two lenses: judged, not used",

@@ -11,11 +11,11 @@ enum { LAG = 2, ACROSS_LAGS = 2 * LAG + 1, LAGS = LAG * ACROSS_LAGS + LAG + 1, O
 
 /* The constants of detection.subpixel.edge_model and detection.subpixel.edge_fit, under their names there. */
 typedef struct {
-    double reach, end_sigmas, paper_sigmas, least_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
-    double least_blur, most_blur, angle_sigma, log_blur_sigma, light_sigma;
-    double most_move_px, most_turn, most_blur_change, most_light_change;
-    double least_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, most_mirrored, radius_px;
-    int64_t iterations, mirrored, fewest_mirrored;
+    double reach, end_sigmas, paper_sigmas, min_reach, near_sigmas, near_px, tail_sigmas, pixel_kurtosis, sharp_blur;
+    double min_blur, max_blur, angle_sigma, log_blur_sigma, light_sigma;
+    double max_move_px, max_turn, max_blur_change, max_light_change;
+    double min_variance, ridge, converged_px, blur_lag, valid_move_px, valid_move_cells, max_mirrored, radius_px;
+    int64_t iterations, mirrored, min_mirrored;
 } edge_rules_t;
 
 EXPORT int64_t edges_scratch(const edge_rules_t *rules);
@@ -38,7 +38,7 @@ typedef struct {
 
 /* The constants of detection.subpixel.correlation, under their names there. */
 typedef struct {
-    double light_share, lost_error, least_left, covered_times, least_factor, least_alike, uneven_times, least_blur, radius_px;
+    double light_share, lost_error, min_left, covered_times, min_factor, min_alike, uneven_times, min_blur, radius_px;
 } factor_rules_t;
 
 EXPORT void sigma_factors(
@@ -52,18 +52,18 @@ EXPORT void uneven_factors(
     ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
     int64_t boards, ARRAY(const double, usual, boards), const factor_rules_t *rules, RESULT(double, out, count));
 
-/* bends.c */
+/* curvatures.c */
 
 /* The constants of detection.subpixel.edge_curvature. */
 typedef struct {
-    double decay, least_sigma, free, bent;
+    double decay, min_sigma, free, bent;
     int64_t reach;
-} bend_rules_t;
+} curvature_rules_t;
 
-EXPORT void line_bends(
+EXPORT void line_curvatures(
     ARRAY(const double, pixels, rows, columns, 2), ARRAY(const double, sigma, rows, columns),
     ARRAY(const uint8_t, wanted, rows, columns), int64_t rows, int64_t columns, int64_t count,
-    ARRAY(const double, sides, count, 2), const bend_rules_t *rules, RESULT(double, out, count, 2),
+    ARRAY(const double, sides, count, 2), const curvature_rules_t *rules, RESULT(double, out, count, 2),
     RESULT(double, out_sigma, count, 2));
 
 /* paper.c */
@@ -104,13 +104,13 @@ EXPORT double fit_perspective(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, RESULT(double, out, 3, 3));
 EXPORT int64_t fit_polynomials(
     ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
-    double most_leverage, SCRATCH(double, basis, terms, count), SCRATCH(double, scratch, FIT_SCRATCH, count),
+    double max_leverage, SCRATCH(double, basis, terms, count), SCRATCH(double, scratch, FIT_SCRATCH, count),
     RESULT(double, unit, 3), ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2),
     RESULT(double, misses, SURFACE_DEGREE + 1), RESULT(double, off, count), RESULT(double, gain, count),
     RESULT(double, scatter, 1));
 EXPORT int64_t fit_map(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, int64_t terms,
-    double most_leverage, double nearest, SCRATCH(double, rest, count, 2), SCRATCH(double, basis, terms, count),
+    double max_leverage, double nearest, SCRATCH(double, rest, count, 2), SCRATCH(double, basis, terms, count),
     SCRATCH(double, scratch, FIT_SCRATCH, count), RESULT(double, homography, 3, 3), RESULT(double, unit, 3),
     ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2), RESULT(double, misses, SURFACE_DEGREE + 1),
     RESULT(double, off, count), RESULT(double, gain, count), RESULT(double, scatter, 1));
@@ -143,11 +143,11 @@ enum {
 typedef struct {
     const edge_rules_t *first, *last, *rough;
     const tag_window_t *window;
-    double points_a_term, most_leverage, nearest_depth, hardly_more, median_of_rayleigh;
-    double first_blur, few_corners, least_contrast, rough_px, better_known, bent_sigmas, wide_blur, most_gain, margin_px;
-    double moved_cells, added_contrast, added_residual, most_sigma_cells, narrow_blurs, code_contrast, likeness;
+    double points_a_term, max_leverage, nearest_depth, hardly_more, median_of_rayleigh;
+    double first_blur, few_corners, min_contrast, rough_px, better_known, bent_sigmas, wide_blur, max_gain, margin_px;
+    double moved_cells, added_contrast, added_residual, max_sigma_cells, narrow_blurs, code_contrast, likeness;
     double scatter_floor, outlier, judging_gain, displaced_cells;
-    int64_t fewest_foretelling, fewest_guiding;
+    int64_t min_foretelling, min_guiding;
 } tag_corner_rules_t;
 
 /* detection.tags.placing.TagBoard, its corners row by row; whether squares join its tags; the border in sides of a tag. */
@@ -224,8 +224,8 @@ enum { TAG_OUTCOMES = 16, TAG_TERMS = 10, TAG_SIDE = 4, TAG_BLOCK = 80 };
 
 /* The constants of detection.tags.whole, under their names there. */
 typedef struct {
-    double tail_sigmas, pixel_kurtosis, sharp_blur, least_blur, most_blur, most_move_px, most_blur_change, light_sigma;
-    double least_variance, converged_px, most_taken;
+    double tail_sigmas, pixel_kurtosis, sharp_blur, min_blur, max_blur, max_move_px, max_blur_change, light_sigma;
+    double min_variance, converged_px, max_taken;
     int64_t iterations;
 } tag_rules_t;
 
@@ -233,7 +233,7 @@ EXPORT void fit_tags(
     IMAGE(grey), int64_t count, ARRAY(const double, maps, count, 2, TAG_TERMS), ARRAY(const double, centres, count, 2),
     ARRAY(const double, scales, count), ARRAY(const uint8_t, ink, count, cells, cells), int64_t cells,
     ARRAY(const double, breaks, cells - 1), double reach, ARRAY(const double, blur, count),
-    ARRAY(const double, contrast, count), ARRAY(const double, bend_sigma, count), const tag_rules_t *rules, int64_t most,
+    ARRAY(const double, contrast, count), ARRAY(const double, curvature_sigma, count), const tag_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, most, TAG_BLOCK), RESULT(double, out, count, TAG_OUTCOMES));
 
 /* boards.c */
@@ -285,14 +285,14 @@ enum { CIRCLE_OUTCOMES = 26, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
 typedef struct {
-    double near_sigmas, near_px, least_blur, most_blur, most_move_px, most_growth, most_light, converged_px,
+    double near_sigmas, near_px, min_blur, max_blur, max_move_px, max_growth, max_light, converged_px,
         converged_sigmas, near_beside;
-    int64_t iterations, plain_iterations, fewest;
+    int64_t iterations, plain_iterations, min_pixels;
 } circle_rules_t;
 
 EXPORT void fit_circles(
     IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2),
-    ARRAY(const double, bends, count, 2, 3), ARRAY(const double, blur, count), ARRAY(const double, reach, count),
+    ARRAY(const double, curvatures, count, 2, 3), ARRAY(const double, blur, count), ARRAY(const double, reach, count),
     ARRAY(const int64_t, beside, count, BESIDE), const circle_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, SPOT, most), RESULT(double, out, count, CIRCLE_OUTCOMES));
 
@@ -305,19 +305,19 @@ enum { LIGHT_OUTCOMES = 8, LIGHT_UNKNOWNS = 11, LIGHT_ASIDE = 11, LIGHT_BLOCK = 
 
 /* The constants of detection.subpixel.shadows, under their names there. */
 typedef struct {
-    double radius_px, reach_cells, least_left, most_left, most_light, fewest;
-    double line_sigma, log_edge_sigma, log_width_sigma, first_width, least_width, most_width;
+    double radius_px, reach_cells, min_left, max_left, max_light, min_pixels;
+    double line_sigma, log_edge_sigma, log_width_sigma, first_width, min_width, max_width;
     int64_t angles, iterations;
 } light_rules_t;
 
 EXPORT void lit_unevenly(
     IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, aside, count), ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts,
-    double most_aside, double least_px, double uneven, RESULT(truth_t, out, count));
+    double max_aside, double min_px, double uneven, RESULT(truth_t, out, count));
 EXPORT void fit_light_steps(
     IMAGE(grey), int64_t count, ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, curvature, count, 2), ARRAY(const double, aside, count), double blur,
-    ARRAY(const double, most_step, LIGHT_UNKNOWNS), const light_rules_t *rules, int64_t most,
+    ARRAY(const double, max_step, LIGHT_UNKNOWNS), const light_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, 4, most), RESULT(double, out, count, LIGHT_OUTCOMES));
 
 #endif

@@ -29,7 +29,7 @@ EXPORT void shrink_bytes(
  * (detection.saddles.response). */
 typedef struct {
     ARRAY(const float, kernel, 5);
-    double whole, extreme, least_span, noise_factor, floor, ceiling;
+    double whole, extreme, min_span, noise_factor, floor, ceiling;
 } level_rules_t;
 
 /* Pixels that the tests of a row are made for at a time: the results stay in registers and the first cache. Each such
@@ -69,12 +69,12 @@ typedef struct {
     ARRAY(const float, circle, TURN, 2);
     ARRAY(const double, gains, gain_count);
     int64_t gain_count;
-    double most_odd, most_centre, even_odd, even_centre, most_cosine, quick_odd, quick_centre, quick_even, quick_sharp;
+    double max_odd, max_centre, even_odd, even_centre, max_cosine, quick_odd, quick_centre, quick_even, quick_sharp;
 } ring_rules_t;
 
 EXPORT int64_t find_corners(
     ARRAY(const float, smooth, height, width), int64_t width, int64_t height, ARRAY(const int32_t, peaks, count, 2),
-    ARRAY(const float, response, count), int64_t count, double radius, double most_step, double most_sharp,
+    ARRAY(const float, response, count), int64_t count, double radius, double max_step, double max_sharp,
     const ring_rules_t *rules, double scale, double offset, ARRAY(const double, known, known_count, 2), int64_t known_count,
     double reach, RESULT(double, saddles, count, 2), RESULT(double, pixels, count, 2), RESULT(double, angles, count, 2),
     RESULT(double, contrast, count), RESULT(truth_t, smeared, count), RESULT(truth_t, repeated, count),
@@ -87,9 +87,9 @@ EXPORT int64_t mark_known(
 
 /* The constants of detection.lattice.links. */
 typedef struct {
-    int64_t neighbours, places, most;
+    int64_t neighbours, places, min_places;
     ARRAY(const double, along, places);
-    double arm_cosine, contrast_ratio, length_ratio, aside, least_aside;
+    double arm_cosine, contrast_ratio, length_ratio, aside, min_aside;
 } link_rules_t;
 
 /* The corners and the level that their edges are read from. */
@@ -97,8 +97,8 @@ typedef struct {
     ARRAY(const double, pixels, count, 2);
     ARRAY(const double, lines, count, 2, 2);
     ARRAY(const double, contrast, count);
-    ARRAY(const double, least, count);
-    ARRAY(const double, most, count);
+    ARRAY(const double, min_contrast, count);
+    ARRAY(const double, max_contrast, count);
     ARRAY(const double, reach, count);
     int64_t count;
 } corners_t;
@@ -122,8 +122,8 @@ typedef struct {
     fit_rules_t predictions[2];
     const ring_rules_t *ring;
     ARRAY(const double, along, places);
-    int64_t places, most, tried, fewest;
-    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, least_area;
+    int64_t places, min_places, tried, min_foretelling;
+    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, min_area;
 } growth_rules_t;
 
 /* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */
@@ -173,7 +173,7 @@ EXPORT int64_t find_components(
 /* The constants of detection.subpixel.scatter. */
 typedef struct {
     double unexplained, median_of_normal, min_term;
-    int64_t fewest_corners, fewest_differences, first_order, last_order, degrees[2];
+    int64_t min_corners, min_differences, first_order, last_order, degrees[2];
 } scatter_rules_t;
 
 EXPORT void uneven_steps(
@@ -181,7 +181,7 @@ EXPORT void uneven_steps(
     SCRATCH(double, scratch, 2 * rows * columns), int64_t inner, RESULT(double, typical, inner),
     RESULT(int64_t, seen, inner), RESULT(double, every, 2));
 EXPORT void line_gaps(
-    ARRAY(const double, sides, count, 2, 2), ARRAY(const double, bends, count, 2, 2), int64_t count,
+    ARRAY(const double, sides, count, 2, 2), ARRAY(const double, curvatures, count, 2, 2), int64_t count,
     RESULT(double, out, count, 2, 2));
 EXPORT void excess_scatter(
     ARRAY(const double, pixels, height, width, 2), ARRAY(const double, sigma, height, width), int64_t height, int64_t width,

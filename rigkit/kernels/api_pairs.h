@@ -26,7 +26,7 @@ EXPORT void qualities_ahead(
 EXPORT void improve(
     ARRAY(const double, packed, 18, count), int64_t count, ARRAY(double, R, hypotheses, 3, 3),
     ARRAY(double, t, hypotheses, 3), double noise, int64_t hypotheses, ARRAY(const int64_t, free, freedom), int64_t freedom,
-    int64_t most_steps, double settled);
+    int64_t max_steps, double settled);
 
 /* pose_minimum.c */
 
@@ -40,7 +40,7 @@ typedef struct {
     ARRAY(const double, point_weights, count);
     ARRAY(const int64_t, which, chosen);
     ARRAY(const int64_t, free, freedom);
-    int64_t count, chosen, freedom, loss, most_iterations;
+    int64_t count, chosen, freedom, loss, max_iterations;
     double scale, tolerance;
 } pose_problem_t;
 
@@ -65,15 +65,15 @@ typedef struct {
 /* The constants of affine.refine_patches; `half` is the half side of the patch, its window a Gaussian of `width`, both in
  * samples. */
 typedef struct {
-    int64_t half, coarsest, most_steps;
-    double width, settled, most_move, least_contrast, least_correlation, most_sigma, least_noise, excess_noise;
+    int64_t half, coarsest, max_steps;
+    double width, settled, max_move, min_contrast, min_correlation, max_sigma, min_noise, excess_noise;
 } patch_rules_t;
 
 /* The rays of image 2 every `spacing` pixels, and how well the pairs agree with E21: an infinite sigma is no knowledge. */
 typedef struct {
     ARRAY(const double, rays2, rows, columns, 3);
     int64_t rows, columns;
-    double spacing, E21[9], sigma, sigma_A, most_distance;
+    double spacing, E21[9], sigma, sigma_A, max_distance;
 } epipolar_t;
 
 /* The nodes that patches grow over: node (r, c) is the pixel `step` * (c, r) of image 1. */
@@ -83,7 +83,7 @@ typedef struct {
     ARRAY(double, out, rows, columns, PATCH_COLUMNS);
     SCRATCH(uint8_t, tries, rows, columns);
     SCRATCH(int32_t, heap, rows, columns);
-    int64_t rows, columns, step, most_tries;
+    int64_t rows, columns, step, max_tries;
 } patch_grid_t;
 
 EXPORT void align_patches(

@@ -9,9 +9,9 @@
 /* Steps are taken no shorter or longer than this. */
 static const double SHORTEST = 0.3, LONGEST = 4.0;
 
-/* Gather the pixels near the edge and within `reach` radii, at most `most`. */
+/* Gather the pixels near the edge and within `reach` radii, at most `capacity`. */
 INLINE void gather(
-    const circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t most,
+    const circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t capacity,
     spots_t *spots)
 {
     const double bend_u = fabs(at->H[0]) + fabs(at->H[1]) + fabs(at->H[2]);
@@ -39,7 +39,7 @@ INLINE void gather(
             }
             place(at, du, dv, &here);
             for (int64_t k = 0; k < BLOCK && u + k <= right; k++) {
-                if (here.r[k] > reach || fabs(here.d[k]) > band || here.r[k] * at->size < NO_DIRECTION || spots->count == most)
+                if (here.r[k] > reach || fabs(here.d[k]) > band || here.r[k] * at->size < NO_DIRECTION || spots->count == capacity)
                     continue;
                 const int64_t from = v * width + u + k, to = spots->count++;
                 spots->u[to] = (double)(u + k);
@@ -101,8 +101,8 @@ INLINE double relaxed(double times, double moves, double along, double before)
 /* Let the map grow by the symmetric matrix of `step`. */
 INLINE void grow(circle_t *at, const double step[PARAMETERS], const circle_rules_t *rules)
 {
-    const double e1 = limited(step[E1], rules->most_growth), e2 = limited(step[E2], rules->most_growth);
-    const double e3 = limited(step[E3], rules->most_growth);
+    const double e1 = limited(step[E1], rules->max_growth), e2 = limited(step[E2], rules->max_growth);
+    const double e3 = limited(step[E3], rules->max_growth);
     const double m0 = at->M[0], m1 = at->M[1], m2 = at->M[2], m3 = at->M[3];
     at->M[0] = m0 * (1.0 + e1 + e2) + m1 * e3;
     at->M[1] = m0 * e3 + m1 * (1.0 + e1 - e2);
@@ -114,14 +114,14 @@ INLINE void grow(circle_t *at, const double step[PARAMETERS], const circle_rules
 static int moved(group_t *group, const double step[PARAMETERS], const circle_rules_t *rules)
 {
     circle_t *at = &group->own;
-    at->c[0] += limited(step[X], rules->most_move_px);
-    at->c[1] += limited(step[Y], rules->most_move_px);
+    at->c[0] += limited(step[X], rules->max_move_px);
+    at->c[1] += limited(step[Y], rules->max_move_px);
     at->s += limited(step[S], 0.5 * at->s);
-    at->s = at->s < rules->least_blur ? rules->least_blur : at->s > rules->most_blur ? rules->most_blur : at->s;
+    at->s = at->s < rules->min_blur ? rules->min_blur : at->s > rules->max_blur ? rules->max_blur : at->s;
     at->a += step[A];
     at->b += step[B];
-    at->g[0] = limited(at->g[0] + step[GX], rules->most_light);
-    at->g[1] = limited(at->g[1] + step[GY], rules->most_light);
+    at->g[0] = limited(at->g[0] + step[GX], rules->max_light);
+    at->g[1] = limited(at->g[1] + step[GY], rules->max_light);
     grow(at, step, rules);
     int fine = inverted(at);
     for (int j = 0; j < group->count && fine; j++) {
@@ -230,15 +230,15 @@ static void write_circle(const circle_t *at, const double *N, double squares, in
 
 /* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
 static group_t grouped(
-    int64_t n, const double *pixels, const double *maps, const double *bends, const double *blur, const int64_t *beside,
+    int64_t n, const double *pixels, const double *maps, const double *curvatures, const double *blur, const int64_t *beside,
     const circle_rules_t *rules)
 {
-    group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, bends + 6 * n, blur[n])};
+    group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, curvatures + 6 * n, blur[n])};
     for (int k = 0; k < BESIDE; k++) {
         const int64_t j = beside[BESIDE * n + k];
         if (j < 0)
             continue;
-        circle_t other = guessed(pixels + 2 * j, maps + 4 * j, bends + 6 * j, blur[n]);
+        circle_t other = guessed(pixels + 2 * j, maps + 4 * j, curvatures + 6 * j, blur[n]);
         /* Both are as wide as the larger of their sides on the way from one to the other; half of what is left is its own. */
         const double u = other.c[0] - group.own.c[0], v = other.c[1] - group.own.c[1], apart = hypot(u, v);
         const double *M = other.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
@@ -251,21 +251,21 @@ static group_t grouped(
 FOR_EACH_PROCESSOR
 void fit_circles(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *maps,
-    const double *bends, const double *blur, const double *reach, const int64_t *beside, const circle_rules_t *rules, int64_t most,
+    const double *curvatures, const double *blur, const double *reach, const int64_t *beside, const circle_rules_t *rules, int64_t capacity,
     double *scratch, double *out)
 {
-    spots_t spots = {.u = scratch, .v = scratch + most, .value = scratch + 2 * most};
+    spots_t spots = {.u = scratch, .v = scratch + capacity, .value = scratch + 2 * capacity};
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * CIRCLE_OUTCOMES;
         memset(result, 0, CIRCLE_OUTCOMES * sizeof(double));
-        group_t group = grouped(n, pixels, maps, bends, blur, beside, rules);
+        group_t group = grouped(n, pixels, maps, curvatures, blur, beside, rules);
         circle_t *at = &group.own;
         const double band = rules->near_sigmas * at->s + rules->near_px;
         if (!inverted(at))
             continue;
-        gather(at, grey, bytes, width, height, reach[n], band, most, &spots);
+        gather(at, grey, bytes, width, height, reach[n], band, capacity, &spots);
         double N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
-        if (!(spots.count >= rules->fewest) || !set_brightness(at, &spots))
+        if (!(spots.count >= rules->min_pixels) || !set_brightness(at, &spots))
             continue;
         double before[PARAMETERS] = {0.0}, times = 1.0, moved_before = 0.0;
         int solved = 1, settled = 0, still = 0;
@@ -273,7 +273,7 @@ void fit_circles(
             const double variance = linearise(&group, &spots, N, right) / (double)(spots.count - PARAMETERS);
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
-            if (at->s <= rules->least_blur && right[S] < 0.0)
+            if (at->s <= rules->min_blur && right[S] < 0.0)
                 leave(N, right, S);
             solved = cholesky(N, PARAMETERS);
             if (!solved)

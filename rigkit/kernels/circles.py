@@ -21,13 +21,13 @@ def fit_circles(
     image: GreyImage,
     pixels: FloatArray,
     maps: FloatArray,
-    bends: FloatArray,
+    curvatures: FloatArray,
     blur: FloatArray,
     reach: FloatArray,
     beside: IntArray,
-    most: int,
+    capacity: int,
     rules: CircleRules,
 ) -> FloatArray:
-    """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `most` : pixels of
-    the largest window."""
-    return np.asarray(kernels().fit_circles(image, pixels, maps, bends, blur, reach, beside, rules, most))
+    """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `capacity` is how
+    many pixels the largest window has."""
+    return np.asarray(kernels().fit_circles(image, pixels, maps, curvatures, blur, reach, beside, rules, capacity))

@@ -65,15 +65,15 @@ FOR_EACH_PROCESSOR void read_modules(
 }
 
 /* Set `best` to the code that each tag is most like, the first of several, and `likeness` to their correlation; both 0 where the
- * modules differ by less than `least`. `bright` (count, side, side) is scratch. */
+ * modules differ by less than `min_contrast`. `bright` (count, side, side) is scratch. */
 FOR_EACH_PROCESSOR void read_codes(
     const void *grey, int64_t bytes, int64_t width, int64_t height, const double *quads, int64_t count, int64_t side,
-    const double *patterns, int64_t codes, double least, double *bright, int64_t *best, double *likeness)
+    const double *patterns, int64_t codes, double min_contrast, double *bright, int64_t *best, double *likeness)
 {
     const int64_t modules = side * side, last = codes - 1;
     for (int64_t n = 0; n < count; n++) {
         best[n] = 0;
-        likeness[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= least ? -INFINITY : 0.0;
+        likeness[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? -INFINITY : 0.0;
     }
     /* Four codes at once, as the sum of one waits for itself, with all tags: the codes of a board are more than the first cache. */
     for (int64_t c = 0; c < codes; c += 4) {

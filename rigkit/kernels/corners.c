@@ -3,7 +3,7 @@
 #include "rings.h"
 
 /* reference.front.saddle_step for one pixel; whether it is a saddle and near. */
-INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double most_step, double pixel[2])
+INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v, double max_step, double pixel[2])
 {
     const float *at = smooth + v * width + u;
     const double here = at[0], left = at[-1], right = at[1], above = at[-width], below = at[width];
@@ -16,7 +16,7 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
     const double inverse = 1.0 / det, step_u = (uv * gv - vv * gu) * inverse, step_v = (uv * gu - uu * gv) * inverse;
     pixel[0] = (double)u + step_u;
     pixel[1] = (double)v + step_v;
-    return fabs(step_u) <= most_step && fabs(step_v) <= most_step;
+    return fabs(step_u) <= max_step && fabs(step_v) <= max_step;
 }
 
 /* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
@@ -36,9 +36,9 @@ INLINE int may_be_corner(
     for (int64_t k = 0; k < PAIRS; k++)
         energy += (even[k] - mean) * (even[k] - mean);
     const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)PAIRS;
-    const double most_centre = odd_energy < (float)rules->even_odd * energy ? rules->quick_even : rules->quick_centre;
+    const double max_centre = odd_energy < (float)rules->even_odd * energy ? rules->quick_even : rules->quick_centre;
     return odd_energy < (float)rules->quick_odd * energy &&
-           centre * centre < (float)(most_centre * most_centre) * variance &&
+           centre * centre < (float)(max_centre * max_centre) * variance &&
            response < (float)rules->quick_sharp * variance;
 }
 
@@ -53,11 +53,11 @@ INLINE void fetch_ring(const image_t image, int64_t u, int64_t v, int64_t reach)
 
 /* Which of the `count` peaks of a level, of that response, are corners (reference.front.corners): `saddles` gets the saddles next to
  * them, in pixels of the full image (`scale`, `offset`), `pixels`, `angles` and `contrast` those that are corners: their ring is valid
- * and they are no sharper than `most_sharp`; `smeared` says which of these only motion explains. Sets `found` to how many saddles
+ * and they are no sharper than `max_sharp`; `smeared` says which of these only motion explains. Sets `found` to how many saddles
  * and corners there are. */
 static FOR_EACH_PROCESSOR void read_peaks(
-    const image_t image, const int32_t *peaks, const float *response, int64_t count, double radius, double most_step,
-    double most_sharp, const ring_rules_t *rules, double scale, double offset, double *saddles, double *pixels, double *angles,
+    const image_t image, const int32_t *peaks, const float *response, int64_t count, double radius, double max_step,
+    double max_sharp, const ring_rules_t *rules, double scale, double offset, double *saddles, double *pixels, double *angles,
     double *contrast, uint8_t *smeared, int64_t *found)
 {
     enum { AHEAD = 6 };
@@ -67,7 +67,7 @@ static FOR_EACH_PROCESSOR void read_peaks(
         if (k + AHEAD < count)
             fetch_ring(image, peaks[2 * (k + AHEAD)], peaks[2 * (k + AHEAD) + 1], reach);
         double pixel[2];
-        if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], most_step, pixel))
+        if (!saddle_near(image.brightness, image.width, peaks[2 * k], peaks[2 * k + 1], max_step, pixel))
             continue;
         double *saddle = saddles + 2 * near++;
         saddle[0] = scale * pixel[0] + offset;
@@ -75,7 +75,7 @@ static FOR_EACH_PROCESSOR void read_peaks(
         if (!may_be_corner(image, rules, (float)pixel[0], (float)pixel[1], (float)radius, response[k]))
             continue;
         const int ring = read_ring(
-            image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / most_sharp),
+            image, *rules, (float)pixel[0], (float)pixel[1], (float)radius, sqrt((double)response[k] / max_sharp),
             angles + 2 * corners, contrast + corners);
         smeared[corners] = ring == 2;
         pixels[2 * corners] = saddle[0];
@@ -89,13 +89,13 @@ static FOR_EACH_PROCESSOR void read_peaks(
 /* The same; `repeated` says which corners lie within `reach` of one of `known`. Returns 0 without memory. */
 int64_t find_corners(
     const float *smooth, int64_t width, int64_t height, const int32_t *peaks, const float *response, int64_t count, double radius,
-    double most_step, double most_sharp, const ring_rules_t *rules, double scale, double offset, const double *known,
+    double max_step, double max_sharp, const ring_rules_t *rules, double scale, double offset, const double *known,
     int64_t known_count, double reach, double *saddles, double *pixels, double *angles, double *contrast, uint8_t *smeared,
     uint8_t *repeated, int64_t *found)
 {
     const image_t image = {smooth, width, height};
     read_peaks(
-        image, peaks, response, count, radius, most_step, most_sharp, rules, scale, offset, saddles, pixels, angles, contrast,
+        image, peaks, response, count, radius, max_step, max_sharp, rules, scale, offset, saddles, pixels, angles, contrast,
         smeared, found);
     memset(repeated, 0, (size_t)found[1]);
     return known_count == 0 || mark_known(pixels, found[1], known, known_count, reach, repeated);

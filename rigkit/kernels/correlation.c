@@ -112,7 +112,7 @@ static double factor_of(const known_t *mean, double count, const factor_rules_t 
 {
     double rows[LAGS], columns[LAGS], influence[LAGS], weight[LAGS], matrix[LAGS][LAGS], pairs[LAGS], change[LAGS];
     set_lags(rows, columns);
-    const double blur = mean->blur > rules->least_blur ? mean->blur : rules->least_blur;
+    const double blur = mean->blur > rules->min_blur ? mean->blur : rules->min_blur;
     const double lost = set_influence(mean->sides, blur, rows, columns, rules, influence);
     for (int k = 0; k < LAGS; k++) {
         pairs[k] = mean->pairs[k] > 1.0 ? mean->pairs[k] : 1.0;
@@ -122,7 +122,7 @@ static double factor_of(const known_t *mean, double count, const factor_rules_t 
     set_blended(mean->blend, matrix);
     solve_transposed(matrix, weight);
     const double share = lost / (mean->used > 1.0 ? mean->used : 1.0);
-    const double left = 1.0 - share > rules->least_left ? 1.0 - share : rules->least_left;
+    const double left = 1.0 - share > rules->min_left ? 1.0 - share : rules->min_left;
     double excess = 0.0, chance = 0.0;
     for (int k = 0; k < LAGS; k++)
         excess += weight[k] * change[k];
@@ -134,7 +134,7 @@ static double factor_of(const known_t *mean, double count, const factor_rules_t 
     /* What is not known of `left` goes with the quotient: small windows, of which the fit takes most, say nothing. */
     const double unsure = (1.0 + excess) * rules->lost_error * share / left, squared = excess * excess;
     const double sure = 1.0 - (chance + unsure * unsure) / (squared > 1e-12 ? squared : 1e-12);
-    const double times = 1.0 + (sure > 0.0 ? sure : 0.0) * excess, least = rules->least_factor * rules->least_factor;
+    const double times = 1.0 + (sure > 0.0 ? sure : 0.0) * excess, least = rules->min_factor * rules->min_factor;
     return sqrt(times > least ? times : least);
 }
 
@@ -207,7 +207,7 @@ void uneven_factors(
         double alike = 0.0;
         for (int k = 1; k < LAGS; k++)
             alike += own_products[k] / (own_pairs[k] > 1.0 ? own_pairs[k] : 1.0);
-        if (!(alike / (double)(LAGS - 1) > rules->least_alike * board * board * noise[i] * noise[i]))
+        if (!(alike / (double)(LAGS - 1) > rules->min_alike * board * board * noise[i] * noise[i]))
             continue;
         known_t known;
         memset(&known, 0, sizeof known);

@@ -95,11 +95,11 @@ static double clipped(double value, double low, double high)
 static void move(double *values, const double *step, int n, const edge_rules_t *rules)
 {
     const double limits[PARAMETERS] = {
-        rules->most_move_px, rules->most_move_px, rules->most_turn, rules->most_turn, rules->most_blur_change * values[S],
-        INFINITY, INFINITY, rules->most_light_change, rules->most_light_change, INFINITY, INFINITY};
+        rules->max_move_px, rules->max_move_px, rules->max_turn, rules->max_turn, rules->max_blur_change * values[S],
+        INFINITY, INFINITY, rules->max_light_change, rules->max_light_change, INFINITY, INFINITY};
     for (int k = 0; k < n; k++)
         values[k] += clipped(step[k], -limits[k], limits[k]);
-    values[S] = clipped(values[S], rules->least_blur, rules->most_blur);
+    values[S] = clipped(values[S], rules->min_blur, rules->max_blur);
 }
 
 /* What is known of a corner's parameters before its pixels are looked at: one over the variances of the first `count`. */
@@ -148,7 +148,7 @@ FOR_EACH_PROCESSOR static void descend(
         else
             (n == FEWER ? normal_equations : all_normal_equations)(values, window, at, rules, products);
         double variance = products[n * ROWS + n] / (double)(more > 1 ? more : 1);
-        variance = variance > rules->least_variance ? variance : rules->least_variance;
+        variance = variance > rules->min_variance ? variance : rules->min_variance;
         out->variance = variance;
         double step[PARAMETERS];
         for (int k = 0; k < n; k++) {
@@ -193,12 +193,12 @@ FOR_EACH_PROCESSOR static void fit_corner(
     memset(out + OUTCOMES - 2 * LAGS, 0, 2 * LAGS * sizeof(double));
     if (rules->mirrored && more > 0) {
         variance = leave_residuals(window, found.last, prior.count) / (double)more;
-        variance = variance > rules->least_variance ? variance : rules->least_variance;
+        variance = variance > rules->min_variance ? variance : rules->min_variance;
         const double mean = unmirrored(values, window, prior.count, rules);
         noise = mean < 0.0 ? variance : mean * (double)window->count / (double)more;
-        if (mean >= 0.0 && noise > rules->least_variance)
+        if (mean >= 0.0 && noise > rules->min_variance)
             lag_products(window, values[Y], out + OUTCOMES - 2 * LAGS);
-        noise = noise > rules->least_variance ? noise : rules->least_variance;
+        noise = noise > rules->min_variance ? noise : rules->min_variance;
     }
     const double spread = found.solved
         ? 0.5 * noise * (inverse_at(found.products, X, prior.count) + inverse_at(found.products, Y, prior.count)) : NAN;
@@ -217,7 +217,7 @@ FOR_EACH_PROCESSOR static void fit_corner(
 /* Side of the square that holds the window and, around it, nothing where mirror images may fall. */
 static int64_t across_square(const edge_rules_t *rules)
 {
-    return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->most_mirrored) + LANES) + 1;
+    return 2 * ((int64_t)floor(rules->radius_px) + (int64_t)ceil(2.0 * rules->max_mirrored) + LANES) + 1;
 }
 
 static int64_t room_of_window(double radius_px)
@@ -279,7 +279,7 @@ static void fit_tag_corner(
     static const double none[4] = {0.0}, unknown[4] = {NAN, NAN, NAN, NAN};
     static const uint8_t inside[4] = {0};
     const double *high = seen + HEIGHTS, border = tag->border * (high[0] < high[1] ? high[0] : high[1]);
-    const double expected = clipped(blur, rules->least_blur, rules->most_blur);
+    const double expected = clipped(blur, rules->min_blur, rules->max_blur);
     const double narrow = (border - tag->blurs * blur - rules->near_px) / rules->near_sigmas;
     double gaps[4], reach[4];
     for (int k = 0; k < 4; k++) {
@@ -287,7 +287,7 @@ static void fit_tag_corner(
         reach[k] = 0.5 * step[k] < rules->reach ? 0.5 * step[k] : rules->reach;
     }
     const geometry_t at = {seen + SIDES, seen + CURVATURE, none, gaps, none, reach, unknown, single, inside};
-    collect_window(window, image, pixel, at, clipped(narrow, rules->least_blur, expected), rules);
+    collect_window(window, image, pixel, at, clipped(narrow, rules->min_blur, expected), rules);
     fit_corner(window, pixel, at, sign, expected, contrast, rules, out);
 }
 

@@ -1,5 +1,5 @@
-"""The kernels in edges.c, correlation.c and bends.c: the fit of the edge model to corners, what their noise shares, and
-how the lines of a lattice bend."""
+"""The kernels in edges.c, correlation.c and curvatures.c: the fit of the edge model to corners, what their noise
+shares, and how the lines of a lattice bend."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class FactorRules(Struct):
     """The constants of `detection.subpixel.correlation`."""
 
 
-@structure("bend_rules_t")
-class BendRules(Struct):
+@structure("curvature_rules_t")
+class CurvatureRules(Struct):
     """The constants of `detection.subpixel.edge_curvature`."""
 
 
@@ -97,12 +97,12 @@ def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRule
     return np.asarray(kernels().uneven_factors(*corners, usual, rules))
 
 
-def line_bends(
-    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
+def line_curvatures(
+    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: CurvatureRules
 ) -> tuple[FloatArray, FloatArray]:
     """Return what `detection.subpixel.edge_curvature.line_curvature` does."""
     count = len(sides_px)
     if np.count_nonzero(cells) != count:
         raise ValueError(f"line_bends: {count} sides for {np.count_nonzero(cells)} cells")
-    bends: tuple[FloatArray, FloatArray] = kernels().line_bends(pixels, sigma_px, cells, sides_px, rules)
-    return bends
+    curvatures: tuple[FloatArray, FloatArray] = kernels().line_curvatures(pixels, sigma_px, cells, sides_px, rules)
+    return curvatures

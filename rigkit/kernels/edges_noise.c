@@ -31,7 +31,7 @@ double leave_residuals(window_t *window, const double *step, int parameters)
 FOR_EACH_PROCESSOR
 double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules)
 {
-    if (fabs(values[X]) > rules->most_mirrored || fabs(values[Y]) > rules->most_mirrored)
+    if (fabs(values[X]) > rules->max_mirrored || fabs(values[Y]) > rules->max_mirrored)
         return -1.0;
     /* What is left as a picture, and turned by half a turn: then mirror images are read in the order of the pixels. */
     const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;
@@ -82,7 +82,7 @@ double unmirrored(const double *values, window_t *window, int parameters, const 
         count += pairs[lane];
     }
     const double spread = 1.0 + (double)(w00 * w00 + w10 * w10 + w01 * w01 + w11 * w11);
-    return count >= rules->fewest_mirrored ? sum / (double)count / spread : -1.0;
+    return count >= rules->min_mirrored ? sum / (double)count / spread : -1.0;
 }
 
 /* Set `out` to the sums of the products of what mirroring changes at two pixels that are one of LAGS apart, and behind them

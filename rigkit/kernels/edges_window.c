@@ -81,7 +81,7 @@ INLINE double reach_to(const geometry_t at, int k, double blur, double across, c
     if (!at.ends[k])
         return rules->reach;
     const double sigmas = isfinite(at.paper[k]) ? rules->paper_sigmas : rules->end_sigmas;
-    const double far = at.gaps[k] - sigmas * blur, least = rules->least_reach * at.gaps[k];
+    const double far = at.gaps[k] - sigmas * blur, least = rules->min_reach * at.gaps[k];
     const double left = (far > least ? far : least) / across;
     return left < rules->reach ? left : rules->reach;
 }

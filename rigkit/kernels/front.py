@@ -176,8 +176,10 @@ def links(
     `lines` (N, 2, 2) are the unit vectors of A and B, `bounds` the contrasts (N,) of those looked at, `reach` (N,) the
     largest distance of the places that are looked at from the edge.
     """
-    least, most = bounds
-    given = _CornerArrays.of(pixels=pixels, lines=lines, contrast=contrast, least=least, most=most, reach=reach)
+    min_contrast, max_contrast = bounds
+    given = _CornerArrays.of(
+        pixels=pixels, lines=lines, contrast=contrast, min_contrast=min_contrast, max_contrast=max_contrast, reach=reach
+    )
     done, both = kernels().find_links(given, ImageOf.of(brightness=image), scale, offset, rules)
     if not done:
         raise MemoryError

@@ -6,7 +6,7 @@
 enum { MAX_TERMS = 10, MAX_DEGREE = 3, MAX_RADIUS = 3, MAX_TRIED = 16 };
 
 /* The smallest pull on any term: no pivot of the exact normal equations is smaller, whatever rounding makes of it. */
-static const double LEAST_PULL = 1e-12;
+static const double MIN_PULL = 1e-12;
 static const double LINEAR_PULL = 1e-9;
 
 /* A cell's polynomial: see LocalFit. */
@@ -18,7 +18,7 @@ typedef struct {
 INLINE void solve(double matrix[MAX_TERMS][MAX_TERMS], double right[MAX_TERMS][3], const int n)
 {
     for (int k = 0; k < n; k++) {
-        const double pivot = matrix[k][k] > LEAST_PULL ? matrix[k][k] : LEAST_PULL;
+        const double pivot = matrix[k][k] > MIN_PULL ? matrix[k][k] : MIN_PULL;
         const double inverse = 1.0 / pivot;
         for (int i = k + 1; i < n; i++) {
             const double factor = matrix[k][i] * inverse;
@@ -134,10 +134,10 @@ INLINE void fit_polynomial(
         .high_c = column + radius < columns - 1 ? column + radius : columns - 1};
     for (int64_t r = at.low_r; r <= at.high_r; r++)
         add_row(lattice, columns, r, degree, rules, bell, &at);
-    const double total = at.moment[0][0] > LEAST_PULL ? at.moment[0][0] : LEAST_PULL;
+    const double total = at.moment[0][0] > MIN_PULL ? at.moment[0][0] : MIN_PULL;
     const double centre_u = at.position[0][0] / total, centre_v = at.position[0][1] / total;
     double normal[MAX_TERMS][MAX_TERMS], solved[MAX_TERMS][3];
-    const double pull[MAX_DEGREE + 1] = {LEAST_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
+    const double pull[MAX_DEGREE + 1] = {MIN_PULL, LINEAR_PULL, rules->ridge[0], rules->ridge[1]};
     for (int k = 0; k < terms; k++) {
         for (int j = k; j < terms; j++)
             normal[k][j] = at.moment[POWER_C[k] + POWER_C[j]][POWER_R[k] + POWER_R[j]];
@@ -272,7 +272,7 @@ INLINE int fits(
         double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
         aside = aside > rules->min_aside ? aside : rules->min_aside;
         aside = aside < rules->max_aside ? aside : rules->max_aside;
-        if (!edge_seen(level->image, rules->along, rules->places, rules->most, u, v, end_u, end_v, side, aside, weakest))
+        if (!edge_seen(level->image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, side, aside, weakest))
             return 0;
     }
     return 1;
@@ -285,7 +285,7 @@ INLINE int try_cell(
 {
     fit_t fit;
     fit_cell(sheet->pixels, sheet->rows, sheet->columns, row, column, prediction, bell, &fit);
-    if (fit.support < (double)rules->fewest)
+    if (fit.support < (double)rules->min_foretelling)
         return 0;
     const double place_u = (fit.pixel[0] - level->offset) / level->scale;
     const double place_v = (fit.pixel[1] - level->offset) / level->scale;
@@ -295,7 +295,7 @@ INLINE int try_cell(
     const double *a = fit.along_column, *b = fit.along_row;
     const double side_a = sqrt(a[0] * a[0] + a[1] * a[1]), side_b = sqrt(b[0] * b[0] + b[1] * b[1]);
     const double longest = side_a > side_b ? side_a : side_b, area = a[0] * b[1] - a[1] * b[0];
-    if (!(area > rules->least_area))
+    if (!(area > rules->min_area))
         return 0;
     int64_t near[MAX_TRIED];
     double off[MAX_TRIED];

@@ -32,11 +32,11 @@
 INLINE float brightness_at(const image_t image, float u, float v)
 {
     const int32_t width = (int32_t)image.width;
-    const float most_u = (float)(image.width - 1), most_v = (float)(image.height - 1);
+    const float max_u = (float)(image.width - 1), max_v = (float)(image.height - 1);
     u = u > 0.0f ? u : 0.0f;
     v = v > 0.0f ? v : 0.0f;
-    u = u < most_u ? u : most_u;
-    v = v < most_v ? v : most_v;
+    u = u < max_u ? u : max_u;
+    v = v < max_v ? v : max_v;
     int32_t left = (int32_t)u, top = (int32_t)v;
     left = left < width - 2 ? left : width - 2;
     top = top < (int32_t)image.height - 2 ? top : (int32_t)image.height - 2;
@@ -79,7 +79,7 @@ INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int6
  * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
  * (reference.links.edge_contrast). */
 INLINE int edge_seen(
-    const image_t image, const double *along, int64_t places, int64_t most, double u, double v, double end_u,
+    const image_t image, const double *along, int64_t places, int64_t min_places, double u, double v, double end_u,
     double end_v, double sign, double offset, double weakest)
 {
     const double chord_u = end_u - u, chord_v = end_v - v;
@@ -88,13 +88,13 @@ INLINE int edge_seen(
     const double aside_u = -sign * offset * chord_v / length, aside_v = sign * offset * chord_u / length;
     /* Clutter is told from an edge by the first places. */
     int64_t unseen = 0;
-    for (int64_t k = 0; k < places && unseen <= places - most; k++) {
+    for (int64_t k = 0; k < places && unseen <= places - min_places; k++) {
         const double at_u = u + along[k] * chord_u, at_v = v + along[k] * chord_v;
         const float bright = brightness_at(image, (float)(at_u + aside_u), (float)(at_v + aside_v));
         const float dark = brightness_at(image, (float)(at_u - aside_u), (float)(at_v - aside_v));
         unseen += !((double)(bright - dark) > weakest);
     }
-    return unseen <= places - most;
+    return unseen <= places - min_places;
 }
 
 /* At most so many squares for so many points: smaller ones leave more of them to look into, larger ones more points that

@@ -45,12 +45,12 @@ void uneven_steps(
 
 /* Set `out` to how far the neighbouring column and row lines lie from those through `count` cells, before and after, from first
  * and second derivatives along columns and rows (detection.lattice.local_fit.LocalFit.gaps). */
-void line_gaps(const double *sides, const double *bends, int64_t count, double *out)
+void line_gaps(const double *sides, const double *curvatures, int64_t count, double *out)
 {
-    for (int64_t i = 0; i < count; i++, sides += 4, bends += 4, out += 4) {
+    for (int64_t i = 0; i < count; i++, sides += 4, curvatures += 4, out += 4) {
         const double area = sides[0] * sides[3] - sides[1] * sides[2];
-        const double row = 0.5 * (sides[0] * bends[3] - sides[1] * bends[2]);
-        const double column = 0.5 * (bends[0] * sides[3] - bends[1] * sides[2]);
+        const double row = 0.5 * (sides[0] * curvatures[3] - sides[1] * curvatures[2]);
+        const double column = 0.5 * (curvatures[0] * sides[3] - curvatures[1] * sides[2]);
         const double along = hypot(sides[0], sides[1]), down = hypot(sides[2], sides[3]);
         out[0] = fabs(area - row) / along;
         out[1] = fabs(area + row) / along;
@@ -94,7 +94,7 @@ static double roughness(const part_t part, int64_t order, const scatter_rules_t 
                 }
             }
     }
-    return count >= rules->fewest_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
+    return count >= rules->min_differences ? quick_median(part.room, count) / rules->median_of_normal : NAN;
 }
 
 /* Return how many differences of the first order rows and columns have, both coordinates. */
@@ -141,7 +141,7 @@ void surface_scatter(
     int64_t count = 0, found = 0;
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY}, middle[2] = {0.0, 0.0};
     out[0] = out[1] = NAN;
-    if (difference_count(pixels, rows, columns, rules->first_order) >= rules->fewest_differences)
+    if (difference_count(pixels, rows, columns, rules->first_order) >= rules->min_differences)
         return;
     for (int64_t i = 0; i < size; i++) {
         if (!isfinite(pixels[2 * i]) || !isfinite(sigma[i]))
@@ -186,7 +186,7 @@ void surface_scatter(
         }
         const double free = (double)(count - found);
         for (int k = 0; k < 2; k++)
-            if (degree == rules->degrees[k] && 2.0 * free >= (double)rules->fewest_differences)
+            if (degree == rules->degrees[k] && 2.0 * free >= (double)rules->min_differences)
                 out[k] = sqrt((product(places[0], places[0], count) + product(places[1], places[1], count)) / (2.0 * free));
     }
 }
@@ -286,7 +286,7 @@ void excess_scatter(
             part.variance[i] = sigma[cell] * sigma[cell];
             known += isfinite(pixels[2 * cell]) != 0;
         }
-        double calmest = known < rules->fewest_corners ? 1.0 : INFINITY;
+        double calmest = known < rules->min_corners ? 1.0 : INFINITY;
         for (int flat = 0; flat < 2; flat++)
             for (int64_t order = rules->first_order; order <= rules->last_order && calmest > rules->unexplained; order++) {
                 if (flat && order == rules->first_order)

@@ -34,9 +34,9 @@ def uneven_steps(pixels: FloatArray) -> tuple[list[float], list[int], tuple[floa
     return typical.tolist(), seen.tolist(), (along_rows, along_columns)
 
 
-def line_gaps(sides: FloatArray, bends: FloatArray) -> FloatArray:
-    """Return what `detection.lattice.local_fit.LocalFit.gaps` does of its `sides` and `bends`, (M, 2, 2)."""
-    return np.asarray(kernels().line_gaps(sides, bends))
+def line_gaps(sides: FloatArray, curvatures: FloatArray) -> FloatArray:
+    """Return what `detection.lattice.local_fit.LocalFit.gaps` does of its `sides` and `curvatures`, (M, 2, 2)."""
+    return np.asarray(kernels().line_gaps(sides, curvatures))
 
 
 def excess_scatter(

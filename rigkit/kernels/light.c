@@ -117,12 +117,12 @@ INLINE int seek_step(const lit_t *lit, const light_rules_t *rules, double x[UNKN
         for (int place = 0; place < PLACES; place++) {
             for (int j = 0; j < SUMS; j++)
                 dark[j] = sums[STRIPS - 1][j] - sums[place][j];
-            if (!(sums[place][ONE] > rules->fewest && dark[ONE] > rules->fewest))
+            if (!(sums[place][ONE] > rules->min_pixels && dark[ONE] > rules->min_pixels))
                 continue;
             const plain_t here = plain_of(sums[place]), beyond = plain_of(dark);
             const double square = here.level * here.level + here.contrast * here.contrast;
             const double left = (here.level * beyond.level + here.contrast * beyond.contrast) / (square > 1e-9 ? square : 1e-9);
-            if (!(left > rules->least_left && left < rules->most_left) || !(here.squares + beyond.squares < best))
+            if (!(left > rules->min_left && left < rules->max_left) || !(here.squares + beyond.squares < best))
                 continue;
             best = here.squares + beyond.squares;
             x[TOWARDS] = angle;
@@ -265,7 +265,7 @@ INLINE double with_known(
 
 /* Fit corner and step together from `x`; return the variance of a pixel, and in `N` the factor of the equations, or -1. */
 INLINE double fit_together(
-    const lit_t *lit, const double bend[2], const light_rules_t *rules, const double *most_step, double x[UNKNOWNS],
+    const lit_t *lit, const double bend[2], const light_rules_t *rules, const double *max_step, double x[UNKNOWNS],
     double N[UNKNOWNS * UNKNOWNS])
 {
     double start[UNKNOWNS], damping = DAMPING;
@@ -283,11 +283,11 @@ INLINE double fit_together(
             continue;
         cholesky_solve(all.N, UNKNOWNS, all.right);
         for (int i = 0; i < UNKNOWNS; i++)
-            tried[i] = x[i] + limited(all.right[i], most_step[i]);
-        const double least = log(rules->least_width), most = log(rules->most_width);
+            tried[i] = x[i] + limited(all.right[i], max_step[i]);
+        const double least = log(rules->min_width), most = log(rules->max_width);
         tried[WIDTH] = tried[WIDTH] < least ? least : tried[WIDTH] > most ? most : tried[WIDTH];
-        tried[LEFT] = tried[LEFT] < 0.5 * rules->least_left ? 0.5 * rules->least_left : tried[LEFT];
-        tried[LEFT] = tried[LEFT] > rules->most_light ? rules->most_light : tried[LEFT];
+        tried[LEFT] = tried[LEFT] < 0.5 * rules->min_left ? 0.5 * rules->min_left : tried[LEFT];
+        tried[LEFT] = tried[LEFT] > rules->max_light ? rules->max_light : tried[LEFT];
         linearise(lit, tried, bend, &fresh);
         if (!(fresh.squares < now.squares))
             continue;
@@ -332,18 +332,18 @@ static int uneven_at(
 
 void lit_unevenly(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double most_aside, double least_px,
+    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_aside, double min_px,
     double uneven, uint8_t *out)
 {
     for (int64_t n = 0; n < count; n++) {
         const double *side = sides + 4 * n, length[2] = {hypot(side[0], side[1]), hypot(side[2], side[3])};
         double off[2], nearest = INFINITY;
         for (int line = 0; line < 2; line++) {
-            off[line] = fmin(most_aside, aside[n] / fmax(length[line], 1e-9));
+            off[line] = fmin(max_aside, aside[n] / fmax(length[line], 1e-9));
             nearest = fmin(nearest, off[line] * length[line]);
         }
         /* Where the board may end, only the nearest places are looked at. */
-        out[n] = nearest > least_px && uneven_at(
+        out[n] = nearest > min_px && uneven_at(
             grey, bytes, width, height, pixels + 2 * n, side, along, ends[n] ? 1 : parts, off, uneven);
     }
 }
@@ -351,7 +351,7 @@ void lit_unevenly(
 FOR_EACH_PROCESSOR
 void fit_light_steps(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *start, const double *sides,
-    const double *curvature, const double *aside, double blur, const double *most_step, const light_rules_t *rules,
+    const double *curvature, const double *aside, double blur, const double *max_step, const light_rules_t *rules,
     int64_t most, double *scratch, double *out)
 {
     lit_t lit = {.u = scratch, .v = scratch + most, .value = scratch + 2 * most, .pattern = scratch + 3 * most};
@@ -370,7 +370,7 @@ void fit_light_steps(
         x[T2] = atan2(side[3], side[2]);
         x[S] = log(blur);
         x[WIDTH] = log(rules->first_width);
-        const double variance = fit_together(&lit, curvature + 2 * n, rules, most_step, x, N);
+        const double variance = fit_together(&lit, curvature + 2 * n, rules, max_step, x, N);
         if (!(variance > 0.0))
             continue;
         double spread = 0.0;

@@ -27,13 +27,13 @@ def fit_light_steps(
     curvature: FloatArray,
     aside: FloatArray,
     blur: float,
-    most_step: FloatArray,
+    max_step: FloatArray,
     rules: LightRules,
 ) -> FloatArray:
     """Return the outcomes of N corners, (N, 8). Arguments as `detection.subpixel.shadows.light_steps`; what a step
-    of the fit changes is `most_step` (11,) at most."""
-    most = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
-    return np.asarray(kernels().fit_light_steps(image, start, sides, curvature, aside, blur, most_step, rules, most))
+    of the fit changes is `max_step` (11,) at most."""
+    capacity = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
+    return np.asarray(kernels().fit_light_steps(image, start, sides, curvature, aside, blur, max_step, rules, capacity))
 
 
 def lit_unevenly(
@@ -43,15 +43,15 @@ def lit_unevenly(
     aside: FloatArray,
     ends: BoolArray,
     along: FloatArray,
-    most_aside: float,
-    least_px: float,
+    max_aside: float,
+    min_px: float,
     uneven: float,
 ) -> BoolArray:
     """Return which of N corners are lit unevenly, as `detection.subpixel.shadows.beside_shadows`.
 
     The last four are its constants.
     """
-    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, most_aside, least_px, uneven))
+    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, max_aside, min_px, uneven))
 
 
 @structure("paper_rules_t")

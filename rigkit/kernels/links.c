@@ -29,7 +29,7 @@ typedef struct {
 /* The corner whose neighbours are looked for, and the bounds of their contrast. */
 typedef struct {
     double u, v;
-    float lines[4], contrast, least, most, ratio, square_of_cosine;
+    float lines[4], contrast, min_contrast, max_contrast, ratio, square_of_cosine;
 } home_t;
 
 /* Look at the places `from` to `to` - 1 and append them to the `count` near ones; return how many there are then. */
@@ -53,7 +53,7 @@ INLINE int64_t look_at(
             const float home_a = u * a_u[k] + v * a_v[k], home_b = u * b_u[k] + v * b_v[k];
             const float along = a * a > b * b ? a * a : b * b;
             const float back = home_a * home_a > home_b * home_b ? home_a * home_a : home_b * home_b;
-            const int32_t alike = (theirs[k] > home->least) & (theirs[k] < home->most);
+            const int32_t alike = (theirs[k] > home->min_contrast) & (theirs[k] < home->max_contrast);
             square[k] = alike ? here : INFINITY;
             place[k] = (int32_t)first + k;
             meets[k] = alike & (along > cosine * here) & (back > cosine * here) &
@@ -129,11 +129,11 @@ INLINE int link_seen(
     const double end_v = (corners->pixels[2 * j + 1] - offset) / scale;
     double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
     const double most = corners->reach[i];
-    aside = aside > rules->least_aside ? aside : rules->least_aside;
+    aside = aside > rules->min_aside ? aside : rules->min_aside;
     aside = aside < most ? aside : most;
     const double there = corners->contrast[j], here = corners->contrast[i];
     const double weakest = rules->contrast_ratio * (there < here ? there : here);
-    return edge_seen(image, rules->along, rules->places, rules->most, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0,
+    return edge_seen(image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0,
                      aside, weakest);
 }
 
@@ -149,7 +149,7 @@ INLINE void link_arms(
     const home_t home = {places->u[place], places->v[place],
                          {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place],
                           places->columns[B_V][place]},
-                         places->columns[CONTRAST][place], (float)corners->least[i], (float)corners->most[i],
+                         places->columns[CONTRAST][place], (float)corners->min_contrast[i], (float)corners->max_contrast[i],
                          (float)rules->contrast_ratio, (float)(rules->arm_cosine * rules->arm_cosine)};
     const int64_t count = gather(squares, places, &home, wanted, near);
     int64_t listed = 0;

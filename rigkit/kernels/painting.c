@@ -286,7 +286,7 @@ EXPORT int64_t tile_cover(const tile_t *tile, const surface_t *surface)
     for (int n = 0; n < TILE_NODES * TILE_NODES; n++) {
         const double *ray = tile->nodes + 3 * n, *matrix = surface->plane_from_ray;
         const double depth = matrix[6] * ray[0] + matrix[7] * ray[1] + matrix[8] * ray[2];
-        if (!(depth > LEAST_DEPTH))
+        if (!(depth > MIN_DEPTH))
             continue;
         in_front++;
         for (int k = 0; k < 2; k++) {

@@ -55,14 +55,14 @@ INLINE int try_node(
         for (int64_t k = 0; k < 2; k++)
             line.by_pixel[n][k] = E[0] * by[k] + E[1] * by[2 + k] + E[2] * by[4 + k];
     }
-    const int knows = isfinite(epipolar->sigma), gated = isfinite(epipolar->most_distance);
+    const int knows = isfinite(epipolar->sigma), gated = isfinite(epipolar->max_distance);
     double found[PATCH_COLUMNS], n2[2], distance, off[2];
     grid->tries[node]++;
-    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->most_distance + rules->most_move))
+    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->max_distance + rules->max_move))
         return 0;
     if (!align_pair(first, second, rules, knows ? &line : NULL, patch, place, found))
         return 0;
-    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->most_distance))
+    if (gated && !(miss(&line, place, n2, &distance, off) && fabs(distance) < epipolar->max_distance))
         return 0;
     memcpy(grid->out + PATCH_COLUMNS * node, found, sizeof found);
     return 1;
@@ -110,7 +110,7 @@ FOR_EACH_PROCESSOR int64_t grow_patches(
             const int64_t next = (row + dv) * grid->columns + column + du;
             if (row + dv < 0 || row + dv >= grid->rows || column + du < 0 || column + du >= grid->columns)
                 continue;
-            if (grid->tries[next] >= grid->most_tries || isfinite(grid->out[PATCH_COLUMNS * next]))
+            if (grid->tries[next] >= grid->max_tries || isfinite(grid->out[PATCH_COLUMNS * next]))
                 continue;
             const double u = step * (double)du, v = step * (double)dv;
             place_t place = {

@@ -56,7 +56,7 @@ INLINE void six_products(float rows[UNKNOWNS][MAX_SAMPLES], const float *with, i
 }
 
 /* Read the patch around (u, v) of `image`; return 0 where it has too little contrast or reaches beyond the image. */
-INLINE int take_patch(const image_t image, double u, double v, double least_contrast, patch_t *p)
+INLINE int take_patch(const image_t image, double u, double v, double min_contrast, patch_t *p)
 {
     const int64_t half = p->half, side = 2 * half + 1, wide = side + 2, count = p->count;
     if (!is_inside(image, u - (double)half - 1.0, v - (double)half - 1.0, 0.0) ||
@@ -82,7 +82,7 @@ INLINE int take_patch(const image_t image, double u, double v, double least_cont
         p->weighted[k] = p->window[k] * p->values[k];
     }
     p->energy = product(p->values, p->weighted, count);
-    if (!(p->energy > least_contrast * least_contrast * p->total))
+    if (!(p->energy > min_contrast * min_contrast * p->total))
         return 0;
     for (int64_t k = 0; k < count; k++) {
         p->steep[0][k] = gradient_u[k] * p->u[k];
@@ -232,7 +232,7 @@ INLINE int align_patch(
     const double half = (double)p->half, u0 = place->u2, v0 = place->v2;
     double step[UNKNOWNS], matrix[UNKNOWNS][UNKNOWNS];
     int fixed = 0;
-    for (int64_t k = 0; k <= rules->most_steps; k++) {
+    for (int64_t k = 0; k <= rules->max_steps; k++) {
         if (!read_there(p, image2, scale1, scale2, place))
             return 0;
         double sums[UNKNOWNS];
@@ -243,7 +243,7 @@ INLINE int align_patch(
         out->correlation = common / sqrt(p->energy * energy);
         /* What the patches differ by, beyond gain and offset, a sample; the unknowns and those two are fitted. */
         out->noise = p->energy * (1.0 - out->correlation * out->correlation) / p->total;
-        out->noise = out->noise * p->effective / (p->effective - UNKNOWNS - 2.0) + rules->least_noise * rules->least_noise;
+        out->noise = out->noise * p->effective / (p->effective - UNKNOWNS - 2.0) + rules->min_noise * rules->min_noise;
         const double gain = p->energy / common;
         for (int64_t n = 0; n < UNKNOWNS; n++)
             step[n] = gain * sums[n];
@@ -260,7 +260,7 @@ INLINE int align_patch(
         if (!move_place(place, step, scale1))
             return 0;
         const double away_u = (place->u2 - u0) / scale2, away_v = (place->v2 - v0) / scale2;
-        if (!(away_u * away_u + away_v * away_v < rules->most_move * rules->most_move))
+        if (!(away_u * away_u + away_v * away_v < rules->max_move * rules->max_move))
             return 0;
         double border = fabs(step[4]) + fabs(step[5]);
         for (int64_t n = 0; n < 4; n++)
@@ -339,12 +339,12 @@ FOR_EACH_PROCESSOR int align_pair(
         const double scale1 = ldexp(1.0, (int)(level1 + k)), scale2 = ldexp(1.0, (int)(level2 + k));
         agreement_t found;
         *place = start;
-        if (!take_patch(first->levels[level1 + k], start.u1 / scale1, start.v1 / scale1, rules->least_contrast, patch))
+        if (!take_patch(first->levels[level1 + k], start.u1 / scale1, start.v1 / scale1, rules->min_contrast, patch))
             continue;
         if (!align_patch(patch, second->levels[level2 + k], scale1, scale2, rules, line, place, &found))
             continue;
         const double sigma = covariance_of(place, scale1, &found, rules, out + 9);
-        if (!(sigma >= 0.0 && sigma < rules->most_sigma))
+        if (!(sigma >= 0.0 && sigma < rules->max_sigma))
             continue;
         out[0] = place->u2;
         out[1] = place->v2;
@@ -352,7 +352,7 @@ FOR_EACH_PROCESSOR int align_pair(
         out[6] = found.correlation;
         out[7] = found.noise;
         out[8] = (double)k;
-        return found.correlation >= rules->least_correlation;
+        return found.correlation >= rules->min_correlation;
     }
     return 0;
 }

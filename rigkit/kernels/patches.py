@@ -43,7 +43,7 @@ class EpipolarKnowledge(Struct):
 
     @classmethod
     def make(
-        cls, rays2: FloatArray, spacing: float, E21: Mat3, *, sigma: float, sigma_A: float, most_distance: float
+        cls, rays2: FloatArray, spacing: float, E21: Mat3, *, sigma: float, sigma_A: float, max_distance: float
     ) -> EpipolarKnowledge:
         """Return it for the rays (R, C, 3) at the pixels `spacing` * (column, row), NaN where there is none."""
         return cls.of(
@@ -52,7 +52,7 @@ class EpipolarKnowledge(Struct):
             E21=tuple(E21.reshape(9)),
             sigma=sigma,
             sigma_A=sigma_A,
-            most_distance=most_distance,
+            max_distance=max_distance,
         )
 
 
@@ -103,11 +103,11 @@ def grown(
     rays1: FloatArray,
     jacobians1: FloatArray,
     step: int,
-    most_tries: int,
+    max_tries: int,
     seeds: FloatArray,
 ) -> PatchTable:
     """Return the patches (R * C,) grown from `seeds` (S, 8) over the nodes of rays (R, C, 3), `step` pixels apart."""
     out = np.empty((*rays1.shape[:2], PATCH_COLUMNS))
-    grid = _Grid.of(rays1=rays1, jacobians1=jacobians1, out=out, step=step, most_tries=most_tries)
+    grid = _Grid.of(rays1=rays1, jacobians1=jacobians1, out=out, step=step, max_tries=max_tries)
     kernels().grow_patches(first, second, epipolar, rules, grid, seeds)
     return _table(out.reshape(-1, PATCH_COLUMNS))

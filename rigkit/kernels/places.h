@@ -9,7 +9,7 @@
 /* Depth ratio over a tile above which x and y are interpolated themselves: the error is below 6 ** -TILE_NODES = 1e-7. */
 #define SMOOTH_DEPTH_RATIO 0.5
 /* Least depth of what is in front. */
-#define LEAST_DEPTH 1e-9
+#define MIN_DEPTH 1e-9
 /* A cell's side, in squares or panel sides: shorter is none; longer, the plane is seen edge on and differences mean nothing. */
 #define MIN_CELL 1e-6f
 #define MAX_CELL 2.0f
@@ -79,7 +79,7 @@ INLINE void set_row(
             return;
     }
     for (int64_t n = 0; n < count; n++) {
-        const int front = depth[n] > LEAST_DEPTH;
+        const int front = depth[n] > MIN_DEPTH;
         const double over = 1.0 / (front ? depth[n] : 1.0);
         x[n] = front ? x[n] * over : FAR_SQUARES;
         y[n] = front ? y[n] * over : FAR_SQUARES;

@@ -40,11 +40,11 @@ def qualities_ahead(packed: FloatArray, R: FloatArray, t: FloatArray, noise: flo
 
 
 def improve(
-    packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, free: IntArray, most_steps: int, settled_rad: float
+    packed: FloatArray, R: FloatArray, t: FloatArray, noise: float, free: IntArray, max_steps: int, settled_rad: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rotations (H, 3, 3) and directions (H, 3) of best quality at a noise level near those given."""
     R, t = np.array(R, np.float64, order="C"), np.array(t, np.float64, order="C")
-    kernels().improve(packed, R, t, noise, free, most_steps, settled_rad)
+    kernels().improve(packed, R, t, noise, free, max_steps, settled_rad)
     return R, t
 
 
@@ -57,7 +57,7 @@ def minimise(
     free: IntArray,
     R: FloatArray,
     t: FloatArray,
-    most_iterations: int,
+    max_iterations: int,
     tolerance: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, int, bool]:
     """Return R, t, residuals (M,), Jacobian (M, 5), weights (M,), iterations, and whether the last step was small.
@@ -72,7 +72,7 @@ def minimise(
         which=which,
         free=free,
         loss=loss[0],
-        most_iterations=most_iterations,
+        max_iterations=max_iterations,
         scale=loss[1],
         tolerance=tolerance,
     )

@@ -163,7 +163,7 @@ FOR_EACH_PROCESSOR int64_t minimise(const pose_problem_t *p, double *R, double *
     add_rows(weights, here.r, here.J, rows, rows, &normal);
     int converged = p->freedom == 0;
     int64_t iterations = 0;
-    while (!converged && iterations < p->most_iterations) {
+    while (!converged && iterations < p->max_iterations) {
         iterations++;
         if (!damped_step(&normal, damping, p->free, p->freedom, step))
             break;

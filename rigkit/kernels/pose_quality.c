@@ -138,7 +138,7 @@ INLINE double sum_up(const double *packed, int64_t count, level_t level, const p
 /* SampsonRows.improved: R (hypotheses, 9) and t (hypotheses, 3) move to the best quality at `noise`. */
 FOR_EACH_PROCESSOR void improve(
     const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses,
-    const int64_t *free, int64_t freedom, int64_t most_steps, double settled)
+    const int64_t *free, int64_t freedom, int64_t max_steps, double settled)
 {
     const level_t level = level_of(noise);
     for (int64_t h = 0; h < hypotheses; h++) {
@@ -149,7 +149,7 @@ FOR_EACH_PROCESSOR void improve(
         memcpy(pose.t, t + 3 * h, sizeof pose.t);
         fill_basis(&pose);
         double quality = sum_up(packed, count, level, &pose, &normal);
-        for (int64_t k = 0; k < most_steps && damping < 1e8; k++) {
+        for (int64_t k = 0; k < max_steps && damping < 1e8; k++) {
             if (!damped_step(&normal, damping, free, freedom, step))
                 break;
             const pose_t there = moved(&pose, step);

@@ -38,8 +38,8 @@ INLINE void ring_angles(
     const double gain = rules->gains[at] + (place - (double)at) * (rules->gains[at + 1] - rules->gains[at]);
     const double twice_u = phase_u * phase_u - phase_v * phase_v, twice_v = 2.0 * phase_u * phase_v;
     double cosine = gain * (fourth_u * twice_u + fourth_v * twice_v) / size;
-    cosine = cosine < rules->most_cosine ? cosine : rules->most_cosine;
-    cosine = cosine > -rules->most_cosine ? cosine : -rules->most_cosine;
+    cosine = cosine < rules->max_cosine ? cosine : rules->max_cosine;
+    cosine = cosine > -rules->max_cosine ? cosine : -rules->max_cosine;
     const double quadrant = acos(cosine), first = -0.5 * (atan2(phase_v, phase_u) + quadrant);
     angles[0] = first < 0.0 ? first + PI : first;
     angles[1] = angles[0] + quadrant;
@@ -52,10 +52,10 @@ INLINE void sample_ring(
     float right[TURN], below[TURN];
     int32_t at[TURN];
     const int32_t width = (int32_t)image.width, right_most = width - 2, low_most = (int32_t)image.height - 2;
-    const float most_u = (float)(width - 1), most_v = (float)(image.height - 1);
+    const float max_u = (float)(width - 1), max_v = (float)(image.height - 1);
     /* A pixel more than the ring needs: circles of float32 are a little rounder or less. */
     const float margin = radius + 1.0f;
-    const int inside = u > margin && v > margin && u < most_u - margin && v < most_v - margin;
+    const int inside = u > margin && v > margin && u < max_u - margin && v < max_v - margin;
     for (int64_t k = 0; inside && k < TURN / apart; k++) {
         const float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
         const int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
@@ -67,8 +67,8 @@ INLINE void sample_ring(
         float sample_u = u + radius * circle[2 * apart * k], sample_v = v + radius * circle[2 * apart * k + 1];
         sample_u = sample_u > 0.0f ? sample_u : 0.0f;
         sample_v = sample_v > 0.0f ? sample_v : 0.0f;
-        sample_u = sample_u < most_u ? sample_u : most_u;
-        sample_v = sample_v < most_v ? sample_v : most_v;
+        sample_u = sample_u < max_u ? sample_u : max_u;
+        sample_v = sample_v < max_v ? sample_v : max_v;
         int32_t left = (int32_t)sample_u, top = (int32_t)sample_v;
         left = left < right_most ? left : right_most;
         top = top < low_most ? top : low_most;
@@ -105,10 +105,10 @@ INLINE int read_ring(
         odd_energy += odd * odd;
         energy += (even[k] - mean) * (even[k] - mean);
     }
-    if (!(odd_energy < (float)rules.most_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
+    if (!(odd_energy < (float)rules.max_odd * energy) || !(high > low) || !((double)high - (double)low >= least))
         return 0;
     const float off = fabsf(brightness_at(image, u, v) - mean) / (high - low);
-    const int smeared = !(off < (float)rules.most_centre);
+    const int smeared = !(off < (float)rules.max_centre);
     if (smeared && !(off < (float)rules.even_centre && odd_energy < (float)rules.even_odd * energy))
         return 0;
     const float middle = 0.5f * (low + high);

@@ -156,7 +156,7 @@ void make_level(
     typical_values(
         smooth, height, width, step, (int64_t)(rules->extreme * (double)seen), room, room + seen, room + 2 * seen, typical);
     double span = (double)typical[2] - (double)typical[1];
-    span = (span > rules->least_span ? span : rules->least_span) / 200.0;
+    span = (span > rules->min_span ? span : rules->min_span) / 200.0;
     const double contrast = span * span;
     const double noise = rules->noise_factor * (double)typical[0], most = rules->ceiling * contrast;
     fill_thresholds(

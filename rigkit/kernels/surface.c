@@ -6,7 +6,7 @@
 enum { ENTRIES = 9, SWEEPS = 12 };
 
 /* Set `least` to the eigenvector of the smallest eigenvalue of the symmetric A (Jacobi's rotations). */
-static void least_eigenvector(double A[ENTRIES][ENTRIES], double least[ENTRIES])
+static void min_eigenvector(double A[ENTRIES][ENTRIES], double least[ENTRIES])
 {
     double V[ENTRIES][ENTRIES] = {{0.0}};
     for (int64_t i = 0; i < ENTRIES; i++)
@@ -98,7 +98,7 @@ FOR_EACH_PROCESSOR double fit_perspective(const double *places, const double *pi
                 for (int64_t q = 0; q < ENTRIES; q++)
                     A[p][q] += rows[r][p] * rows[r][q];
     }
-    least_eigenvector(A, own);
+    min_eigenvector(A, own);
     for (int64_t r = 0; r < 3; r++) {
         double *row = out + 3 * r;
         for (int64_t c = 0; c < 3; c++)
@@ -206,7 +206,7 @@ INLINE void terms_of_degree(
 }
 
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
-    const double *places, const double *values, int64_t count, int64_t terms, double most_leverage, double *basis, double *scratch, double *unit,
+    const double *places, const double *values, int64_t count, int64_t terms, double max_leverage, double *basis, double *scratch, double *unit,
     double *triangle, double *told, double *misses, double *off, double *gain, double *scatter)
 {
     double *left = scratch, *leverage = scratch + 2 * count, *missed = scratch + 3 * count, *ranked_off = scratch + 4 * count;
@@ -236,7 +236,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             add_column(basis, count, terms, k, triangle, told, left, leverage);
 #pragma omp simd
         for (int64_t i = 0; i < count; i++) {
-            const double rest = 1.0 - (leverage[i] < most_leverage ? leverage[i] : most_leverage);
+            const double rest = 1.0 - (leverage[i] < max_leverage ? leverage[i] : max_leverage);
             missed[i] = ranked_off[i] = sqrt(left[i] * left[i] + left[count + i] * left[count + i]) / rest;
         }
         misses[degree] = quick_median(ranked_off, count);
@@ -246,7 +246,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
         memcpy(off, missed, (size_t)count * sizeof(double));
 #pragma omp simd
         for (int64_t i = 0; i < count; i++) {
-            const double own = leverage[i] < most_leverage ? leverage[i] : most_leverage;
+            const double own = leverage[i] < max_leverage ? leverage[i] : max_leverage;
             gain[i] = sqrt(own / (1.0 - own));
         }
     }
@@ -259,7 +259,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
 /* Fit the perspective that takes `places` nearest to `pixels`, and polynomials through what it leaves; return as
  * `fit_polynomials`, or -1 where a place is nearer than `nearest` in it. `rest` (count, 2) is scratch. */
 int64_t fit_map(
-    const double *places, const double *pixels, int64_t count, int64_t terms, double most_leverage, double nearest, double *rest,
+    const double *places, const double *pixels, int64_t count, int64_t terms, double max_leverage, double nearest, double *rest,
     double *basis, double *scratch, double *homography, double *unit, double *triangle, double *told, double *misses, double *off,
     double *gain, double *scatter)
 {
@@ -272,7 +272,7 @@ int64_t fit_map(
             rest[2 * i + k] = pixels[2 * i + k] - (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
     }
     return fit_polynomials(
-        places, rest, count, terms, most_leverage, basis, scratch, unit, triangle, told, misses, off, gain, scatter);
+        places, rest, count, terms, max_leverage, basis, scratch, unit, triangle, told, misses, off, gain, scatter);
 }
 
 /* Set `out` to the values at a place whose terms are `row`, by the degree that is surest there, and to their gain. */

@@ -47,11 +47,11 @@ class TagSurface:
     rows: FloatArray
 
     @classmethod
-    def made_of(cls, pixels: FloatArray, sides: FloatArray, bends: FloatArray) -> TagSurface:
+    def made_of(cls, pixels: FloatArray, sides: FloatArray, curvatures: FloatArray) -> TagSurface:
         """Return the map with these properties, without what `Polynomials.added_to` works out."""
         rows = np.zeros((len(pixels), SURFACE_COLUMNS))
         rows[:, :SIDES], rows[:, SIDES:SECOND] = pixels, sides.reshape(-1, 4)
-        rows[:, SECOND:GAIN] = bends.reshape(-1, 4)
+        rows[:, SECOND:GAIN] = curvatures.reshape(-1, 4)
         return cls(rows)
 
     @property
@@ -65,7 +65,7 @@ class TagSurface:
         return self.rows[:, SIDES:SECOND].reshape(-1, 2, 2)
 
     @property
-    def bends(self) -> FloatArray:
+    def curvatures(self) -> FloatArray:
         """(M, 2, 2) second derivatives likewise."""
         return self.rows[:, SECOND:GAIN].reshape(-1, 2, 2)
 
@@ -110,10 +110,10 @@ def projected(homography: FloatArray, places: FloatArray) -> TagSurface:
     return TagSurface(kernels().project_places(places, homography))
 
 
-def _empty_triangle(most: int) -> FloatArray:
-    """Return what the kernel writes the triangle (T, T) of a polynomial to that has `most` terms at most: those of
+def _empty_triangle(max_terms: int) -> FloatArray:
+    """Return what the kernel writes the triangle (T, T) of a polynomial to that has `max_terms` terms at most: those of
     whole degrees."""
-    terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, most) - 1]
+    terms = TERMS_OF_DEGREE[bisect_right(TERMS_OF_DEGREE, max_terms) - 1]
     return np.zeros((terms, terms))
 
 
@@ -144,20 +144,20 @@ class Polynomials:
     scatter: float
 
     @classmethod
-    def through(cls, places: FloatArray, values: FloatArray, most: int, most_leverage: float) -> Polynomials:
-        """Return those through `values` (N, 2) at `places` (N, 2), of `most` terms at most."""
-        triangle = _empty_triangle(most)
-        best, unit, *fitted = kernels().fit_polynomials(places, values, most_leverage, triangle)
+    def through(cls, places: FloatArray, values: FloatArray, max_terms: int, max_leverage: float) -> Polynomials:
+        """Return those through `values` (N, 2) at `places` (N, 2), of `max_terms` terms at most."""
+        triangle = _empty_triangle(max_terms)
+        best, unit, *fitted = kernels().fit_polynomials(places, values, max_leverage, triangle)
         return cls._of(best, unit, triangle, *fitted)
 
     @classmethod
     def beside_perspective(
-        cls, places: FloatArray, pixels: FloatArray, most: int, most_leverage: float, nearest: float
+        cls, places: FloatArray, pixels: FloatArray, max_terms: int, max_leverage: float, nearest: float
     ) -> tuple[FloatArray, Polynomials] | None:
         """Return the `perspective` that takes `places` (N, 2) nearest to `pixels` (N, 2), and polynomials through what
         it leaves; None where a place is nearer than `nearest` in it."""
-        triangle = _empty_triangle(most)
-        best, homography, unit, *fitted = kernels().fit_map(places, pixels, most_leverage, nearest, triangle)
+        triangle = _empty_triangle(max_terms)
+        best, homography, unit, *fitted = kernels().fit_map(places, pixels, max_leverage, nearest, triangle)
         return None if best < 0 else (homography, cls._of(best, unit, triangle, *fitted))
 
     @classmethod
@@ -213,9 +213,9 @@ def read_modules(image: GreyImage, quads: FloatArray, side: int) -> tuple[FloatA
 
 
 def read_codes(
-    image: GreyImage, quads: FloatArray, side: int, patterns: FloatArray, least: float
+    image: GreyImage, quads: FloatArray, side: int, patterns: FloatArray, min_contrast: float
 ) -> tuple[IntArray, FloatArray]:
     """Return which of the `patterns` (C, side * side) the modules of N tags are most like, (N,), and the correlation,
-    (N,); 0 and 0 where their brightness has a standard deviation below `least`. Else as `read_modules`."""
-    read: tuple[IntArray, FloatArray] = kernels().read_codes(image, quads, side, patterns, least)
+    (N,); 0 and 0 where their brightness has a standard deviation below `min_contrast`. Else as `read_modules`."""
+    read: tuple[IntArray, FloatArray] = kernels().read_codes(image, quads, side, patterns, min_contrast)
     return read

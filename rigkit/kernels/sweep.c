@@ -41,7 +41,7 @@ INLINE void read_row(const sweep_t *sweep, const image_t image2, int64_t level, 
     const float *upper = sweep->table + 2 * (level * sweep->table_rows + above) * wide;
     const float *lower = above + 1 < sweep->table_rows ? upper + 2 * wide : upper;
     const float down = (float)(row - above * spacing) / (float)spacing;
-    const float most_u = (float)(image2.width - 1), most_v = (float)(image2.height - 1);
+    const float max_u = (float)(image2.width - 1), max_v = (float)(image2.height - 1);
     for (int64_t left = 0; left * spacing < columns; left++) {
         const int64_t right = left + 1 < wide ? left + 1 : left;
         float start[2], end[2];
@@ -53,7 +53,7 @@ INLINE void read_row(const sweep_t *sweep, const image_t image2, int64_t level, 
         for (int64_t k = 0; k < count; k++) {
             const float along = (float)k / (float)spacing;
             const float u = start[0] + along * (end[0] - start[0]), v = start[1] + along * (end[1] - start[1]);
-            const int inside = u >= 0.0f && v >= 0.0f && u <= most_u && v <= most_v;
+            const int inside = u >= 0.0f && v >= 0.0f && u <= max_u && v <= max_v;
             out[left * spacing + k] = inside ? brightness_at(image2, u, v) : NAN;
         }
     }

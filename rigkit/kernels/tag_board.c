@@ -141,14 +141,14 @@ void map_tag_board(const tag_fit_t *fit)
         values = room.rest;
     } else
         best = fit_map(
-            room.places, room.start, count, terms, rules->most_leverage, rules->nearest_depth, room.rest, room.basis, room.left,
+            room.places, room.start, count, terms, rules->max_leverage, rules->nearest_depth, room.rest, room.basis, room.left,
             room.homography, room.unit, room.triangle, room.told, room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     numbers[MAP_BY_PERSPECTIVE] = (double)(best >= 0);
     if (best < 0) {
         const int64_t fewest = values == room.rest ? 1 : count < 3 ? count : 3;
         terms = terms_within(wanted > fewest ? wanted : fewest);
         best = fit_polynomials(
-            room.places, values, count, terms, rules->most_leverage, room.basis, room.left, room.unit, room.triangle, room.told,
+            room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle, room.told,
             room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     }
     /* What further terms add is noise. */
@@ -197,7 +197,7 @@ static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
     /* Line 1 runs along the row; +90 degrees from it are down, and from line 2 to the left. */
     room->single[2 * k] = row;
     room->single[2 * k + 1] = -column;
-    room->contrast[k] = 0.5 * (step > fit->rules->least_contrast ? step : fit->rules->least_contrast);
+    room->contrast[k] = 0.5 * (step > fit->rules->min_contrast ? step : fit->rules->min_contrast);
 }
 
 /* Tell the fit what is known of the marked corners beside where they start. */

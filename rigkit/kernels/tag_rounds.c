@@ -16,12 +16,12 @@ static int64_t mark_missing(const tag_fit_t *fit, tag_room_t *room)
         cells[n] = !(is_known(fit, n) || vain[n] || waiting[n]);
     keep_marked(fit, room, NULL);
     see_marked(fit, room, 1);
-    const double most_u = (double)fit->width - 1.0 - rules->margin_px, most_v = (double)fit->height - 1.0 - rules->margin_px;
+    const double max_u = (double)fit->width - 1.0 - rules->margin_px, max_v = (double)fit->height - 1.0 - rules->margin_px;
     for (int64_t k = 0; k < room->count; k++) {
         const double *seen = room->surface + SURFACE_COLUMNS * k;
         memcpy(room->start + 2 * k, seen, 2 * sizeof(double));
-        usable[k] = seen[GAIN] < rules->most_gain && seen[0] > rules->margin_px && seen[0] < most_u && seen[1] > rules->margin_px
-            && seen[1] < most_v;
+        usable[k] = seen[GAIN] < rules->max_gain && seen[0] > rules->margin_px && seen[0] < max_u && seen[1] > rules->margin_px
+            && seen[1] < max_v;
     }
     keep_marked(fit, room, usable);
     return room->count;
@@ -97,8 +97,8 @@ static uint8_t looks_of(
     const double moved = hypot(outcome[0] - seen[0], outcome[1] - seen[1]), brighter = outcome[CONTRAST] / contrast;
     if (!(outcome[VALID] > 0.5 && moved < rules->moved_cells * gain * gap && outcome[CONTRAST] > rules->added_contrast * contrast))
         return NOT_SEEN;
-    const double most_left = rules->added_residual * residual * (brighter > 1.0 ? brighter : 1.0);
-    if (outcome[RESIDUAL] < most_left && outcome[SIGMA] < rules->most_sigma_cells * gap)
+    const double max_left = rules->added_residual * residual * (brighter > 1.0 ? brighter : 1.0);
+    if (outcome[RESIDUAL] < max_left && outcome[SIGMA] < rules->max_sigma_cells * gap)
         return SEEN_CLEAN;
     return fit->board->border * lesser_height(seen) < rules->narrow_blurs * blur ? SEEN_CODED : SEEN_ODD;
 }
@@ -147,7 +147,7 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
 {
     tag_room_t room = room_of(fit);
     const int64_t count = fit->board->count, known = known_corners(fit);
-    if (known == count || known < fit->rules->fewest_foretelling)
+    if (known == count || known < fit->rules->min_foretelling)
         return 0;
     if (!by_this_map)
         map_tag_board(fit);
@@ -192,7 +192,7 @@ static int64_t drop_round(const tag_fit_t *fit)
 {
     const tag_corner_rules_t *rules = fit->rules;
     tag_room_t room = room_of(fit);
-    if (known_corners(fit) < rules->fewest_guiding)
+    if (known_corners(fit) < rules->min_guiding)
         return 0;
     map_tag_board(fit);
     take_known(fit, &room);

@@ -11,7 +11,7 @@
 #include "kernels.h"
 
 enum { SHARES = 6, BENDS = 8, MOVES = 2 * SHARES, S = MOVES, A, B, GX, GY, PARAMETERS };
-enum { ORDERS = 4, MOST_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, AT_ONCE = 4, LANES = 16 };
+enum { ORDERS = 4, MAX_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, AT_ONCE = 4, LANES = 16 };
 _Static_assert(AT_ONCE * BLOCK == 4 * LANES, "products are taken in four parts");
 
 /* To the compiler so many numbers side by side, of any alignment. */
@@ -41,7 +41,7 @@ typedef struct {
 /* The edges between the cells from `first` on along one side: shares of the pixels beyond them, and their derivatives
  * along d / s. */
 typedef struct {
-    float part[MOST_CELLS][ORDERS][BLOCK];
+    float part[MAX_CELLS][ORDERS][BLOCK];
     int64_t first, count;
 } profile_t;
 
@@ -203,12 +203,12 @@ INLINE int64_t block_pixels(
     return (int64_t)count;
 }
 
-/* Gather the squares of pixels in and around the tag, at most `most`; return how many, and set `seen` to how many pixels
+/* Gather the squares of pixels in and around the tag, at most `capacity`; return how many, and set `seen` to how many pixels
  * count. */
 FOR_EACH_PROCESSOR
 static int64_t tag_pixels(
     const tag_t *tag, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, tag_block_t *blocks,
-    int64_t most, int64_t *seen)
+    int64_t capacity, int64_t *seen)
 {
     *seen = 0;
     if (!isfinite(tag->centre[0] + tag->centre[1] + tag->scale))
@@ -222,7 +222,7 @@ static int64_t tag_pixels(
     bottom = bottom < height - 1 ? bottom : height - 1;
     int64_t count = 0;
     for (int64_t v = top; v <= bottom; v += SIDE)
-        for (int64_t u = left; u <= right && count < most; u += SIDE) {
+        for (int64_t u = left; u <= right && count < capacity; u += SIDE) {
             const int64_t mine = block_pixels(tag, grey, bytes, width, height, reach, u, v, blocks + count);
             *seen += mine;
             count += mine > 0;
@@ -303,11 +303,11 @@ static double tag_equations(
     return products[PARAMETERS];
 }
 
-/* Add what is known of the `bends` and of the light beforehand, at noise of this `variance`. */
+/* Add what is known of the `curvatures` and of the light beforehand, at noise of this `variance`. */
 static void add_prior(
-    const tag_t *tag, double bend_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS], double step[PARAMETERS])
+    const tag_t *tag, double curvature_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS], double step[PARAMETERS])
 {
-    const double dim = 1.0 / (rules->light_sigma * tag->scale), straight = variance / (bend_sigma * bend_sigma);
+    const double dim = 1.0 / (rules->light_sigma * tag->scale), straight = variance / (curvature_sigma * curvature_sigma);
     for (int i = BENDS; i < MOVES; i++) {
         step[i] -= straight * tag->moves[i];
         N[i * (PARAMETERS + 1)] += straight;
@@ -324,10 +324,10 @@ static double take_step(tag_t *tag, const double step[PARAMETERS], const tag_rul
     double largest = 0.0;
     for (int i = 0; i < MOVES; i++) {
         largest = fabs(step[i]) > largest ? fabs(step[i]) : largest;
-        tag->moves[i] += limited(step[i], rules->most_move_px);
+        tag->moves[i] += limited(step[i], rules->max_move_px);
     }
-    tag->s += limited(step[S], rules->most_blur_change * tag->s);
-    tag->s = tag->s < rules->least_blur ? rules->least_blur : tag->s > rules->most_blur ? rules->most_blur : tag->s;
+    tag->s += limited(step[S], rules->max_blur_change * tag->s);
+    tag->s = tag->s < rules->min_blur ? rules->min_blur : tag->s > rules->max_blur ? rules->max_blur : tag->s;
     tag->a += step[A];
     tag->b += step[B];
     tag->g[0] = limited(tag->g[0] + step[GX], 1.0);
@@ -358,7 +358,7 @@ static void write_tag(const tag_t *tag, const double *N, double variance, double
 void fit_tags(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *maps, const double *centres,
     const double *scales, const uint8_t *ink, int64_t cells, const double *breaks, double reach, const double *blur,
-    const double *contrast, const double *bend_sigma, const tag_rules_t *rules, int64_t most, double *scratch, double *out)
+    const double *contrast, const double *curvature_sigma, const tag_rules_t *rules, int64_t capacity, double *scratch, double *out)
 {
     tag_block_t *blocks = (tag_block_t *)scratch;
     for (int64_t n = 0; n < count; n++) {
@@ -368,8 +368,8 @@ void fit_tags(
             .map = maps + 2 * TAG_TERMS * n, .centre = centres + 2 * n, .breaks = breaks, .scale = scales[n], .s = blur[n],
             .b = -contrast[n], .ink = ink + cells * cells * n, .cells = cells};
         int64_t seen;
-        const int64_t squares = tag_pixels(&tag, grey, bytes, width, height, reach, blocks, most, &seen);
-        if (seen <= PARAMETERS || cells > MOST_CELLS)
+        const int64_t squares = tag_pixels(&tag, grey, bytes, width, height, reach, blocks, capacity, &seen);
+        if (seen <= PARAMETERS || cells > MAX_CELLS)
             continue;
         for (int64_t k = 0; k < squares; k++)
             for (int i = 0; i < BLOCK; i++)
@@ -379,9 +379,9 @@ void fit_tags(
         for (int64_t k = 0; k < rules->iterations && !settled; k++) {
             const double left = tag_equations(&tag, blocks, squares, rules, N, right);
             variance = left / (double)(seen - PARAMETERS);
-            variance = variance > rules->least_variance ? variance : rules->least_variance;
+            variance = variance > rules->min_variance ? variance : rules->min_variance;
             memcpy(step, right, sizeof step);
-            add_prior(&tag, bend_sigma[n], variance, rules, N, step);
+            add_prior(&tag, curvature_sigma[n], variance, rules, N, step);
             if (!cholesky(N, PARAMETERS))
                 break;
             cholesky_solve(N, PARAMETERS, step);
@@ -389,7 +389,7 @@ void fit_tags(
             double taken = 0.0;
             for (int i = 0; i < PARAMETERS; i++)
                 taken += step[i] * right[i];
-            settled = take_step(&tag, step, rules) <= rules->converged_px && taken <= rules->most_taken * left;
+            settled = take_step(&tag, step, rules) <= rules->converged_px && taken <= rules->max_taken * left;
         }
         if (settled)
             write_tag(&tag, N, variance, result);

@@ -27,7 +27,7 @@ def fit_tags(
     reach: float,
     blur: FloatArray,
     contrast: FloatArray,
-    bend_sigma: FloatArray,
+    curvature_sigma: FloatArray,
     rules: TagRules,
 ) -> FloatArray:
     """Return the outcomes of N tags, (N, 16).
@@ -39,8 +39,10 @@ def fit_tags(
     ink : (N, C, C) which of the cells between the `breaks` (C - 1,) along y and x are dark.
     reach : pixels are used so far beyond the tag, in its sides.
     blur, contrast : (N,) where to start.
-    bend_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
+    curvature_sigma : (N,) how well it is known where the middles of the sides are beside their ends, px.
     """
-    most = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
-    out = kernels().fit_tags(image, maps, centres, scales, ink, breaks, reach, blur, contrast, bend_sigma, rules, most)
+    capacity = int((2.0 * (1.0 + 2.0 * reach) * float(np.max(scales, initial=1.0)) / TAG_SIDE + 2.0) ** 2)
+    out = kernels().fit_tags(
+        image, maps, centres, scales, ink, breaks, reach, blur, contrast, curvature_sigma, rules, capacity
+    )
     return np.asarray(out)

@@ -78,7 +78,7 @@ class HeldBoards:
         """Return some of them."""
         return HeldBoards(self.points_mm, self.rotation[index], self.translation_mm[index], self.seen[index])
 
-    def carried(self, other_from_cam: Rigid3) -> HeldBoards:
+    def transformed(self, other_from_cam: Rigid3) -> HeldBoards:
         """Return them in another frame; which corners are seen stays."""
         rotation, translation = other_from_cam.rotation @ self.rotation, other_from_cam.apply(self.translation_mm)
         return HeldBoards(self.points_mm, rotation, translation, self.seen)

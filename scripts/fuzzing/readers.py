@@ -69,14 +69,14 @@ def fetch_listed(path: Path) -> None:
 
 def read_frames(path: Path) -> None:
     """Keep the frames of a video that show the board."""
-    frames_of_video(path, Path("out/frames"), [SMALL], most=4)
+    frames_of_video(path, Path("out/frames"), [SMALL], max_frames=4)
 
 
 def read_record(path: Path) -> None:
     """Keep the frames of a video where a record of former ones is damaged: they are chosen anew."""
     Path("out/frames").mkdir()
     shutil.copy(path, "out/frames/frames.json")
-    frames_of_video(Path("film.avi"), Path("out/frames"), [SMALL], most=4)
+    frames_of_video(Path("film.avi"), Path("out/frames"), [SMALL], max_frames=4)
 
 
 def read_database(path: Path) -> None:

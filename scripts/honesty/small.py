@@ -23,7 +23,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.core.findings import Severity
 
 SIZES = (3, 4, 5, 7, 10)
-LEAST_OTHERS = 4
+MIN_OTHERS = 4
 """Fewer other images than these say little of a small session."""
 GRID = (40, 30)
 WIDELY = 3.0
@@ -116,7 +116,7 @@ def drawn_sessions(
             # The first draws are the same, however many are asked for.
             rng = np.random.default_rng([seed, size, draw])
             views = views_of_draw(np.random.default_rng([seed, size, draw, 1]))
-            if len(views) - size < LEAST_OTHERS:
+            if len(views) - size < MIN_OTHERS:
                 break
             names = rng.permutation(sorted(views)).tolist()
             parts = [{name: views[name] for name in sorted(part)} for part in (names[:size], names[size:])]

@@ -77,7 +77,7 @@ def left_out() -> None:
         return
     flagged = count = 0
     for name, own in UNCHANGED.items():
-        others = [c.chance if c.change is not None and c.change.most_px >= ALARM_PX else 1.0
+        others = [c.chance if c.change is not None and c.change.max_px >= ALARM_PX else 1.0
                   for other, checks in UNCHANGED.items() if other != name for c in checks]  # fmt: skip
         limit = min(float(np.quantile(others, MAX_FLAGGED)), ALARM_CHANCE)
         alarms = sum(c.unexplained or (not c.holds and c.chance < limit) for c in own)

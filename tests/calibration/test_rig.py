@@ -12,7 +12,7 @@ from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
 from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import GlobalCovariance
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.carried import carried
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
@@ -174,7 +174,7 @@ def test_covariance_of_lenses_and_of_the_boards_mean_motion(kind: str, tied: boo
         design = np.array([(shown(s * e) - shown(-s * e)) / (2 * s) for s, e in zip(h, np.eye(h.size), strict=True)]).T
         # Poses follow what is not sure of the globals beside.
         through = design[:, :count] - design[:, count:] @ normal.covariance[1].reshape(-1, count)
-        parts = carried(observations, state, c, before.translation_mm)
+        parts = pose_jacobians(observations, state, c, before.translation_mm)
         for more, expected in (
             (None, 0.25 * design @ inverse @ design.T),
             (root @ root.T, 0.25 * design @ inverse @ design.T + through @ root @ root.T @ through.T),
@@ -193,7 +193,7 @@ def test_views_of_which_no_corner_counts_have_no_part_in_the_mean_motion(rng: np
         normal, lens_of = rig_normal(seen, state, SHAPE_WEIGHT), state.layout(seen).cameras[1]
         translation = state.of_camera(1, seen).translation_mm
         sure = GlobalCovariance(normal, 0.5, Clustered(0.25 * normal.covariance[0], 1.0, float("inf")))
-        found.append(sure.of_camera(lens_of, carried(seen, state, 1, translation), translation))
+        found.append(sure.of_camera(lens_of, pose_jacobians(seen, state, 1, translation), translation))
     scale = np.sqrt(np.diag(found[1]))
     assert (np.abs(found[0] - found[1]) < 1e-9 * scale[:, None] * scale).all()
 

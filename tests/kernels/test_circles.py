@@ -43,7 +43,7 @@ def test_the_middle_of_the_ellipse_is_not_the_centre() -> None:
 
 def test_a_circle_outside_the_image_is_not_valid() -> None:
     image = np.full((60, 64), 100.0, np.float32)
-    maps, bends = np.tile(8.0 * np.eye(2), (2, 1, 1)), np.zeros((2, 2, 3))
+    maps, curvatures = np.tile(8.0 * np.eye(2), (2, 1, 1)), np.zeros((2, 2, 3))
     places = np.array([[-40.0, 20.0], [np.nan, 20.0]])
-    fit = fit_circles(image, places, maps, bends, np.full(2, 0.8), np.full(2, 1.6))
+    fit = fit_circles(image, places, maps, curvatures, np.full(2, 0.8), np.full(2, 1.6))
     assert not fit.valid.any()

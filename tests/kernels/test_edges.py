@@ -10,8 +10,7 @@ from kernels.reference import edges as reference
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.detection.subpixel import edge_curvature as bends
-from rigkit.detection.subpixel import edge_fit
+from rigkit.detection.subpixel import edge_curvature, edge_fit
 from rigkit.detection.subpixel.edge_curvature import line_curvature
 from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import Geometry, ends_of
@@ -163,7 +162,7 @@ def test_compiled_bends_are_the_numpy_ones(rng: np.random.Generator, monkeypatch
     sigma = np.where(rng.random((7, 9)) < 0.1, np.nan, rng.uniform(1e-4, 0.1, (7, 9)))
     sides = rng.uniform(10.0, 30.0, (int(cells.sum()), 2))
     compiled = line_curvature(pixels, sigma, cells, sides)
-    monkeypatch.setattr(bends, "line_bends", reference.line_bends)
+    monkeypatch.setattr(edge_curvature, "line_curvatures", reference.line_curvatures)
     plain = line_curvature(pixels, sigma, cells, sides)
     for ours, theirs in zip(compiled, plain, strict=True):
         assert np.isfinite(theirs).all()

@@ -135,13 +135,13 @@ def test_a_structure_keeps_the_copies_that_it_points_to() -> None:
 def test_a_structure_with_a_member_of_any_name_does_not_keep_itself() -> None:
     rays = np.ones((2, 6, 3))[:, ::2]
     out, slopes = np.empty((2, 3, PATCH_COLUMNS)), np.ones((2, 3, 3, 2))
-    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, most_tries=1)
+    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
     assert grid._kept["out"] is out and all(kept is not grid for kept in grid._kept.values())
 
 
 def test_sizes_are_read_from_arrays_and_scratch_is_made() -> None:
     rays, slopes, out = np.ones((2, 5, 3)), np.ones((2, 5, 3, 2)), np.ones((2, 5, PATCH_COLUMNS))
-    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, most_tries=1)
+    grid = _Grid.of(rays1=rays, jacobians1=slopes, out=out, step=1, max_tries=1)
     assert (grid.rows, grid.columns) == (2, 5)
     assert (grid._kept["heap"].shape, grid._kept["heap"].dtype) == ((2, 5), np.int32)
     with pytest.raises(TypeError, match=r"qualities: 'packed' is float64 \(18,\), wants \(18, count\)"):

@@ -43,7 +43,7 @@ def test_patches_are_aligned_as_defined(rng: np.random.Generator) -> None:
     q1 = rng.uniform([25.0, 25.0], [120.0, 100.0], (30, 2))
     q2 = q1 @ A21.T + SHIFT + rng.uniform(-0.8, 0.8, (30, 2))
     A = A21 + rng.uniform(-0.05, 0.05, (30, 2, 2))
-    rules = patch_rules(HALF, most_move=4.0)
+    rules = patch_rules(HALF, max_move=4.0)
     found = aligned(patch_pyramid(image1), patch_pyramid(image2), rules, starts_of(q1, q2, A))
     good = np.flatnonzero(np.isfinite(found.correlation))
     assert len(good) > 25
@@ -64,11 +64,11 @@ def test_patches_grow_as_defined(rng: np.random.Generator) -> None:
     image1, image2 = pair_of_images(rng)
     q1 = np.array([[60.3, 50.2]])
     seeds = starts_of(q1, q1 @ A21.T + SHIFT + 0.3, A21[None])
-    rules = patch_rules(HALF, most_move=2.0, least_correlation=0.9)
+    rules = patch_rules(HALF, max_move=2.0, min_correlation=0.9)
     rows, columns = (SIZE[1] - 1) // STEP + 1, (SIZE[0] - 1) // STEP + 1
     rays1 = np.zeros((rows, columns, 3))
     free = EpipolarKnowledge.make(
-        np.zeros((4, 4, 3)), 8.0, np.zeros((3, 3)), sigma=np.inf, sigma_A=np.inf, most_distance=np.inf
+        np.zeros((4, 4, 3)), 8.0, np.zeros((3, 3)), sigma=np.inf, sigma_A=np.inf, max_distance=np.inf
     )
     pyramids = patch_pyramid(image1), patch_pyramid(image2)
     found = grown(*pyramids, free, rules, rays1, np.zeros((rows, columns, 3, 2)), STEP, 3, seeds)
@@ -79,9 +79,9 @@ def test_patches_grow_as_defined(rng: np.random.Generator) -> None:
         STEP,
         half=HALF,
         width=0.6 * HALF,
-        least_correlation=0.9,
-        most_move=2.0,
-        most_tries=3,
+        min_correlation=0.9,
+        max_move=2.0,
+        max_tries=3,
     )
     have = np.flatnonzero(np.isfinite(found.correlation))
     assert len(expected) > 80
@@ -111,9 +111,9 @@ def test_what_is_known_of_the_epipolar_line_is_used(rng: np.random.Generator) ->
     coarse = np.stack(np.meshgrid(spacing * np.arange(40), spacing * np.arange(35)), axis=-1)
     rays1, jacobians1 = lens.unproject(nodes)[0], lens.ray_jacobian(nodes)
     knowledge = EpipolarKnowledge.make(
-        lens.unproject(coarse)[0], spacing, E21, sigma=sigma, sigma_A=sigma_A, most_distance=50.0
+        lens.unproject(coarse)[0], spacing, E21, sigma=sigma, sigma_A=sigma_A, max_distance=50.0
     )
-    rules = patch_rules(HALF, most_move=5.0, excess_noise=4.0)
+    rules = patch_rules(HALF, max_move=5.0, excess_noise=4.0)
     pyramids = patch_pyramid(image1), patch_pyramid(image2)
     found = grown(*pyramids, knowledge, rules, rays1, jacobians1, step, 1, seeds)
     at = 1 * nodes.shape[1] + 1
@@ -141,7 +141,7 @@ def test_what_is_known_of_the_epipolar_line_is_used(rng: np.random.Generator) ->
         prior=prior,
         excess_noise=4.0,
     )
-    free = aligned(*pyramids, patch_rules(HALF, most_move=5.0), seeds)
+    free = aligned(*pyramids, patch_rules(HALF, max_move=5.0), seeds)
     assert np.linalg.norm(free.pixels2[0] - place) > 0.1
     # Rays are interpolated between nodes 4 px apart: of a lens of 70 px, to 1e-3 px.
     np.testing.assert_allclose(found.pixels2[at], place, atol=5e-3)

@@ -48,13 +48,15 @@ def test_derivatives_of_a_perspective(rng: np.random.Generator) -> None:
     places, pixels = seen(rng, bend=0.0)
     matrix, _ = perspective(places, pixels)
     shown = projected(matrix, places)
-    here, sides, bends = shown.pixels, shown.sides, shown.bends
+    here, sides, curvatures = shown.pixels, shown.sides, shown.curvatures
     image = np.column_stack([places, np.ones(len(places))]) @ matrix.T
     np.testing.assert_allclose(here, image[:, :2] / image[:, 2:], rtol=1e-12)
     for k, step in enumerate(1e-3 * np.eye(2)):
         after, before = projected(matrix, places + step), projected(matrix, places - step)
         np.testing.assert_allclose(sides[:, k], (after.pixels - before.pixels) / 2e-3, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(bends[:, k], (after.sides[:, k] - before.sides[:, k]) / 2e-3, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            curvatures[:, k], (after.sides[:, k] - before.sides[:, k]) / 2e-3, rtol=1e-6, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.1, 0.6])
@@ -75,7 +77,7 @@ def test_polynomials(bend: float, rng: np.random.Generator) -> None:
     assert ours.scatter == pytest.approx(np.median(ours.off / np.hypot(1.0, ours.gain)))
     wanted = rng.uniform([-2.0, -2.0], [13.0, 11.0], (50, 2))
     plain, surest = (ours.added_to(None, wanted, surest=which) for which in (False, True))
-    for one, two in zip((plain.pixels, plain.sides, plain.bends), whole.at(wanted, ours.plain), strict=True):
+    for one, two in zip((plain.pixels, plain.sides, plain.curvatures), whole.at(wanted, ours.plain), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
     for one, two in zip((surest.pixels, surest.gain), whole.surest(wanted, tried), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
@@ -89,7 +91,7 @@ def test_lines_of_a_surface(rng: np.random.Generator) -> None:
     surface = polynomials.added_to(base, places, surest=False)
     np.testing.assert_allclose(surface.pixels, base.pixels + polynomials.added_to(None, places, surest=False).pixels)
     lengths = np.linalg.norm(surface.sides, axis=2)
-    bent = surface.sides[..., 0] * surface.bends[..., 1] - surface.sides[..., 1] * surface.bends[..., 0]
+    bent = surface.sides[..., 0] * surface.curvatures[..., 1] - surface.sides[..., 1] * surface.curvatures[..., 0]
     np.testing.assert_allclose(surface.curvature, bent / lengths**3)
     np.testing.assert_allclose(surface.heights, np.abs(np.linalg.det(surface.sides))[:, None] / lengths)
 

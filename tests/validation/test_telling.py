@@ -114,7 +114,7 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
     poses = [view.cam_from_board for view in for_left.views]
     rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
     held = HeldBoards(BOARD.points(), rotation, shift, np.tile(BOARD.exists(), (FRESH, 1)))
-    whole = sees_held(rig.cameras[1], BOARD, held.carried(MOUNT), Reach())
+    whole = sees_held(rig.cameras[1], BOARD, held.transformed(MOUNT), Reach())
     seen = [held.seen, whole[:, None] & held.seen]
     others = _powers(rig, told_by(rig, BOARD, rotation, shift, seen))
     assert min(p.chance for p in others) < 0.9 * min(p.chance for p in promised)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, UNTRUE, fewest_of_a_kind
+from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, UNTRUE, min_of_a_kind
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares
@@ -86,12 +86,12 @@ def moment(order: Sequence[str], some: Collection[str]) -> str:
 @dataclass(frozen=True, eq=False, slots=True)
 class _Pulls:
     """What each of N images says of the lens after its pose: information (N, P, P) and score (N, P), in units in which
-    all together and the prior (P, P) have a unit diagonal; a part has `fewest` images at least."""
+    all together and the prior (P, P) have a unit diagonal; a part has `min_images` images at least."""
 
     information: FloatArray
     score: FloatArray
     prior: FloatArray
-    fewest: int
+    min_images: int
 
     @classmethod
     def of(cls, observations: Observations, fit: Fit, number: IntArray) -> _Pulls:
@@ -102,18 +102,18 @@ class _Pulls:
         prior = (fit.normal.gg - fit.data.gg)[:p, :p]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(information.sum(axis=0) + prior), np.finfo(float).tiny))
         across = scale[:, None] * scale
-        fewest = int(np.ceil(fewest_of_a_kind(len(score))))
-        return cls(information * across, score * scale, prior * across + RIDGE_OF_STEP * np.eye(p), fewest)
+        min_images = int(np.ceil(min_of_a_kind(len(score))))
+        return cls(information * across, score * scale, prior * across + RIDGE_OF_STEP * np.eye(p), min_images)
 
     def gains(self, order: IntArray) -> FloatArray:
         """Return by how much the cost falls when the first k of the images in this order (N,) and the others have
         lenses of their own: for each k that leaves both enough, at first order, but for what one lens gains."""
-        at = slice(self.fewest - 1, len(order) - self.fewest)
+        at = slice(self.min_images - 1, len(order) - self.min_images)
         return self._gain(self.information[order].cumsum(axis=0)[at], self.score[order].cumsum(axis=0)[at])
 
     def parted_at(self, order: IntArray) -> int:
         """Return how many of the images in this order (N,) come before the place where lenses differ most."""
-        return self.fewest + int(np.argmax(self.gains(order)))
+        return self.min_images + int(np.argmax(self.gains(order)))
 
     def gain_of(self, second: BoolArray) -> float:
         """Return the same when the images that are `second` (N,) and the others have."""

@@ -47,7 +47,7 @@ BY_CHANCE = 1e-3
 ASKED_AT = 0.05
 """Of such images so few have it solved for. A pupil spoils the lens it is told by, and the scatter between images, most
 where images are few: of SIMULATED sessions with 3 mm rad^-2 one of ten had a chance of one to three in a thousand."""
-LEAST_FOUND = 0.5
+MIN_FOUND = 0.5
 """Mostly a half of a pupil or more is found where lens and boards follow it: what may matter in full is asked for."""
 MIN_PUPIL_PART = 1e-4
 """Of the square of what a pupil does to the corners, poses, boards and a central lens that follow it leave at least
@@ -205,7 +205,7 @@ def may_move(calibration: Calibration) -> bool:
     pupil = MovingPupil.of(calibration)
     if pupil is None or pupil.chance > ASKED_AT:
         return False
-    return pupil.far_px(FarProjection.of(calibration)) > LEAST_FOUND * SMALL_PX
+    return pupil.far_px(FarProjection.of(calibration)) > MIN_FOUND * SMALL_PX
 
 
 def _shown(calibration: Calibration) -> tuple[float, float, float]:

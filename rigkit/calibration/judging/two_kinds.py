@@ -64,7 +64,7 @@ class Kinds:
     cost: float
 
 
-def fewest_of_a_kind(images: int) -> float:
+def min_of_a_kind(images: int) -> float:
     """Return how many of the images a kind has at least."""
     return max(MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND * images)
 
@@ -113,7 +113,7 @@ def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kind
             break
         second = closer
     least = np.minimum(second.sum(axis=1), (~second).sum(axis=1))
-    enough = least >= fewest_of_a_kind(len(own))
+    enough = least >= min_of_a_kind(len(own))
     if not enough.any():
         return None
     step, pull = _best_steps(own, across, follow, along, second)

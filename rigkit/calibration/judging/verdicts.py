@@ -25,7 +25,7 @@ from rigkit.calibration.judging.changing import WAYS, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
-from rigkit.calibration.judging.two_kinds import APART, fewest_of_a_kind
+from rigkit.calibration.judging.two_kinds import APART, min_of_a_kind
 from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
@@ -199,7 +199,7 @@ def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResul
     """Return the images that hardly agree with the others in any corner, where these are too many for mishaps."""
     used = {view.image for view in views}
     out = list(dict.fromkeys(i for i, reason in dropped if reason.endswith(DISAGREES_WITH_VIEWS) and i not in used))
-    return out if len(out) >= fewest_of_a_kind(len(used) + len(out)) else []
+    return out if len(out) >= min_of_a_kind(len(used) + len(out)) else []
 
 
 def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:

@@ -13,11 +13,11 @@ from rigkit.calibration.covariance import GlobalCovariance
 from rigkit.calibration.pupil import SolvedPupil, without_pupil
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.carried import carried, pose_products
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians, pose_products
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.rig.state import RigState
@@ -119,7 +119,7 @@ def _cameras(
     cameras, squared = [], []
     for c, (name, own) in enumerate(zip(joint.views.names, observations.cameras, strict=True)):
         alone = state.of_camera(c, observations)
-        parts = carried(observations, state, c, alone.translation_mm)
+        parts = pose_jacobians(observations, state, c, alone.translation_mm)
         frame = known.of_camera(layout.cameras[c], parts, alone.translation_mm, beside)
         residuals, kept = joint.solution.normal.residuals[c], observations.weights[c] > 0.0
         squared.append((residuals.px**2).sum(axis=-1)[kept])

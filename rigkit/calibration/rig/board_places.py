@@ -169,9 +169,9 @@ def _best_reference(
     order = sorted((s for s in scenes if len(s) > 1), key=lambda s: -len(s))
     best = None
     for reference in order[:REFERENCES]:
-        known, readings, misfit = _read(reference, scenes, members)
-        if best is None or (len(known), -misfit) > (len(best[0]), -best[2]):
-            best = known, readings, misfit
+        known, readings, residual = _read(reference, scenes, members)
+        if best is None or (len(known), -residual) > (len(best[0]), -best[2]):
+            best = known, readings, residual
     return None if best is None else (best[0], best[1])
 
 
@@ -186,22 +186,22 @@ def _read(
         if label is not None:
             known[label.board_id] = label.cam_from_board
     readings: dict[int, Reading | None] = {}
-    misfits: list[float] = []
+    residuals: list[float] = []
     # Scenes that add a board to those known are read before the ones that need it.
     waiting = sorted(range(len(scenes)), key=lambda i: -len(scenes[i]))
     for last in (False, True):
         left = []
         for i in waiting:
-            reading, misfit = _named(scenes[i], known, far)
+            reading, residual = _named(scenes[i], known, far)
             if reading is None and not last:
                 left.append(i)
                 continue
             readings[i] = reading
             if reading is not None:
-                misfits.append(misfit)
+                residuals.append(residual)
         waiting = left
     middles = _middles([r for r in readings.values() if r is not None], known)
-    return middles, [readings[i] for i in range(len(scenes))], float(np.median(misfits)) if misfits else np.inf
+    return middles, [readings[i] for i in range(len(scenes))], float(np.median(residuals)) if residuals else np.inf
 
 
 def _named(

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.displaced import LensModes, telling_modes
-from rigkit.calibration.rig.carried import carried
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import Solution
@@ -49,7 +49,7 @@ def _of_camera(
     by_globals = np.zeros((n, modes.shape[1]))
     by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
-    for part in carried(observations, state, c, alone.translation_mm):
+    for part in pose_jacobians(observations, state, c, alone.translation_mm):
         shown = by_own[part.views]
         by_globals[part.index] += (np.swapaxes(part.globals, -1, -2) @ shown).sum(axis=0)
         by_pose[part.poses] += np.swapaxes(part.target, -1, -2) @ shown

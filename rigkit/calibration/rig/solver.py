@@ -1,4 +1,4 @@
-"""The joint least squares of a rig, on top of the normal equations of single cameras (`carried`)."""
+"""The joint least squares of a rig, on top of the normal equations of single cameras (`pose_jacobians`)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.carried import carried
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
@@ -44,7 +44,7 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
             g[there] += n.g[here]
             for also, too in parts:
                 gg[there, also] += n.gg[here, too]
-        for part in carried(observations, state, c, alone.translation_mm):
+        for part in pose_jacobians(observations, state, c, alone.translation_mm):
             f, views, index = part.poses, part.views, part.index
             by_target, by_globals = np.swapaxes(part.target, -1, -2), np.swapaxes(part.globals, -1, -2)
             own_pp, own_p = n.pp[views], n.p[views, :, None]

@@ -275,9 +275,9 @@ class _Squares:
         places = self.at(np.array([up, up]), np.array([-aside, aside]))
         return np.asarray(((places >= 0.0) & (places <= np.array([width, height]) - 1.0)).all(axis=(1, 2)))
 
-    def supported(self, least: int) -> BoolArray:
-        """Return which squares (M,) have `least` corners behind the prediction of each of their own."""
-        return self._of_squares(self.shape.support >= least)
+    def supported(self, min_support: int) -> BoolArray:
+        """Return which squares (M,) have `min_support` corners behind the prediction of each of their own."""
+        return self._of_squares(self.shape.support >= min_support)
 
     def _of_squares(self, sound: BoolArray) -> BoolArray:
         """Return for which squares (M,) all four cells at their corners are `sound` (2 (M + 1),)."""

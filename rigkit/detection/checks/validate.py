@@ -97,18 +97,18 @@ def stray_row(lattice: Lattice, size_px: tuple[int, int]) -> BoolArray | None:
     return None
 
 
-def large(lattice: Lattice, least: int) -> bool:
-    """Return whether `lattice` has `least` corners and, if that is to be a board (9), three rows and three columns."""
-    return lattice.count >= least and min(lattice.size) >= (MIN_ROWS if least >= MIN_ROWS**2 else 2)
+def large(lattice: Lattice, min_corners: int) -> bool:
+    """Return whether `lattice` has `min_corners` and, if that is to be a board (9), three rows and three columns."""
+    return lattice.count >= min_corners and min(lattice.size) >= (MIN_ROWS if min_corners >= MIN_ROWS**2 else 2)
 
 
-def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
+def separate(lattices: Sequence[Lattice], min_corners: int) -> list[Lattice]:
     """Return those of `lattices` that are `large` enough, without the corners that they share with larger ones.
 
     What has most of its corners in common with larger ones is the same board again, and left out. A lattice that grew
     over the edge to another board keeps its own corners.
     """
-    candidates = sorted((item for item in lattices if large(item, least)), key=lambda item: -item.count)
+    candidates = sorted((item for item in lattices if large(item, min_corners)), key=lambda item: -item.count)
     if len(candidates) < 2:
         return candidates
     corners = [item.pixels[item.known] for item in candidates]
@@ -124,7 +124,7 @@ def separate(lattices: Sequence[Lattice], least: int) -> list[Lattice]:
             if np.count_nonzero(again) > 1:
                 shared |= again
         rest = _without_shared(item, shared)
-        if rest is not None and large(rest, least):
+        if rest is not None and large(rest, min_corners):
             kept.append(rest)
     return kept
 
@@ -193,13 +193,13 @@ def compact(lattice: Lattice, size_px: tuple[int, int]) -> bool:
     return False
 
 
-def trustworthy(refined: RefinedLattice, before: int, least: int, prior: float = 0.0) -> bool:
+def trustworthy(refined: RefinedLattice, before: int, min_corners: int, prior: float = 0.0) -> bool:
     """Return whether what the fit left of a lattice of `before` corners is a board.
 
     `prior` is added to the score of its evidence: what else speaks for a board.
     """
     lattice = refined.lattice
-    if lattice.count < max(least, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
+    if lattice.count < max(min_corners, (1.0 - MAX_LOST) * before) or min(lattice.size) < MIN_ROWS:
         return False
     return Evidence.of(refined).score + prior > 0.0
 

@@ -11,7 +11,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, fit_circles
-from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_bends
+from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_curvatures
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels.circles import BESIDE
 
@@ -281,7 +281,7 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     fit = draft.fit
     around = local_maps(draft.label, fit.pixels, draft.label, hexagonal=draft.hexagonal, sigma_px=_sigma(fit))
     size_px = (grey.shape[1], grey.shape[0])
-    around = with_smooth_bends(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
+    around = with_smooth_curvatures(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
     others = _beside_each(draft.label, draft.hexagonal) if beside else None
     fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px, others)

@@ -21,17 +21,17 @@ NEAR_BESIDE = 3.0
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,
-    least_blur=0.25,
-    most_blur=12.0,
-    most_move_px=1.0,
-    most_growth=0.2,
-    most_light=1.5,
+    min_blur=0.25,
+    max_blur=12.0,
+    max_move_px=1.0,
+    max_growth=0.2,
+    max_light=1.5,
     converged_px=1e-3,
     converged_sigmas=0.05,
     near_beside=NEAR_BESIDE,
     iterations=30,
     plain_iterations=5,
-    fewest=16,
+    min_pixels=16,
 )
 """Fits of the model's own edges settle in five steps; those of others (sharpened, moved) take up to thirty, the later
 ones relaxed. They end where steps are as small as MODEL_SIGMA_PX, or a twentieth of what the circle is known to."""
@@ -85,7 +85,7 @@ def fit_circles(
     grey: GreyImage,
     pixels: FloatArray,
     maps: FloatArray,
-    bends: FloatArray,
+    curvatures: FloatArray,
     blur_px: FloatArray,
     reach: FloatArray,
     beside: IntArray | None = None,
@@ -96,19 +96,19 @@ def fit_circles(
     ----------
     pixels : (N, 2) centres, known to a few tenths of the radius.
     maps : (N, 2, 2) px per radius.
-    bends : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
+    curvatures : (N, 2, 3) second derivatives of the image by the plane, xx, xy and yy, px per radius squared.
     blur_px : (N,) where to start.
     reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
     beside : (N, BESIDE) neighbours, whose light blur brings into a circle's pixels; -1 for none.
     """
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
-    margin = np.abs(bends).sum(axis=(1, 2)) + 1.0
+    margin = np.abs(curvatures).sum(axis=(1, 2)) + 1.0
     own = np.minimum(reach * extent, extent + RULES.near_sigmas * blur_px + RULES.near_px) + margin
     finite = own[np.isfinite(own)]
-    most = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
-    most = min(most, grey.size)
+    capacity = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
+    capacity = min(capacity, grey.size)
     beside = np.full((len(pixels), kernel.BESIDE), -1) if beside is None else beside
-    rows = kernel.fit_circles(grey, pixels, maps, bends, blur_px, reach, beside, most, RULES)
+    rows = kernel.fit_circles(grey, pixels, maps, curvatures, blur_px, reach, beside, capacity, RULES)
     found = rows[:, 2:6].reshape(-1, 2, 2)
     with np.errstate(all="ignore"):
         relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)

@@ -112,7 +112,7 @@ def local_maps(
     )
 
 
-def with_smooth_bends(
+def with_smooth_curvatures(
     around: PlaneMap, label: IntArray, pixels: FloatArray, size_px: tuple[int, int], *, hexagonal: bool
 ) -> PlaneMap:
     """Return the map `around` the circles of a lattice, (N, 2) each, with second derivatives of one map through all.
@@ -128,7 +128,7 @@ def with_smooth_bends(
     smooth = SmoothMap(places, pixels, wide_perspective(places, pixels, centre))
     here, below, above = (smooth.at(places + np.array([0.0, off])) for off in (0.0, MIXED_STEP, -MIXED_STEP))
     mixed = (below.sides[:, 0] - above.sides[:, 0]) / (2.0 * MIXED_STEP)
-    second = np.stack([here.bends[:, 0], mixed, here.bends[:, 1]], axis=2)
+    second = np.stack([here.curvatures[:, 0], mixed, here.curvatures[:, 1]], axis=2)
     known = np.isfinite(second).all(axis=(1, 2), keepdims=True)
     return replace(around, second=np.where(known, second, around.second))
 

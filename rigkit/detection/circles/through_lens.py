@@ -53,7 +53,7 @@ def seen_through(
     radius_mm = found.radius * nearest_mm if pattern.diameter_mm is None else 0.5 * pattern.diameter_mm
     grid = board.grid()[board.exists()]
     points = board.points(grid)
-    expected, maps, bends, valid = _maps(camera, pose, points, radius_mm)
+    expected, maps, curvatures, valid = _maps(camera, pose, points, radius_mm)
     spacing = np.sqrt(np.abs(np.linalg.det(maps))) * nearest_mm / radius_mm
     known = np.isin(board.index(grid), board.index(placed.grid))
     pixels = np.where(known[:, None], placed.lattice()[grid[:, 1], grid[:, 0]], expected)
@@ -70,7 +70,7 @@ def seen_through(
     reach = edge_reach(maps[tried], 0.5 * nearest_mm / radius_mm, blur, surrounded)
     first = np.argsort(~near, axis=1, kind="stable")[:, :BESIDE]
     beside = np.where(np.take_along_axis(near, first, axis=1), first, -1)
-    fit = fit_circles(grey, pixels[tried], maps[tried], bends[tried], blur, reach, beside)
+    fit = fit_circles(grey, pixels[tried], maps[tried], curvatures[tried], blur, reach, beside)
     off = np.linalg.norm(fit.pixels - pixels[tried], axis=1) / spacing[tried]
     good = _sound(fit, found) & (off < OFF_PLACE)
     sigma = np.full(len(grid), np.nan)

@@ -32,17 +32,17 @@ def fit_corners(
     start: FloatArray,
     signs: FloatArray,
     blur: FloatArray | float,
-    bends: tuple[FloatArray, FloatArray] | None = None,
+    curvatures: tuple[FloatArray, FloatArray] | None = None,
     *,
     paper: bool = True,
 ) -> EdgeFit:
     """Fit the edge model to the M `cells` (R, C) of `board` from `start` (M, 2); `shape` is theirs.
 
-    `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `bends` is the curvature of the lines and how well it is
-    known, (M, 2) each, where corners' sigmas tell more of it than `shape`. Windows end before the markers of a ChArUco
-    board. `paper` : read what lies beyond the board.
+    `signs` (M,) as `Lattice.signs`; `blur` is the s expected; `curvatures` are those of the lines and how well they are
+    known, (M, 2) each, where corners' sigmas tell more of them than `shape`. Windows end before the markers of ChArUco
+    boards. `paper` : read what lies beyond the board.
     """
-    curvature, loose = bends or (shape.curvature(), np.zeros((len(start), 2)))
+    curvature, loose = curvatures or (shape.curvature(), np.zeros((len(start), 2)))
     every = Geometry(shape.sides, curvature, shape.gaps(), ends_of(np.ones_like(cells), cells))
     width = _short_of_markers(board, shape.sides, np.broadcast_to(np.asarray(blur, dtype=np.float64), (len(start),)))
 

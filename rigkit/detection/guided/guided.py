@@ -27,7 +27,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
-from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
+from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
@@ -186,9 +186,9 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
         return state
     known = state.known & np.isfinite(state.sigma_px)
     shape = fit_cells(state.pixels, known)
-    bends = line_bends_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
+    curvatures = line_curvatures_to_fit(state.pixels, state.sigma_px, known, shape.sides, RADIUS_PX)
     blur = known_median(state.blur)
-    fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, bends)
+    fit = fit_corners(image, board, known, shape, state.pixels[known], state.signs[known], blur, curvatures)
     fit = _with_uneven(fit, shape.sides, board)
     return state.with_fit(known, fit, fit.valid & (fit.contrast > 0.0) & cells[known])
 

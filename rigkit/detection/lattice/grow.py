@@ -135,9 +135,9 @@ def _grow(lattice: Lattice, saddles: GridBuckets, level: Level, rings: int) -> i
 @cache
 def _rules() -> GrowthRules:
     numbers: dict[str, float] = {
-        "most": MIN_EDGE_PLACES,
+        "min_places": MIN_EDGE_PLACES,
         "tried": MAX_SADDLES_TRIED,
-        "fewest": MIN_FORETELLING,
+        "min_foretelling": MIN_FORETELLING,
         "reach": GROWTH_REACH,
         "ring_part": RING,
         "min_ring": MIN_RING_PX,
@@ -147,7 +147,7 @@ def _rules() -> GrowthRules:
         "aside": ASIDE_LENGTHS,
         "min_aside": MIN_ASIDE_PX,
         "max_aside": MAX_ASIDE_PX,
-        "least_area": MIN_AREA_PX2,
+        "min_area": MIN_AREA_PX2,
     }
     predictions = [FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
     return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), EDGE_PLACES, **numbers)

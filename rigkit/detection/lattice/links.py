@@ -88,12 +88,12 @@ def _link_rules(length_ratio: float) -> front.LinkRules:
     return front.LinkRules.of(
         neighbours=NEIGHBOURS,
         along=EDGE_PLACES,
-        most=MIN_EDGE_PLACES,
+        min_places=MIN_EDGE_PLACES,
         arm_cosine=ARM_COSINE,
         contrast_ratio=CONTRAST_RATIO,
         length_ratio=length_ratio,
         aside=ASIDE_LENGTHS,
-        least_aside=MIN_ASIDE_PX,
+        min_aside=MIN_ASIDE_PX,
     )
 
 

@@ -38,14 +38,14 @@ class LocalFit:
     ----------
     pixels : position at the cell itself.
     sides : (M, 2, 2) first derivatives, along the column direction and along the row direction.
-    bends : (M, 2, 2) second derivatives likewise.
+    curvatures : (M, 2, 2) second derivatives likewise.
     support : (M,) number of corners behind the fit.
     gain : (M,) standard deviation of `pixels` for corners of standard deviation 1.
     """
 
     pixels: FloatArray
     sides: FloatArray
-    bends: FloatArray
+    curvatures: FloatArray
     support: FloatArray
     gain: FloatArray
 
@@ -59,11 +59,11 @@ class LocalFit:
 
     @property
     def bend_column(self) -> FloatArray:
-        return self.bends[:, 0]
+        return self.curvatures[:, 0]
 
     @property
     def bend_row(self) -> FloatArray:
-        return self.bends[:, 1]
+        return self.curvatures[:, 1]
 
     def of(self, chosen: BoolArray) -> LocalFit:
         """Return the same of the cells chosen (M,)."""
@@ -87,7 +87,7 @@ class LocalFit:
 
         The direction of +90 degrees is that of growing angle from u to v.
         """
-        (a, b), (c, d) = self.sides.T, self.bends.T
+        (a, b), (c, d) = self.sides.T, self.curvatures.T
         curvature: FloatArray = (a * d - b * c).T / np.maximum((self.sides**2).sum(axis=2), 1e-12) ** 1.5
         return curvature
 
@@ -97,7 +97,7 @@ class LocalFit:
         First index: the column line, the row line; second: before and after, in the direction of +90 degrees. A cell
         without sides has no neighbours: NaN.
         """
-        return line_gaps(self.sides, self.bends)
+        return line_gaps(self.sides, self.curvatures)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -138,8 +138,8 @@ def _rules(degree: int, radius: int, leave_out: bool, width: float, ridge: tuple
 def _local_fit(rows: FloatArray) -> LocalFit:
     """Return the fit from `rows` (M, 12): the fields of `LocalFit` one after the other."""
     # By themselves in memory, as kernels take them.
-    sides, bends = (np.ascontiguousarray(rows[:, k : k + 4]).reshape(-1, 2, 2) for k in (2, 6))
-    return LocalFit(rows[:, :2], sides, bends, rows[:, 10], rows[:, 11])
+    sides, curvatures = (np.ascontiguousarray(rows[:, k : k + 4]).reshape(-1, 2, 2) for k in (2, 6))
+    return LocalFit(rows[:, :2], sides, curvatures, rows[:, 10], rows[:, 11])
 
 
 def foretold(lattice: FloatArray, cells: BoolArray) -> LocalFit:

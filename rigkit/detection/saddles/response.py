@@ -155,7 +155,7 @@ def _level_rules() -> front.LevelRules:
     return front.LevelRules.make(
         SMOOTH,
         extreme=EXTREME,
-        least_span=MIN_SPAN,
+        min_span=MIN_SPAN,
         noise_factor=NOISE_FACTOR,
         floor=THRESHOLD_FLOOR,
         ceiling=THRESHOLD_CEILING,

@@ -49,10 +49,10 @@ def blur_covariance(image: GreyImage, lattice: Lattice, blur_px: float) -> Float
     shape, centres = shape.of(chosen), lattice.pixels[known][chosen]
     along, down = (part.ravel() for part in np.meshgrid(READ_AT, READ_AT))
     part = np.minimum(1.0, LARGE_SQUARES * blur_px / shape.cell_px())[:, None, None]
-    shape = replace(shape, sides=part * shape.sides, bends=part**2 * shape.bends)
+    shape = replace(shape, sides=part * shape.sides, curvatures=part**2 * shape.curvatures)
     # Along bent lines, as the squares lie.
     terms = np.stack([along, down, 0.5 * along**2, 0.5 * down**2])
-    offsets = np.einsum("ks,nkx->nsx", terms, np.concatenate([shape.sides, shape.bends], axis=1))
+    offsets = np.einsum("ks,nkx->nsx", terms, np.concatenate([shape.sides, shape.curvatures], axis=1))
     seen = sample(image, centres[:, None] + offsets).astype(np.float64)
     seen -= seen.mean(axis=1, keepdims=True)
     return _covariance(seen, _waves(along, down), _wave_vectors(shape), blur_px)

@@ -110,11 +110,11 @@ def factor_rules(radius_px: float) -> edges.FactorRules:
     return edges.FactorRules.of(
         light_share=LIGHT_SHARE,
         lost_error=LOST_ERROR,
-        least_left=MIN_LEFT,
+        min_left=MIN_LEFT,
         covered_times=COVERED_TIMES,
-        least_factor=MIN_SIGMA_FACTOR,
-        least_alike=MIN_ALIKE,
+        min_factor=MIN_SIGMA_FACTOR,
+        min_alike=MIN_ALIKE,
         uneven_times=UNEVEN_TIMES,
-        least_blur=BLUR_RANGE[0],
+        min_blur=BLUR_RANGE[0],
         radius_px=radius_px,
     )

@@ -15,7 +15,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.lattice.lattice import LatticeStack
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
-from rigkit.kernels.edges import BendRules, line_bends
+from rigkit.kernels.edges import CurvatureRules, line_curvatures
 
 DECAY = 0.1
 """Boards under strong perspective and in fisheyes have coefficients up to this^k, in sides of the cell."""
@@ -51,11 +51,11 @@ def line_curvature(
     cells : (R, C) bool, row by row.
     sides_px : (M, 2) lengths of the cell's sides along row and column.
     """
-    rules = BendRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
-    return line_bends(pixels, sigma_px, cells, sides_px, rules)
+    rules = CurvatureRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
+    return line_curvatures(pixels, sigma_px, cells, sides_px, rules)
 
 
-def line_bends_to_fit(
+def line_curvatures_to_fit(
     pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides: FloatArray, radius_px: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the curvature as `line_curvature` does, with a standard deviation of 0 where it is known well enough for a

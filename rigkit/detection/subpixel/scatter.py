@@ -96,8 +96,8 @@ def _rules() -> native.ScatterRules:
     return native.ScatterRules(
         unexplained=UNEXPLAINED,
         median_of_normal=MEDIAN_OF_NORMAL,
-        fewest_corners=MIN_SCATTER_CORNERS,
-        fewest_differences=MIN_DIFFERENCES,
+        min_corners=MIN_SCATTER_CORNERS,
+        min_differences=MIN_DIFFERENCES,
         first_order=DIFFERENCES[0],
         last_order=DIFFERENCES[-1],
         degrees=SURFACES,

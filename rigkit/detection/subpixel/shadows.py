@@ -35,18 +35,18 @@ LIGHT_RULES = LightRules.of(
     # Of the window: as that of the edge model.
     radius_px=18.0,
     reach_cells=0.44,
-    least_left=LIGHT_RANGE[0],
-    most_left=LIGHT_RANGE[1],
-    most_light=1.5,
+    min_left=LIGHT_RANGE[0],
+    max_left=LIGHT_RANGE[1],
+    max_light=1.5,
     # Pixels on either side of a shadow's edge that tell it.
-    fewest=20.0,
+    min_pixels=20.0,
     # How well lines, blur, and the width of the shadow's edge are known beforehand.
     line_sigma=0.05,
     log_edge_sigma=0.1,
     log_width_sigma=0.7,
     first_width=0.8,
-    least_width=0.3,
-    most_width=6.0,
+    min_width=0.3,
+    max_width=6.0,
     # In so many directions a sharp step is sought; then corner and step are fitted with so many steps.
     angles=16,
     iterations=8,

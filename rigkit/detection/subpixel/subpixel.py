@@ -17,7 +17,7 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.consistent import checked, confirmed, with_holes
 from rigkit.detection.subpixel.correlation import board_factors
-from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
+from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import TAIL_SIGMAS, WINDOW_REACH, Geometry, ends_of, tilted
 from rigkit.detection.subpixel.outer_squares import fitted_beside_paper
@@ -172,10 +172,10 @@ class _Windows:
         """Return those of the corners of `start`, with `sides` and `gaps` (N, 2, 2), and `blur` (R, C); `aslant` where
         it matters how neighbouring lines are turned."""
         known, pixels = start.lattice.known, start.lattice.pixels
-        bends, bends_sigma = line_bends_to_fit(pixels, start.sigma_px, known, sides, radius_px)
-        geometry = Geometry(sides, bends, gaps, ends_of(known, known))
+        curvatures, curvature_sigma = line_curvatures_to_fit(pixels, start.sigma_px, known, sides, radius_px)
+        geometry = Geometry(sides, curvatures, gaps, ends_of(known, known))
         geometry = tilted(geometry, known) if aslant else geometry
-        return cls(start.lattice, geometry, bends_sigma, blur[known], radius_px)
+        return cls(start.lattice, geometry, curvature_sigma, blur[known], radius_px)
 
     def fit(
         self, image: GreyImage, signs: FloatArray, which: BoolArray | slice, geometry: Geometry, most: tuple[int, float]

@@ -49,7 +49,7 @@ FELT_SIGMAS = 4.0
 ROUGH_STEP_PX = 0.1
 """A step that ends a round after which tags are fitted again: what is left after it is a tenth of it."""
 
-MOST_TAKEN = 0.02
+MAX_TAKEN = 0.02
 """The last step takes no more than this part of the squares that are left: sigmas are right to a hundredth. The light
 is not known beforehand, and one fitted a step later than the corners made sigmas up to four times too large."""
 
@@ -59,14 +59,14 @@ def _rules(converged_px: float) -> TagRules:
         tail_sigmas=FELT_SIGMAS,
         pixel_kurtosis=PIXEL_KURTOSIS,
         sharp_blur=SHARP_BLUR_PX,
-        least_blur=BLUR_RANGE[0],
-        most_blur=BLUR_RANGE[1],
-        most_move_px=MAX_MOVE_PX,
-        most_blur_change=MAX_BLUR_CHANGE,
+        min_blur=BLUR_RANGE[0],
+        max_blur=BLUR_RANGE[1],
+        max_move_px=MAX_MOVE_PX,
+        max_blur_change=MAX_BLUR_CHANGE,
         light_sigma=LIGHT_SIGMA_PER_PX,
-        least_variance=ROUNDING_VARIANCE,
+        min_variance=ROUNDING_VARIANCE,
         converged_px=converged_px,
-        most_taken=MOST_TAKEN,
+        max_taken=MAX_TAKEN,
         iterations=LAST_PASS[1],
     )
 

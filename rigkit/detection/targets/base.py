@@ -72,7 +72,7 @@ class Search:
         self._lattices = list(lattices)
 
     @property
-    def fewest(self) -> int:
+    def min_corners_seen(self) -> int:
         """Corners that the smallest lattice of interest has: a whole board may have fewer than `min_corners`."""
         whole = (max(columns * rows, MIN_BOARD_CORNERS) for columns, rows in self.chessboard_sizes)
         return min([self.min_corners, *whole])
@@ -81,14 +81,14 @@ class Search:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)
         only = self.chessboard_sizes if plain else ()
         marked = any(board.pattern.type == Charuco.type for board in self.boards)
-        found = find_lattices(self.grey, self.fewest, only, marked=marked)
+        found = find_lattices(self.grey, self.min_corners_seen, only, marked=marked)
         if not found and self.grey.dtype != np.uint8:
             # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
-            seen = [item.lattice for item in find_lattices(equalised(self.grey), self.fewest, only)]
+            seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
             # What is hot beside a board moves corners of the equalised image: they are placed on one that is only
             # brighter.
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
-            found = fitted(self.grey, seen, self.fewest, only)
+            found = fitted(self.grey, seen, self.min_corners_seen, only)
         return found
 
 

@@ -28,7 +28,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.saddles.response import GreyImage, pyramid
 from rigkit.detection.subpixel.correlation import shared_noise, with_uneven
-from rigkit.detection.subpixel.edge_curvature import line_bends_to_fit
+from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
@@ -49,7 +49,7 @@ MIN_VOTES, AGREEING_VOTES = 3, 0.7
 WIPES = 2
 """Times that markers are wiped out and corners fitted anew: the second time from corners without their ink."""
 
-MOVED_PX, MIN_MOVED, LEAST_DRAWN = 0.05, 12, -0.5
+MOVED_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.5
 """By how much markers are wiped out beside their places, corner by corner this way or that, to see how corners follow;
 coordinates that say it at least; and the least that is believed: sigmas are doubled then."""
 
@@ -332,7 +332,7 @@ def _drawn_by_markers(
     empty = replace(board, pattern=Chessboard())
     moved = placed_together(wiped, _fitted(wiped, told, empty, blur)).lattice.pixels - found.lattice.pixels
     back = -(moved / off)[np.isfinite(moved)]
-    return max(float(np.median(back)), LEAST_DRAWN) if len(back) >= MIN_MOVED else 0.0
+    return max(float(np.median(back)), MIN_DRAWN) if len(back) >= MIN_MOVED else 0.0
 
 
 def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> RefinedLattice:
@@ -341,8 +341,8 @@ def _fitted(image: GreyImage, refined: RefinedLattice, board: Board, blur: float
     known = lattice.known
     shape = fit_cells(lattice.pixels, known)
     # A corner that a shadow crosses, or a finger, bends no lines: it is uncertain, and says so.
-    bends = line_bends_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
-    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, bends)
+    curvatures = line_curvatures_to_fit(lattice.pixels, refined.sigma_px, known, shape.sides, RADIUS_PX)
+    fit = fit_corners(image, board, known, shape, lattice.pixels[known], lattice.signs()[known], blur, curvatures)
     shared = shared_noise(fit, shape.sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
     fit = with_uneven(fit, shape.sides, RADIUS_PX, shared)
 

@@ -200,15 +200,15 @@ def grow(
         line.E21,
         sigma=line.sigma_px,
         sigma_A=line.sigma_A,
-        most_distance=line.max_distance_px,
+        max_distance=line.max_distance_px,
     )
     rules = patch_rules(
         HALF_WIDTH,
         coarsest=COARSEST,
-        most_move=MAX_GROWTH_MOVE_PX,
-        least_correlation=min_correlation,
+        max_move=MAX_GROWTH_MOVE_PX,
+        min_correlation=min_correlation,
         settled_px=settled_px,
-        most_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
+        max_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
     assert seeds.A21 is not None
     starts = starts_of(seeds.pixels1, seeds.pixels2, seeds.A21)

@@ -13,8 +13,8 @@ import numpy as np
 
 from rigkit.calibration.clustered import reduced_by_cluster
 from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.rig.carried import carried_by_mount, summed_products
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians_of_mount, summed_products
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.outliers import inliers, sigma_of
 from rigkit.calibration.solving.poses import refine_poses
@@ -246,7 +246,7 @@ class _PosedBoards:
             if seen is not None:
                 own = view_products(seen, self.state(watched, c, seen), self.weight[c])
                 lever = self.translation_mm[self.group[c]] @ pose.rotation.T
-                follow = carried_by_mount(pose.rotation, layout.mounts[c], self.group[c], lever)
+                follow = pose_jacobians_of_mount(pose.rotation, layout.mounts[c], self.group[c], lever)
                 each.append((own, np.arange(lens.start, lens.stop), (follow,)))
         return summed_products(each, len(self.frame), layout.count)
 

@@ -59,10 +59,10 @@ class Frames:
         """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
         held = held_boards(watched.cameras[c], board, reach)
         held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
-        in_rig = held.carried(watched.cam_from_rig[c].inverse())
+        in_rig = held.transformed(watched.cam_from_rig[c].inverse())
         seen = np.stack(
             [
-                sees_held(camera, board, in_rig.carried(pose), reach)
+                sees_held(camera, board, in_rig.transformed(pose), reach)
                 for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
             ],
             axis=1,

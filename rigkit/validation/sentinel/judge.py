@@ -60,7 +60,7 @@ class Change:
     amounts, covariance : (K,) and (K, K), in `cause.units`.
     chance : probability that unchanged cameras show as much of it.
     size_px : how far it moves the projection, rms after the best rotation; of a mount, how far what it shows moves.
-    most_px : the same with how unsure it is: what may be large is not small because it is told badly.
+    max_px : the same with how unsure it is: what may be large is not small because it is told badly.
     gain : by how much it lowers the sum of squares.
     """
 
@@ -69,7 +69,7 @@ class Change:
     covariance: FloatArray
     chance: float
     size_px: float
-    most_px: float
+    max_px: float
     gain: float
 
     @property
@@ -135,7 +135,7 @@ class SentinelCheck:
         """Nothing says that the calibration does not hold."""
         if self.unexplained:
             return False
-        return self.change is None or self.chance >= ALARM_CHANCE or self.change.most_px < ALARM_PX
+        return self.change is None or self.chance >= ALARM_CHANCE or self.change.max_px < ALARM_PX
 
 
 def _wild(rms_px: float, expected_px: float) -> bool:
@@ -182,8 +182,8 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         step = best.cause.directions @ amounts
         unsure = best.cause.directions @ best.covariance @ best.cause.directions.T
         covariance = watched.covariance + unsure
-        size_px, most_px = _sizes_px(watched, evidence, step, unsure)
-        change = replace(best, amounts=amounts, size_px=size_px, most_px=most_px)
+        size_px, max_px = _sizes_px(watched, evidence, step, unsure)
+        change = replace(best, amounts=amounts, size_px=size_px, max_px=max_px)
     goals = cost or lens_goals(watched)
     return SentinelCheck(
         chance=chance,
@@ -284,7 +284,7 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     m = len(amounts)
     chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
     return Change(
-        cause=cause, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, most_px=0.0, gain=gain
+        cause=cause, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, max_px=0.0, gain=gain
     )
 
 

@@ -50,12 +50,12 @@ def describe(found: Sequence[BoardDetection]) -> FloatArray | None:
 
 
 class FrameChoice:
-    """The frames kept so far, at most twice as many as `most`."""
+    """The frames kept so far, at most twice as many as `max_frames`."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, max_frames: int) -> None:
         self.kept: dict[int, KeptFrame] = {}
         self.near_copies = 0
-        self._most, self._radius = most, SAME_VIEW
+        self._max_frames, self._radius = max_frames, SAME_VIEW
 
     def offer(self, frame: KeptFrame) -> tuple[bool, list[int]]:
         """Consider `frame`; return whether it is kept, and the numbers of those that are no longer."""
@@ -67,7 +67,7 @@ class FrameChoice:
             del self.kept[k]
         self.kept[frame.number] = frame
         gone = list(near)
-        while len(self.kept) > 2 * self._most:
+        while len(self.kept) > 2 * self._max_frames:
             self._radius *= GROWTH
             gone += self._thin()
         return frame.number in self.kept, gone
@@ -78,7 +78,7 @@ class FrameChoice:
         if self.kept:
             limit = BLURRED * float(np.median([frame.sigma_px for frame in self.kept.values()]))
             self.kept = {k: frame for k, frame in self.kept.items() if frame.sigma_px <= limit}
-        if len(self.kept) > self._most:
+        if len(self.kept) > self._max_frames:
             self.kept = {k: self.kept[k] for k in sorted(self._farthest())}
         return sorted(before - set(self.kept))
 
@@ -94,12 +94,12 @@ class FrameChoice:
         return sorted(gone)
 
     def _farthest(self) -> list[int]:
-        """Return the `most` frames of which each is as far as can be from those before it (Gonzalez 1985), starting
+        """Return `max_frames` frames, of which each is as far as can be from those before it (Gonzalez 1985), starting
         with the one that most cameras see the sharpest."""
         frames = list(self.kept.values())
         first = min(range(len(frames)), key=lambda k: (-len(frames[k].views), frames[k].sigma_px))
         chosen, apart = [first], np.array([_apart(frames[first], other) for other in frames])
-        while len(chosen) < self._most:
+        while len(chosen) < self._max_frames:
             chosen.append(int(apart.argmax()))
             apart = np.minimum(apart, [_apart(frames[chosen[-1]], other) for other in frames])
         return [frames[k].number for k in chosen]

@@ -81,16 +81,21 @@ def timestamps_beside(sources: Sequence[Path]) -> Path | None:
 
 
 def frames_of_video(
-    source: Path, folder: Path, boards: Sequence[Board] = (), *, most: int = MAX_FRAMES, progress: Progress = silent
+    source: Path,
+    folder: Path,
+    boards: Sequence[Board] = (),
+    *,
+    max_frames: int = MAX_FRAMES,
+    progress: Progress = silent,
 ) -> VideoFrames:
-    """Keep the frames of a video, a sequence of files or a live camera (until it has `most`, or Ctrl-C) as PNG files.
+    """Keep frames of a video, a sequence of files or a live camera (until it has `max_frames`, or Ctrl-C) as PNG files.
 
     Frames that were kept before, of the same video for the same boards, are used again.
 
     Raises InputError: the video cannot be read, no frame shows a board, or `folder` cannot be written to, or holds
     other files.
     """
-    return frames_of_videos({"": source}, folder, boards, most=most, progress=progress)
+    return frames_of_videos({"": source}, folder, boards, max_frames=max_frames, progress=progress)
 
 
 def frames_of_videos(
@@ -99,7 +104,7 @@ def frames_of_videos(
     boards: Sequence[Board] = (),
     *,
     timestamps: Path | None = None,
-    most: int = MAX_FRAMES,
+    max_frames: int = MAX_FRAMES,
     progress: Progress = silent,
 ) -> VideoFrames:
     """Keep frames of one moment of several cameras, by name; as `frames_of_video`.
@@ -107,11 +112,11 @@ def frames_of_videos(
     `timestamps` says which frames are of one moment (`rigkit.io.video.read_timestamps`); without, those of one number
     are: the videos began together and lost none.
     """
-    asked = _asked(sources, boards, timestamps, most)
+    asked = _asked(sources, boards, timestamps, max_frames)
     kept = _kept_before(folder, asked)
     if kept is not None:
         return kept
-    keeper = _FrameFolder(folder, FrameChoice(most))
+    keeper = _FrameFolder(folder, FrameChoice(max_frames))
     looked_at = with_boards = 0
     with _opened(sources, timestamps) as (videos, moments):
         live = any(video.live for video in videos.values())
@@ -128,7 +133,7 @@ def frames_of_videos(
                 if frame is not None:
                     with_boards += 1
                     keeper.offer(frame, {name: pictures[name] for name in frame.views})
-                if live and len(keeper.choice.kept) >= most:
+                if live and len(keeper.choice.kept) >= max_frames:
                     break
         # Moments that were told of and had no frame are not waited for.
         progress(SEARCHING, looked_at, looked_at)
@@ -296,7 +301,7 @@ class _FrameFolder:
 
 
 def _asked(
-    sources: Mapping[str, Path], boards: Sequence[Board], timestamps: Path | None, most: int
+    sources: Mapping[str, Path], boards: Sequence[Board], timestamps: Path | None, max_frames: int
 ) -> dict[str, object]:
     """Return what the choice depends on: the files by size and time of change, the boards."""
     files = [*sources.values(), *([timestamps] if timestamps else [])]
@@ -306,7 +311,7 @@ def _asked(
         "cameras": {name: path.name for name, path in sources.items()},
         "files": state,
         "boards": digest,
-        "most": most,
+        "most": max_frames,
     }
 
 

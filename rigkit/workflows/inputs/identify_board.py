@@ -279,12 +279,12 @@ def _guess(
     guess: BoardGuess | None = None
     unreadable: InputError | None = None
     pictures: list[tuple[str, GreyImage]] = []
-    for most, between in ((EXPLAINING_IMAGES, False), (ENOUGH_IMAGES, False), (ENOUGH_IMAGES, True)):
+    for max_images, between in ((EXPLAINING_IMAGES, False), (ENOUGH_IMAGES, False), (ENOUGH_IMAGES, True)):
         # Every second one of a session may be of something else.
-        if between and (guess is not None or len(paths) <= most):
+        if between and (guess is not None or len(paths) <= max_images):
             break
         pictures = []
-        for name, one in _pictures(paths, most, between):
+        for name, one in _pictures(paths, max_images, between):
             if isinstance(one, InputError):
                 unreadable = unreadable or one
             else:
@@ -295,33 +295,35 @@ def _guess(
             return None, [], None
         # Where some do not show it, more are asked.
         told = guess is not None and guess.told and 1 < len(guess.images) == len(pictures)
-        if told or (len(paths) <= most and not any(map(is_video, paths))):
+        if told or (len(paths) <= max_images and not any(map(is_video, paths))):
             break
     return guess, pictures, unreadable
 
 
-def _pictures(paths: Sequence[Path], most: int, between: bool = False) -> Iterator[tuple[str, GreyImage | InputError]]:
-    """Yield the names and grey levels of about `most` images, evenly spread over `paths`, or why one cannot be read;
-    of those that lie between these.
+def _pictures(
+    paths: Sequence[Path], max_images: int, between: bool = False
+) -> Iterator[tuple[str, GreyImage | InputError]]:
+    """Yield the names and grey levels of about `max_images` images, evenly spread over `paths`, or why one cannot be
+    read; of those that lie between these.
 
     Of videos frames are taken.
     """
-    step = max(1, -(-len(paths) // most))
+    step = max(1, -(-len(paths) // max_images))
     for path in paths[step // 2 if between else 0 :: step]:
         try:
             if is_video(path):
-                yield from _frames(path, max(1, most // len(paths)))
+                yield from _frames(path, max(1, max_images // len(paths)))
             else:
                 yield str(path), grey_image(read_image(path))
         except InputError as error:
             yield str(path), error
 
 
-def _frames(path: Path, most: int) -> Iterator[tuple[str, GreyImage]]:
+def _frames(path: Path, max_images: int) -> Iterator[tuple[str, GreyImage]]:
     """Yield so many frames of a video, evenly spread over it."""
     with Video(path) as video:
-        step = max(1, video.count // most) if video.count else FRAMES_APART
-        for k in range(most):
+        step = max(1, video.count // max_images) if video.count else FRAMES_APART
+        for k in range(max_images):
             # The middles of equal parts: at its ends a board is on its way in or out.
             frame = video.frame(k * step + step // 2)
             if frame is None:

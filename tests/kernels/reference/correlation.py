@@ -48,8 +48,8 @@ _WHOLE, _BETWEEN = _blends()
 
 def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> FloatArray:
     products, pairs, noise, pixels, sides, blur, used, good, owner = corners
-    assert (rules.light_share, rules.lost_error, rules.least_left) == (LIGHT_SHARE, LOST_ERROR, MIN_LEFT)
-    assert (rules.covered_times, rules.least_factor, rules.least_blur) == (
+    assert (rules.light_share, rules.lost_error, rules.min_left) == (LIGHT_SHARE, LOST_ERROR, MIN_LEFT)
+    assert (rules.covered_times, rules.min_factor, rules.min_blur) == (
         COVERED_TIMES,
         MIN_SIGMA_FACTOR,
         BLUR_RANGE[0],
@@ -75,7 +75,7 @@ def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> F
 
 def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
     products, pairs, noise, _, _, _, _, good, owner = corners
-    assert (rules.least_alike, rules.uneven_times) == (MIN_ALIKE, UNEVEN_TIMES)
+    assert (rules.min_alike, rules.uneven_times) == (MIN_ALIKE, UNEVEN_TIMES)
     out = np.ones(len(owner))
     seen = good & (pairs[:, 0] > 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -48,7 +48,7 @@ from rigkit.detection.subpixel.edge_fit import (
 )
 from rigkit.detection.subpixel.edge_model import NEAR_PX, NEAR_SIGMAS, WINDOW_REACH, Geometry
 from rigkit.detection.tags.corners import NOTHING_NEAR_PX
-from rigkit.kernels.edges import LAGS, BendRules, Rules, TagWindow
+from rigkit.kernels.edges import LAGS, CurvatureRules, Rules, TagWindow
 from rigkit.kernels.surface import TagSurface
 
 MIN_DETERMINED_PIXELS = K1
@@ -103,7 +103,7 @@ def fit_corners(
         )
         rows[kept[active], K1 : K2 + 1] = 0.0
         products = (rows @ np.swapaxes(rows, 1, 2)).astype(np.float64)
-        variance[active] = np.maximum(products[:, -1, -1] / free[active], rules.least_variance)
+        variance[active] = np.maximum(products[:, -1, -1] / free[active], rules.min_variance)
         pull = prior[active] * variance[active, None]
         hessian = products[:, :-1, :-1]
         hessian[:, diagonal, diagonal] += pull + FIT_RIDGE
@@ -124,15 +124,15 @@ def fit_corners(
             break
     noise, lags = variance, np.zeros((2, len(pixels), len(LAGS)))
     if rules.mirrored:
-        variance = np.maximum((rest**2).sum(axis=1) / free, rules.least_variance)
+        variance = np.maximum((rest**2).sum(axis=1) / free, rules.min_variance)
         noise, lags = _noise(values, variance, window, rest)
-        lags[:, noise <= rules.least_variance] = 0.0
-        noise = np.maximum(noise, rules.least_variance)
+        lags[:, noise <= rules.min_variance] = 0.0
+        noise = np.maximum(noise, rules.min_variance)
     return _result(values, variance, noise, lags, normal, window, pixels, geometry, sign)
 
 
-def line_bends(
-    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: BendRules
+def line_curvatures(
+    pixels: FloatArray, sigma_px: FloatArray, cells: BoolArray, sides_px: FloatArray, rules: CurvatureRules
 ) -> tuple[FloatArray, FloatArray]:
     steps = np.arange(-LINE_REACH, LINE_REACH + 1)
     design = steps[:, None].astype(np.float64) ** np.arange(COEFFICIENTS)

@@ -111,13 +111,13 @@ def corners(
     known: FloatArray,
     reach: float,
 ) -> CornersOfLevel:
-    radius, most_step, most_sharp = tests
-    assert most_step == MAX_STEP and rules.most_odd == MAX_ODD
+    radius, max_step, max_sharp = tests
+    assert max_step == MAX_STEP and rules.max_odd == MAX_ODD
     found, near = saddle_step(smooth, at)
     found, response = found[near], response[near]
     which = np.flatnonzero(may_be_corners(smooth, found, radius, response))
     rings = read_rings(smooth, found[which], radius)
-    good = rings.valid & (response[which] <= most_sharp * rings.contrast**2)
+    good = rings.valid & (response[which] <= max_sharp * rings.contrast**2)
     scale, offset = to_full
     full = scale * found + offset
     pixels = full[which[good]]

@@ -21,7 +21,7 @@ from rigkit.kernels.light import LIGHT_ASIDE
 RADIUS_PX, LIGHT_REACH_CELLS, WIDTH_RANGE_PX = (
     LIGHT_RULES.radius_px,
     LIGHT_RULES.reach_cells,
-    (LIGHT_RULES.least_width, LIGHT_RULES.most_width),
+    (LIGHT_RULES.min_width, LIGHT_RULES.max_width),
 )
 
 OFFSETS = np.stack(np.meshgrid(*[np.arange(-RADIUS_PX, RADIUS_PX + 1.0)] * 2), axis=-1).reshape(-1, 2)
@@ -109,7 +109,9 @@ def hard_steps(values: FloatArray, pattern: FloatArray, weight: FloatArray) -> t
         lit, dark = sums[:, :, :-1], sums[:, :, -1:] - sums[:, :, :-1]
         (level, contrast, rest), (level_2, contrast_2, rest_2) = levels(lit), levels(dark)
         left = (level * level_2 + contrast * contrast_2) / np.maximum(level**2 + contrast**2, 1e-9)
-        usable = (left > LIGHT_RANGE[0]) & (left < LIGHT_RANGE[1]) & (np.minimum(lit[0], dark[0]) > LIGHT_RULES.fewest)
+        usable = (
+            (left > LIGHT_RANGE[0]) & (left < LIGHT_RANGE[1]) & (np.minimum(lit[0], dark[0]) > LIGHT_RULES.min_pixels)
+        )
         total = np.where(usable, rest + rest_2, np.inf)
         at = total.argmin(axis=1)
         better = total[mine, at] < best
@@ -161,7 +163,7 @@ def together(
         step = np.linalg.solve(products + diagonal, right[..., None])[..., 0].clip(-MAX_LIGHT_STEP, MAX_LIGHT_STEP)
         tried = now + step
         tried[:, WIDTH] = tried[:, WIDTH].clip(*np.log(WIDTH_RANGE_PX))
-        tried[:, LEFT] = tried[:, LEFT].clip(0.5 * LIGHT_RANGE[0], LIGHT_RULES.most_light)
+        tried[:, LEFT] = tried[:, LEFT].clip(0.5 * LIGHT_RANGE[0], LIGHT_RULES.max_light)
         fresh = seen(tried)
         better = fresh[2] < cost
         now, cost = np.where(better[:, None], tried, now), np.minimum(fresh[2], cost)

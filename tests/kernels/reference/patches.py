@@ -37,7 +37,7 @@ def aligned(
     width: float,
     prior: Any = None,
     excess_noise: float = 1.0,
-    least_noise: float = 0.3,
+    min_noise: float = 0.3,
 ) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return place, affinity, correlation and covariance (6, 6) of (u2, v2, A).
 
@@ -62,7 +62,7 @@ def aligned(
         there = there - (w @ there) / w.sum()
         energy, common = w @ (T * T), w @ (T * there)
         correlation = common / np.sqrt(energy * (w @ (there * there)))
-        noise = energy * (1 - correlation**2) / w.sum() * effective / (effective - 8.0) + least_noise**2
+        noise = energy * (1 - correlation**2) / w.sum() * effective / (effective - 8.0) + min_noise**2
         step, normal = energy / common * J.T @ (w * there), H.copy()
         if prior is not None:
             rows, values = prior(q2, A)
@@ -87,9 +87,9 @@ def grown(
     *,
     half: int,
     width: float,
-    least_correlation: float,
-    most_move: float,
-    most_tries: int,
+    min_correlation: float,
+    max_move: float,
+    max_tries: int,
 ) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray, float]]:
     """Return (row, column) -> place, affinity and correlation of what grows without an epipolar geometry."""
     rows, columns = (image1.shape[0] - 1) // step + 1, (image1.shape[1] - 1) // step + 1
@@ -104,7 +104,7 @@ def grown(
             if (q - reach < 2.0).any() or (q + reach > np.array(image.shape[::-1]) - 4.0).any():
                 return
         place, affinity, correlation, _ = aligned(image1, image2, q1, q2, A, half=half, width=width)
-        if correlation >= least_correlation and np.linalg.norm(place - q2) < most_move:
+        if correlation >= min_correlation and np.linalg.norm(place - q2) < max_move:
             out[node] = place, affinity, correlation
             heapq.heappush(heap, (-correlation, node))
 
@@ -120,7 +120,7 @@ def grown(
             node = row + dv, column + du
             if not (0 <= node[0] < rows and 0 <= node[1] < columns) or node in out:
                 continue
-            if tries.get(node, 0) < most_tries:
+            if tries.get(node, 0) < max_tries:
                 tries[node] = tries.get(node, 0) + 1
                 attempt(node, q2 + A @ (step * np.array([du, dv], float)), A)
     return out

@@ -207,9 +207,9 @@ class _Fitter:
         surface = smooth.at(rows_where(self.places, cells))
         half = np.minimum(rows_where(self.reach, cells) * surface.lengths, LAST_PASS[0])
         # A line of curvature k lies off its chord by k w^2 / 6 in the mean over w to either side.
-        bends = np.abs(surface.curvature - rows_where(self.curvature, cells))
+        curvatures = np.abs(surface.curvature - rows_where(self.curvature, cells))
         # Of two columns; max(axis=1) takes ten times as long.
-        off = np.maximum(bends[:, 0], bends[:, 1]) * np.maximum(half[:, 0], half[:, 1]) ** 2 / 6.0
+        off = np.maximum(curvatures[:, 0], curvatures[:, 1]) * np.maximum(half[:, 0], half[:, 1]) ** 2 / 6.0
         bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
         if not bent.any():
             return state

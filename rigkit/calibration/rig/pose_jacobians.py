@@ -16,19 +16,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.covariance import Carried
+from rigkit.calibration.covariance import PoseJacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 
 
-def carried(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> list[Carried]:
+def pose_jacobians(
+    observations: RigObservations, state: RigState, c: int, translation_mm: Points
+) -> list[PoseJacobians]:
     """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from targets, its mount where that
     is free, and (board by board, where boards have places on a target) from these."""
     layout, frame, lever = state.layout(observations), observations.frame[c], translation_mm - state.mount_mm[c]
     turn = state.mount_rotation[c]
     if not observations.tied:
-        return [carried_by_mount(turn, layout.mounts[c], frame, lever)]
+        return [pose_jacobians_of_mount(turn, layout.mounts[c], frame, lever)]
     out, board = [], observations.cameras[c].board
     for b in np.unique(board).tolist():
         views = np.flatnonzero(board == b)
@@ -37,14 +39,14 @@ def carried(observations: RigObservations, state: RigState, c: int, translation_
         place[:, :3, :3] = place[:, 3:, 3:] = onto
         target = _swung(onto @ state.board_mm[b]) @ _turned(turn)
         free = _free([(layout.mounts[c], _swung(lever[views])), (layout.boards[b], place)], len(views))
-        out.append(Carried(views, frame[views], target, *free))
+        out.append(PoseJacobians(views, frame[views], target, *free))
     return out
 
 
-def carried_by_mount(rotation: Mat3, mount: slice | None, poses: IntArray, lever: Points) -> Carried:
+def pose_jacobians_of_mount(rotation: Mat3, mount: slice | None, poses: IntArray, lever: Points) -> PoseJacobians:
     """Return how V boards, targets all, follow their `poses` (V,) in the rig and the `mount` of a camera, None where
     that is not free: it has this `rotation`, and the boards lie at `lever` (V, 3) from where it has the rig."""
-    return Carried(np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _swung(lever))], len(poses)))
+    return PoseJacobians(np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _swung(lever))], len(poses)))
 
 
 def pose_products(observations: RigObservations, state: RigState, products: Sequence[FloatArray]) -> FloatArray:
@@ -56,7 +58,7 @@ def pose_products(observations: RigObservations, state: RigState, products: Sequ
         (
             own,
             np.r_[lens.start : lens.stop, layout.shape.start : n],
-            carried(observations, state, c, state.of_camera(c, observations).translation_mm),
+            pose_jacobians(observations, state, c, state.of_camera(c, observations).translation_mm),
         )
         for c, (own, lens) in enumerate(zip(products, layout.cameras, strict=True))
     ]
@@ -64,7 +66,7 @@ def pose_products(observations: RigObservations, state: RigState, products: Sequ
 
 
 def summed_products(
-    each: Sequence[tuple[FloatArray, IntArray, Sequence[Carried]]], poses: int, count: int
+    each: Sequence[tuple[FloatArray, IntArray, Sequence[PoseJacobians]]], poses: int, count: int
 ) -> FloatArray:
     """Return the products of so many poses and globals, (F, G + 7, G + 7): of each camera given are those of its views
     (V, P + 7, P + 7), where its own P unknowns stand among the globals, and how the views follow."""

@@ -47,7 +47,7 @@ INLINE double most_probable(const taylor_t *line, const double sigma[TERMS], dou
 /* Set `out` to the curvature at place `at` of a line of `count` corners, `stride` cells apart, and its sigma. */
 INLINE void line_bend(
     const double *pixels, const double *sigma, int64_t stride, int64_t at, int64_t count, double side,
-    const bend_rules_t *rules, double *out, double *out_sigma)
+    const curvature_rules_t *rules, double *out, double *out_sigma)
 {
     taylor_t line = {0};
     const double per_side = 1.0 / side;
@@ -58,7 +58,7 @@ INLINE void line_bend(
         double wide = sigma[step * stride];
         if (!isfinite(wide) || !isfinite(other[0]))
             continue;
-        wide = per_side * (wide > rules->least_sigma ? wide : rules->least_sigma);
+        wide = per_side * (wide > rules->min_sigma ? wide : rules->min_sigma);
         const double u = (other[0] - pixels[0]) * per_side, v = (other[1] - pixels[1]) * per_side;
         double moment = 1.0 / (wide * wide);
         for (int k = 0; k < 2 * TERMS - 1; k++) {
@@ -92,11 +92,11 @@ INLINE void line_bend(
 }
 
 /* Set `out` (M, 2) to the curvature of row and column at the M wanted cells and `out_sigma` to its standard deviation
- * (reference.edges.line_bends). */
+ * (reference.edges.line_curvatures). */
 FOR_EACH_PROCESSOR
-void line_bends(
+void line_curvatures(
     const double *pixels, const double *sigma, const uint8_t *wanted, int64_t rows, int64_t columns, int64_t count,
-    const double *sides, const bend_rules_t *rules, double *out, double *out_sigma)
+    const double *sides, const curvature_rules_t *rules, double *out, double *out_sigma)
 {
     (void)count;
     for (int64_t row = 0; row < rows; row++)
