@@ -163,7 +163,11 @@ INLINE void look_along(const double near[3][3], int64_t lines, const double ends
         out->before[order] = (order ? 0.0 : 1.0) - low[order];
         out->beyond[order] = high[order];
     }
-    for (int64_t line = 0; line < lines; line++)
+    /* Of the lines only those near change with the place: all before add -2 and 2 in turn, those beyond nothing. */
+    const double reach = (NEAR_SIGMAS * sharp + 1.0) * slope;
+    const int64_t first = place > reach ? (int64_t)limited(place - reach, (double)lines) : 0;
+    out->squares[0] -= first % 2 ? 2.0 : 0.0;
+    for (int64_t line = first; line < lines && (double)line < place + reach; line++)
         add_line(place, (double)line, slope, bend, turn, sharp, line % 2 ? 2.0 : -2.0, out->squares);
 }
 
