@@ -103,6 +103,6 @@ def line_curvatures(
     """Return what `detection.subpixel.edge_curvature.line_curvature` does."""
     count = len(sides_px)
     if np.count_nonzero(cells) != count:
-        raise ValueError(f"line_bends: {count} sides for {np.count_nonzero(cells)} cells")
+        raise ValueError(f"line_curvatures: {count} sides for {np.count_nonzero(cells)} cells")
     curvatures: tuple[FloatArray, FloatArray] = kernels().line_curvatures(pixels, sigma_px, cells, sides_px, rules)
     return curvatures

@@ -60,7 +60,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         what = change.cause.words if change.cause.kind == "lens" else change
         headline = f"Does NOT hold ({p}): {what}; {_cost_words(check, change)}"
         unsure = (
-            "" if change.size_px >= ALARM_PX else f", perhaps {change.most_px:.2f} px: these pictures tell it badly"
+            "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
         )
         sentences.append(
             f"It moves the projection by {change.size_px:.3f} px rms{unsure}; after the correction "
