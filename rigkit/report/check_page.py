@@ -59,9 +59,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         # What changed in several ways is told by what it does alone.
         what = change.cause.words if change.cause.kind == "lens" else change
         headline = f"Does NOT hold ({p}): {what}; {_cost_words(check, change)}"
-        unsure = (
-            "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
-        )
+        unsure = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
         sentences.append(
             f"It moves the projection by {change.size_px:.3f} px rms{unsure}; after the correction "
             f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
