@@ -6,8 +6,8 @@
  * be, nobody sees), the blur s, and the light (1 + g . x) (a + b S), S the share of the disc. */
 #include "circle_model.h"
 
-/* Steps are taken no shorter or longer than this. */
-static const double SHORTEST = 0.3, LONGEST = 4.0;
+/* Steps are taken no shorter or longer than this: where two of them are nearly alike, or opposite, noise decides the ratio. */
+static const double MIN_TIMES = 0.3, MAX_TIMES = 4.0;
 
 /* Gather the pixels near the edge and within `reach` radii, at most `capacity`. */
 INLINE void gather(
@@ -95,7 +95,7 @@ INLINE double relaxed(double times, double moves, double along, double before)
 {
     const double change = moves - 2.0 * along + before;
     const double fresh = times * (before - along) / (change > 1e-12 * before ? change : 1e-12 * before);
-    return fresh < SHORTEST ? SHORTEST : fresh > LONGEST ? LONGEST : fresh;
+    return fresh < MIN_TIMES ? MIN_TIMES : fresh > MAX_TIMES ? MAX_TIMES : fresh;
 }
 
 /* Let the map grow by the symmetric matrix of `step`. */

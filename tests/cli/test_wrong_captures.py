@@ -172,12 +172,17 @@ def test_wrong_squares_are_named(
     assert "50.0" in text
 
 
+def declare_squares(folder: Path, capture: tuple[Path, dict[str, StereoScene]], square_mm: str) -> None:
+    """Write a manifest of one pair whose second board is declared with squares of another size."""
+    path = folder / "plane2.toml"
+    path.write_text(path.read_text().replace("50.0", square_mm))
+    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+
+
 def test_one_board_with_wrong_squares_is_named(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = folder / "plane2.toml"
-    path.write_text(path.read_text().replace("50.0", "51.5"))
-    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+    declare_squares(folder, capture, "51.5")
     code, text, failed = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
     assert "size plane2" in failed and failed <= {"baseline", "size plane2"}
@@ -187,9 +192,7 @@ def test_one_board_with_wrong_squares_is_named(
 def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = folder / "plane2.toml"
-    path.write_text(path.read_text().replace("50.0", "43.0"))
-    write_manifest(folder, pair_toml(capture[1]["same"], "same", ("regular", "regular")))
+    declare_squares(folder, capture, "43.0")
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
     said = "board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
