@@ -79,14 +79,14 @@ class HistoryEntry:
         the SHA-256 of the file of which it tells the changes."""
         amounts: dict[str, tuple[float, float]] = {}
         for change in check.tried:
-            cause = change.cause
+            what = change.hypothesis
             # Of flipped pictures nothing moved.
-            if cause.kind in ("lens", "moved") or check.flipped:
+            if what.kind in ("lens", "moved") or check.flipped:
                 continue
             several = len(change.amounts) > 1
-            for k, (amount, sigma, unit) in enumerate(zip(change.amounts, change.sigmas, cause.units, strict=True)):
-                whose = "" if cause.camera is None else f" of {cause.camera}"
-                amounts[f"{cause.kind}{whose}{f' {k + 1}' if several else ''}, {unit}"] = (float(amount), float(sigma))
+            for k, (amount, sigma, unit) in enumerate(zip(change.amounts, change.sigmas, what.units, strict=True)):
+                whose = "" if what.camera is None else f" of {what.camera}"
+                amounts[f"{what.kind}{whose}{f' {k + 1}' if several else ''}, {unit}"] = (float(amount), float(sigma))
         moment = now or datetime.now(UTC)
         return cls(
             date=moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),

@@ -57,7 +57,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         )
     else:
         # What changed in several ways is told by what it does alone.
-        what = change.cause.words if change.cause.kind == "lens" else change
+        what = change.hypothesis.words if change.hypothesis.kind == "lens" else change
         headline = f"Does NOT hold ({p}): {what}; {_cost_words(check, change)}"
         unsure = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
         sentences.append(
@@ -87,7 +87,7 @@ def _cost_words(check: SentinelCheck, change: Change) -> str:
     """Return what a change costs: in the length that is measured, or of what is a metre away."""
     if check.cost_unit != "px":
         return f"an error of {check.cost:.2g} {check.cost_unit} rms in the length"
-    c = 0 if change.cause.camera is None else check.watched.names.index(change.cause.camera)
+    c = 0 if change.hypothesis.camera is None else check.watched.names.index(change.hypothesis.camera)
     return px_words(check.watched.cameras[c], change.size_px)
 
 
@@ -96,7 +96,9 @@ def _nearest_words(check: SentinelCheck, change: Change) -> str:
     simpler = [
         c
         for c in check.tried
-        if c.cause.camera == change.cause.camera and PART_OF.get(c.cause.kind) == change.cause.kind and c.gain > 0.0
+        if c.hypothesis.camera == change.hypothesis.camera
+        and PART_OF.get(c.hypothesis.kind) == change.hypothesis.kind
+        and c.gain > 0.0
     ]
     if not simpler or change.gain <= 0.0:
         return ""
@@ -151,10 +153,10 @@ def check_table(check: SentinelCheck) -> Table:
     for change in check.tried:
         amounts = ", ".join(
             f"{a:+.3g} ± {s:.2g} {unit}"
-            for a, s, unit in zip(change.amounts, change.sigmas, change.cause.units, strict=True)
+            for a, s, unit in zip(change.amounts, change.sigmas, change.hypothesis.units, strict=True)
         )
-        named = check.change is not None and change.cause is check.change.cause
-        rows.append(cells(change.cause.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
+        named = check.change is not None and change.hypothesis is check.change.hypothesis
+        rows.append(cells(change.hypothesis.words, f"{change.chance:.2g}", Cell(change.gain, best=named), amounts))
     none = cells("nothing can be told from these pictures", "", None, "")
     heads = columns("if this alone happened | chance without it | explains .1 | amount")
     return Table("causes", "What may have happened", heads, tuple(rows) or (none,))
@@ -167,11 +169,11 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
         "holds": check.holds,
         "chance": check.chance,
         "statement": facts.headline,
-        "cause": None if change is None else change.cause.kind,
-        "camera": None if change is None else change.cause.camera,
+        "cause": None if change is None else change.hypothesis.kind,
+        "camera": None if change is None else change.hypothesis.camera,
         "amounts": [] if change is None else change.amounts.tolist(),
         "sigmas": [] if change is None else change.sigmas.tolist(),
-        "units": [] if change is None else list(change.cause.units),
+        "units": [] if change is None else list(change.hypothesis.units),
         "size_px": None if change is None else change.size_px,
         **{name: getattr(check, name) for name in ("cost", "cost_unit", "rms_px", "rms_fixed_px", "expected_px")},
         "powers": [without_nan(asdict(power)) for power in check.powers],

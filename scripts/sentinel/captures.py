@@ -13,7 +13,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.planning.goal import projection_goal
-from rigkit.validation.sentinel.causes import causes_of
+from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck
 from rigkit.validation.sentinel.watch import watched_camera
 from sentinel.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
@@ -56,11 +56,11 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
 def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     """Return a calibrated camera of any model after a change that leaves 0.15 px rms after the best rotation."""
     watched = watched_camera(full, "camera")
-    (cause,) = (c for c in causes_of(watched) if c.kind == what)
-    amount = rng.standard_normal((cause.directions.shape[1],))
+    (hypothesis,) = (c for c in hypotheses_of(watched) if c.kind == what)
+    amount = rng.standard_normal((hypothesis.directions.shape[1],))
     if what == "distortion":
         amount[1:] = 0.0
-    step = (cause.directions @ amount)[: full.camera.parameters.size]
+    step = (hypothesis.directions @ amount)[: full.camera.parameters.size]
     weight = projection_goal(full.camera).weight
     return full.camera.with_parameters(full.camera.parameters + step * CHANGED_PX / np.sqrt(step @ weight @ step))
 

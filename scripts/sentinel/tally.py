@@ -29,7 +29,7 @@ def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") 
     """Print how many of the checks alarm, and how many of these name `what` happened; keep the sums, by `how` pictures
     were taken."""
     alarms = [c for c in checks if not c.holds]
-    kinds = Counter("none" if c.change is None else c.change.cause.kind for c in alarms)
+    kinds = Counter("none" if c.change is None else c.change.hypothesis.kind for c in alarms)
     right = kinds[what]
     print(
         f"{title:32s} {len(alarms):3d} of {len(checks)} alarm, {right} of them rightly named: {dict(kinds)}", flush=True

@@ -175,7 +175,7 @@ def test_squares_of_another_size_are_a_change_of_scale(tmp_path: Path) -> None:
     rig, pictures = _rig_of_two(tmp_path, BOARD)
     change = check_pictures(rig, pictures, CheckOptions(boards=(Board("other", 9, 6, 20.0, 20.0),))).check.change
     assert change is not None
-    assert change.cause.kind == "scale"
+    assert change.hypothesis.kind == "scale"
     assert change.amounts[0] == pytest.approx(-20.0, abs=0.5)
 
 

@@ -59,7 +59,7 @@ def test_what_changed_is_found_named_and_undone(
     camera = changed_lens(what)
     check = checked(calibration, camera, rng)
     assert not check.holds and check.chance < 1e-3
-    assert check.change is not None and check.change.cause.kind == kind
+    assert check.change is not None and check.change.hypothesis.kind == kind
     goal = projection_goal(camera)
     before, after = (
         lens_of(c).parameters - camera.parameters for c in (check.watched.cameras[0], check.fixed.cameras[0])
@@ -87,7 +87,7 @@ def test_changes_are_found_as_often_as_the_check_says() -> None:
         (power,) = (p for p in check.powers if p.kind == "focus")
         assert power.size == 0.15
         said.append(power.chance)
-        (change,) = (c for c in check.tried if c.cause.kind == "focus")
+        (change,) = (c for c in check.tried if c.hypothesis.kind == "focus")
         found.append(change.chance < ALARM_CHANCE / len(check.tried))
     assert 0.2 < np.mean(said) < 0.8
     assert np.mean(found) == pytest.approx(np.mean(said), abs=POWER_WITHIN)
@@ -191,7 +191,7 @@ def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration
     usual = lens("reg").parameters
     much = lens("reg").with_parameters(usual + 6.0 * (changed_lens(several).parameters - usual))
     check = checked(calibration, much, np.random.default_rng(1))
-    assert check.change is not None and check.change.cause.kind == "lens" and not check.holds
+    assert check.change is not None and check.change.hypothesis.kind == "lens" and not check.holds
     words = check_facts(check)
     assert re.search(r"changed in several ways; [\d.]+ px, [\d.]+ mm at 1 m$", words.headline)
     assert re.search(r"\d+% of what is seen is explained by this alone: the ", words.sentences[1])

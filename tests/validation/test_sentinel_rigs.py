@@ -85,7 +85,7 @@ def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
     check = _rig_check(moved, lens("wide"), rng)
     assert not check.holds and check.change is not None
-    assert (check.change.cause.kind, check.change.cause.camera) == ("rotation", "right")
+    assert (check.change.hypothesis.kind, check.change.hypothesis.camera) == ("rotation", "right")
     assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
     assert check.change.sigmas.max() < 0.01
     # A rig's file may come from anywhere.
@@ -96,7 +96,7 @@ def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generato
     moved = Rigid3(MOUNT.rotation, 1.01 * MOUNT.translation_mm)
     check = _rig_check(moved, lens("wide"), rng)
     assert not check.holds and check.change is not None
-    assert check.change.cause.kind == "scale"
+    assert check.change.hypothesis.kind == "scale"
     assert check.change.amounts == pytest.approx([1.0], abs=0.1)
 
 
@@ -123,7 +123,7 @@ def test_a_scene_tells_of_a_mount_without_any_board() -> None:
         quiet += check_matches(_rig(), [_matches(MOUNT, rng)]).holds
         alarmed = check_matches(_rig(), [_matches(moved, rng)])
         assert not alarmed.holds
-        named += alarmed.change is not None and alarmed.change.cause.kind == "rotation"
+        named += alarmed.change is not None and alarmed.change.hypothesis.kind == "rotation"
     assert quiet == named == draws
 
 
@@ -243,7 +243,7 @@ def test_a_change_does_not_hide_behind_the_scatter_it_makes(axis: int, rng: np.r
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
     check = check_matches(_rig(), [_matches(moved, rng, FINE_MATCH_NOISE_PX)])
     assert check.expected_px < 2.0 * FINE_MATCH_NOISE_PX < 0.5 * check.rms_px
-    assert check.chance < 1e-9 and check.change is not None and check.change.cause.kind == "rotation"
+    assert check.chance < 1e-9 and check.change is not None and check.change.hypothesis.kind == "rotation"
     assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
 
 
@@ -261,7 +261,7 @@ def test_wrong_matches_that_lie_alone_do_not_rename_a_change(axis: int) -> None:
         pixels2[few, 1] += 0.3
         kept = np.concatenate([few, np.flatnonzero(~alone)])
         check = check_matches(_rig(), [PairMatches(0, 1, whole.pixels1[kept], pixels2[kept])])
-        assert not check.holds and check.change is not None and check.change.cause.kind == "rotation"
+        assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
 
 
 def test_the_size_of_a_change_is_not_that_of_its_uncertainty() -> None:

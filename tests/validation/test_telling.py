@@ -20,8 +20,8 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.plan_page import plan_words
-from rigkit.validation.sentinel.causes import causes_of
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, told_by
+from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
 from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.telling import views_that_tell
@@ -134,7 +134,7 @@ def _powers(rig: Watched, information: FloatArray) -> tuple[Power, ...]:
         overdispersion=1.0,
         freedom=rig.freedom,
     )
-    return powers_of(rig, evidence, causes_of(rig), ALARM_CHANCE)
+    return powers_of(rig, evidence, hypotheses_of(rig), ALARM_CHANCE)
 
 
 def test_cameras_that_never_see_one_board_are_checked_lens_by_lens() -> None:

@@ -2,9 +2,9 @@
 
 Scores of frames have, where nothing changed, the covariance A + A C A in units of the frames' own scatter, with A their
 information and C the covariance of theta: the frames scatter, and the calibration was a little off from the start. With
-A = L L^T, w = L^+ score has the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every cause D is
-fitted alone; the simplest that explains enough is named (Schwarz's criterion), and the chance that unchanged cameras
-show as much of any cause is that of the smallest chance of F-tests, drawn or by Bonferroni's bound.
+A = L L^T, w = L^+ score has the covariance I + L^T C L, and a change theta += D a moves it by L^T D a. Every hypothesis
+D is fitted alone; the simplest that explains enough is named (Schwarz's criterion), and the chance that unchanged
+cameras show as much of any hypothesis is that of the smallest chance of F-tests, drawn or by Bonferroni's bound.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from rigkit.calibration.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
@@ -43,28 +43,28 @@ RARE = {"lens": 6.0, "moved": 6.0}
 RARE_IN_RIGS = {"principal point": 6.0}
 """Mounts turn, by what looks nearly the same, much more often than the glass moves in its barrel."""
 AS_MUCH = 0.9
-"""Of what the likeliest cause explains, by derivatives where nothing changed: of a large change these are off by a few
-per cent (a board with squares of 20 mm for 25: 0.7), and a simpler cause that explains as much is held against it at
-the end of its own change."""
+"""Of what the likeliest hypothesis explains, by derivatives where nothing changed: of a large change these are off by a
+few per cent (a board with squares of 20 mm for 25: 0.7), and a simpler hypothesis that explains as much is held against
+it at the end of its own change."""
 DRAWS, FEW_DRAWS = 4000, 8
 """Of what unchanged cameras show; fewer than so many tell no chance."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Change:
-    """A cause with the amounts that explain the frames best.
+    """A hypothesis with the amounts that explain the frames best.
 
     Attributes
     ----------
-    cause : what changed.
-    amounts, covariance : (K,) and (K, K), in `cause.units`.
+    hypothesis : what changed.
+    amounts, covariance : (K,) and (K, K), in `hypothesis.units`.
     chance : probability that unchanged cameras show as much of it.
     size_px : how far it moves the projection, rms after the best rotation; of a mount, how far what it shows moves.
     max_px : the same with how unsure it is: what may be large is not small because it is told badly.
     gain : by how much it lowers the sum of squares.
     """
 
-    cause: Cause
+    hypothesis: Hypothesis
     amounts: FloatArray
     covariance: FloatArray
     chance: float
@@ -78,14 +78,14 @@ class Change:
         return np.sqrt(np.diag(self.covariance))
 
     def __str__(self) -> str:
-        if self.cause.kind == "lens":
+        if self.hypothesis.kind == "lens":
             # Its amounts make up for each other: each by itself would say far more than happened.
-            return f"{self.cause.words}: by {self.size_px:.2g} px rms in all"
+            return f"{self.hypothesis.words}: by {self.size_px:.2g} px rms in all"
         values = ", ".join(
             f"{a:+.3g} +- {s:.2g} {unit}"
-            for a, s, unit in zip(self.amounts, self.sigmas, self.cause.units, strict=True)
+            for a, s, unit in zip(self.amounts, self.sigmas, self.hypothesis.units, strict=True)
         )
-        return f"{self.cause.words}: {values}"
+        return f"{self.hypothesis.words}: {values}"
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -95,13 +95,13 @@ class SentinelCheck:
     Attributes
     ----------
     chance : probability that an unchanged camera or rig shows at least as much.
-    change : what explains the pictures best, alarming or not; None where no cause can be told.
+    change : what explains the pictures best, alarming or not; None where no hypothesis can be told.
     watched, fixed : as calibrated, and after `change`.
     step, covariance : change of theta (T,), and its covariance (T, T).
     rms_px, rms_fixed_px : of the fresh corners before and after.
     expected_px : rms that corners of unchanged cameras show, with what the calibration leaves open.
     frames, corners : how many there were.
-    tried : every cause by itself, the simplest first.
+    tried : every hypothesis by itself, the simplest first.
     powers : how well changes of lenses and turns of mounts would have been seen; what is missing was not seen at all.
     cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
     flipped : how the pictures must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
@@ -158,7 +158,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
     expected_px, known, chance = _expected_px(watched, evidence), list[Change](), 1.0
     try:
         whitened = Whitened.of(watched, evidence)
-        known = [c for c in (_fitted(whitened, cause) for cause in causes_of(watched)) if c is not None]
+        known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(watched)) if c is not None]
     except DegenerateError:
         # Pictures of something else are far from all that can be linearised: that is the verdict.
         if not _wild(evidence.rms_px, expected_px):
@@ -179,8 +179,8 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
             if left < _cost(best, penalty) - _cost(rival, penalty):
                 best, (amounts, fixed, after) = rival, other
                 break
-        step = best.cause.directions @ amounts
-        unsure = best.cause.directions @ best.covariance @ best.cause.directions.T
+        step = best.hypothesis.directions @ amounts
+        unsure = best.hypothesis.directions @ best.covariance @ best.hypothesis.directions.T
         covariance = watched.covariance + unsure
         size_px, max_px = _sizes_px(watched, evidence, step, unsure)
         change = replace(best, amounts=amounts, size_px=size_px, max_px=max_px)
@@ -200,7 +200,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         tried=tuple(known),
         powers=()
         if _wild(after.rms_px, expected_px)
-        else powers_of(watched, evidence, [c.cause for c in known], ALARM_CHANCE),
+        else powers_of(watched, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
@@ -216,8 +216,9 @@ def _expected_px(watched: Watched, evidence: FreshEvidence) -> float:
 
 
 def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
-    """Return the probability that unchanged cameras show as much of any cause as they show of the likeliest. Causes
-    overlap, so that it is less than the sum of their chances: drawn, as long as draws tell; else Bonferroni's bound."""
+    """Return the probability that unchanged cameras show as much of any hypothesis as they show of the likeliest.
+    Hypotheses overlap, so that it is less than the sum of their chances: drawn, as long as draws tell; else
+    Bonferroni's bound."""
     best = min(c.chance for c in known)
     bound = min(1.0, len(known) * best)
     if bound < FEW_DRAWS / DRAWS:
@@ -229,7 +230,7 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
     scale = rng.chisquare(whitened.freedom, DRAWS) / whitened.freedom if whitened.freedom < LARGE_FREEDOM else 1.0
     least = np.ones(DRAWS)
     for change in known:
-        basis = np.linalg.qr(root.T @ whitened.by_theta @ change.cause.directions)[0]
+        basis = np.linalg.qr(root.T @ whitened.by_theta @ change.hypothesis.directions)[0]
         m = basis.shape[1]
         gain = ((basis.T @ drawn) ** 2).sum(axis=0) / scale
         least = np.minimum(least, fdtrc(m, whitened.freedom, gain / m))
@@ -237,13 +238,13 @@ def _chance_of_any(whitened: Whitened, known: Sequence[Change]) -> float:
 
 
 def _evident(change: Change, penalty: float) -> float:
-    """Return twice the log odds of a cause: what it explains, less what its numbers and its rarity cost."""
+    """Return twice the log odds of a hypothesis: what it explains, less what its numbers and its rarity cost."""
     return change.gain - _cost(change, penalty)
 
 
 def _cost(change: Change, penalty: float) -> float:
-    kind = change.cause.kind
-    rare = RARE.get(kind, 0.0) + (RARE_IN_RIGS.get(kind, 0.0) if change.cause.camera is not None else 0.0)
+    kind = change.hypothesis.kind
+    rare = RARE.get(kind, 0.0) + (RARE_IN_RIGS.get(kind, 0.0) if change.hypothesis.camera is not None else 0.0)
     return change.amounts.size * penalty + rare
 
 
@@ -251,16 +252,16 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     """Return the amounts of a change, what is watched after it, and what the frames say then: linearised anew there, as
     long as that is possible."""
     amounts = change.amounts
-    fixed = watched.changed(change.cause.directions @ amounts)
+    fixed = watched.changed(change.hypothesis.directions @ amounts)
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
         try:
-            again = _fitted(Whitened.of(fixed, after), change.cause)
+            again = _fitted(Whitened.of(fixed, after), change.hypothesis)
         except DegenerateError:
             again = None
         if again is None:
             break
-        closer = watched.changed(change.cause.directions @ (amounts + again.amounts))
+        closer = watched.changed(change.hypothesis.directions @ (amounts + again.amounts))
         then = look(closer)
         if then.rms_px > after.rms_px:
             break
@@ -268,9 +269,9 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
     return amounts, fixed, after
 
 
-def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
-    """Return what a cause would have to be; None where the frames do not show it."""
-    by_amount = whitened.by_theta @ cause.directions
+def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
+    """Return what a hypothesis would have to be; None where the frames do not show it."""
+    by_amount = whitened.by_theta @ hypothesis.directions
     weighed = np.linalg.solve(whitened.covariance, np.column_stack([by_amount, whitened.score]))
     normal, right = by_amount.T @ weighed[:, :-1], by_amount.T @ weighed[:, -1]
     size = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
@@ -284,7 +285,7 @@ def _fitted(whitened: Whitened, cause: Cause) -> Change | None:
     m = len(amounts)
     chance = float(fdtrc(m, whitened.freedom, max(gain, 0.0) / m))
     return Change(
-        cause=cause, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, max_px=0.0, gain=gain
+        hypothesis=hypothesis, amounts=amounts, covariance=covariance, chance=chance, size_px=0.0, max_px=0.0, gain=gain
     )
 
 

@@ -1,9 +1,9 @@
 """What fresh frames would have found: the chance that a change raises the alarm, and how many frames it takes.
 
-A change a of a cause adds a^T N a, N its normal matrix in whitened scores, to the mean of the statistic: F becomes the
-noncentral F distribution. The limit is that of one of all causes tried (Bonferroni), and a change is looked for by its
-own cause only: the chances stated are rather too small. The covariance of the calibration does not shrink with the
-fresh frames: where no number of them is enough, the calibration is what is not sure.
+A change a of a hypothesis adds a^T N a, N its normal matrix in whitened scores, to the mean of the statistic: F becomes
+the noncentral F distribution. The limit is that of one of all hypotheses tried (Bonferroni), and a change is looked for
+by its own hypothesis only: the chances stated are rather too small. The covariance of the calibration does not shrink
+with the fresh frames: where no number of them is enough, the calibration is what is not sure.
 
 Reference: G. A. F. Seber, A. J. Lee, "Linear Regression Analysis" (2003), section 4.3.
 """
@@ -17,8 +17,8 @@ import numpy as np
 from scipy.special import chndtr, fdtri, gammaincinv
 
 from rigkit.core.arrays import FloatArray
-from rigkit.validation.sentinel.causes import Cause, lens_goals
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.hypotheses import Hypothesis, lens_goals
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
 LENS_KINDS = ("focus", "principal point", "distortion")
@@ -42,7 +42,7 @@ class Power:
 
     Attributes
     ----------
-    kind, camera : of the cause.
+    kind, camera : of the hypothesis.
     size, unit : a change of this size (px rms over the image, or degrees of a mount)
     chance : is found with this probability, in a direction as any other.
     found_from : the size that is found nine times in ten; infinite where these frames do not show it.
@@ -61,11 +61,11 @@ class Power:
 
 
 def powers_of(
-    watched: Watched, evidence: FreshEvidence, causes: Iterable[Cause], alarm_chance: float
+    watched: Watched, evidence: FreshEvidence, hypotheses: Iterable[Hypothesis], alarm_chance: float
 ) -> tuple[Power, ...]:
     """Return how well changes of each lens, and turns of mounts, would have been seen by frames like these, where a
-    chance below `alarm_chance` of any of the causes is an alarm."""
-    causes = list(causes)
+    chance below `alarm_chance` of any of the hypotheses is an alarm."""
+    hypotheses = list(hypotheses)
     several = [Whitened.of(watched, _repeated(evidence, times)) for times in TIMES]
     surer = [
         Whitened.of(replace(watched, covariance=watched.covariance / times), _repeated(evidence, times))
@@ -73,26 +73,27 @@ def powers_of(
     ]
     goals = dict(zip(watched.names, lens_goals(watched), strict=True))
     out = []
-    for cause in causes:
-        if cause.kind in LENS_KINDS:
-            weight = goals[cause.camera or watched.names[0]].weight
-            metric, size, unit = cause.directions.T @ weight @ cause.directions, CHANGED_PX, "px"
-        elif cause.kind == "rotation":
+    for hypothesis in hypotheses:
+        if hypothesis.kind in LENS_KINDS:
+            weight = goals[hypothesis.camera or watched.names[0]].weight
+            metric, size, unit = hypothesis.directions.T @ weight @ hypothesis.directions, CHANGED_PX, "px"
+        elif hypothesis.kind == "rotation":
             metric, size, unit = np.eye(3), TURNED_DEG, "deg"
         else:
             continue
-        alone = alarm_chance / len(causes)
-        now = _Shown.of(several[0], cause, metric, alone)
+        alone = alarm_chance / len(hypotheses)
+        now = _Shown.of(several[0], hypothesis, metric, alone)
         enough, both = (
             next(
-                (t for t, w in zip(TIMES, thought, strict=True) if _Shown.of(w, cause, metric, alone).finds(size)), None
+                (t for t, w in zip(TIMES, thought, strict=True) if _Shown.of(w, hypothesis, metric, alone).finds(size)),
+                None,
             )
             for thought in (several, surer)
         )
         out.append(
             Power(
-                kind=cause.kind,
-                camera=cause.camera,
+                kind=hypothesis.kind,
+                camera=hypothesis.camera,
                 size=size,
                 unit=unit,
                 chance=float(now.chance(np.array([size]))[0]),
@@ -118,8 +119,8 @@ class _Shown:
     limits: FloatArray
 
     @classmethod
-    def of(cls, whitened: Whitened, cause: Cause, metric: FloatArray, alarm_chance: float) -> _Shown:
-        by_amount = whitened.by_theta @ cause.directions
+    def of(cls, whitened: Whitened, hypothesis: Hypothesis, metric: FloatArray, alarm_chance: float) -> _Shown:
+        by_amount = whitened.by_theta @ hypothesis.directions
         normal = by_amount.T @ np.linalg.solve(whitened.covariance, by_amount)
         size, axes = np.linalg.eigh(metric)
         seen = size > NULL_RANK * size[-1]

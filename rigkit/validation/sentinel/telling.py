@@ -1,8 +1,8 @@
 """Which pictures to check a camera or a rig with: those that would tell changes of its lenses and mounts best.
 
-With P = (C^-1 + A)^-1, C the covariance of the calibration and A what fresh frames say, changes a of a cause D scatter
-by N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Frames that make this small for every cause are not those
-that improve the calibration most: what a lens needs known least may be what changes.
+With P = (C^-1 + A)^-1, C the covariance of the calibration and A what fresh frames say, changes a of a hypothesis D
+scatter by N^-1, N = D^T (C + A^-1)^-1 D = D^T (C^-1 - C^-1 P C^-1) D. Frames that make this small for every hypothesis
+are not those that improve the calibration most: what a lens needs known least may be what changes.
 
 Reference: A. C. Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS" (2007), section 10.3
 (the designs for parts of the parameters).
@@ -21,9 +21,9 @@ from rigkit.core.errors import InputError
 from rigkit.planning.candidates import Reach
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, choose_views, covariance_of
-from rigkit.validation.sentinel.causes import Cause, causes_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.frames import Frames
+from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
 from rigkit.validation.sentinel.power import LENS_KINDS, Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK
@@ -35,7 +35,7 @@ class ChangeAim:
 
     Attributes
     ----------
-    shown : for each cause C^-1 D (T, m), D in px over the image, and D^T C^-1 D (m, m).
+    shown : for each hypothesis C^-1 D (T, m), D in px over the image, and D^T C^-1 D (m, m).
     what : in words.
     """
 
@@ -45,17 +45,17 @@ class ChangeAim:
 
     @classmethod
     def of(cls, watched: Watched, inverse: FloatArray, most: FloatArray) -> ChangeAim:
-        """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); causes of which even
+        """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); hypotheses of which even
         `most` (T, T), what all frames say that could be taken, tells nothing are left out."""
         several = len(watched.cameras) > 1
         by_all, shown = covariance_of(inverse + most), []
-        for cause in causes_of(watched):
-            metric = _metric(watched, cause)
+        for hypothesis in hypotheses_of(watched):
+            metric = _metric(watched, hypothesis)
             if metric is None:
                 continue
             size, axes = np.linalg.eigh(metric)
             seen = size > NULL_RANK * size[-1]
-            by_px = cause.directions @ (axes[:, seen] / np.sqrt(size[seen]))
+            by_px = hypothesis.directions @ (axes[:, seen] / np.sqrt(size[seen]))
             one = (inverse @ by_px, by_px.T @ inverse @ by_px)
             if _told(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
                 shown.append(one)
@@ -63,8 +63,8 @@ class ChangeAim:
         return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
 
     def error(self, covariance: FloatArray) -> FloatArray:
-        """Return the root of the causes' variances together, each the geometric mean over its directions, so that none
-        is told at the cost of all others; huge where there is one of which the frames say nothing."""
+        """Return the root of the hypotheses' variances together, each the geometric mean over its directions, so that
+        none is told at the cost of all others; huge where there is one of which the frames say nothing."""
         variance = np.zeros(covariance.shape[:-2])
         for by_theta, whole in self.shown:
             told = np.maximum(_told(by_theta, whole, covariance), NULL_RANK * np.trace(whole))
@@ -77,13 +77,13 @@ def _told(by_theta: FloatArray, whole: FloatArray, covariance: FloatArray) -> Fl
     return np.asarray(np.linalg.eigvalsh(whole - by_theta.T @ covariance @ by_theta))
 
 
-def _metric(watched: Watched, cause: Cause) -> FloatArray | None:
-    """Return the mean square over the image, px^2, that amounts of a cause move it by, (m, m): of a lens after the best
-    rotation, of a mount's turn what is far away; None for what is not looked for."""
-    c = watched.names.index(cause.camera or watched.names[0])
-    if cause.kind in LENS_KINDS:
-        return np.asarray(cause.directions.T @ lens_goals(watched)[c].weight @ cause.directions)
-    return np.radians(1.0) ** 2 * turn_weight(watched.cameras[c]) if cause.kind == "rotation" else None
+def _metric(watched: Watched, hypothesis: Hypothesis) -> FloatArray | None:
+    """Return the mean square over the image, px^2, that amounts of a hypothesis move it by, (m, m): of a lens after the
+    best rotation, of a mount's turn what is far away; None for what is not looked for."""
+    c = watched.names.index(hypothesis.camera or watched.names[0])
+    if hypothesis.kind in LENS_KINDS:
+        return np.asarray(hypothesis.directions.T @ lens_goals(watched)[c].weight @ hypothesis.directions)
+    return np.radians(1.0) ** 2 * turn_weight(watched.cameras[c]) if hypothesis.kind == "rotation" else None
 
 
 def views_that_tell(
@@ -116,5 +116,5 @@ def views_that_tell(
     # Without any picture nothing is told.
     knowledge = Knowledge(watched.cameras[0], inverse, CornerError(sigma))
     return Plan(knowledge, aim, float("inf"), tuple(views)), powers_of(
-        watched, evidence, causes_of(watched), ALARM_CHANCE
+        watched, evidence, hypotheses_of(watched), ALARM_CHANCE
     )

@@ -21,7 +21,7 @@ FIT_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cause:
+class Hypothesis:
     """Something that may have happened.
 
     Attributes
@@ -53,7 +53,7 @@ class Cause:
         return told[self.kind].format("the camera" if self.camera is None else f"camera '{self.camera}'")
 
 
-def causes_of(watched: Watched) -> list[Cause]:
+def hypotheses_of(watched: Watched) -> list[Hypothesis]:
     """Return what may have happened, the simplest first."""
     several = len(watched.cameras) > 1
     layout, lenses, mounts = watched.layout, [], []
@@ -68,18 +68,18 @@ def causes_of(watched: Watched) -> list[Cause]:
             ("distortion", slice(3, 6)),
             ("lens", slice(0, 6)),
         ):
-            lenses.append(Cause(kind, own, whole[:, part], units[part]))
+            lenses.append(Hypothesis(kind, own, whole[:, part], units[part]))
         if several and (c > 0 or len(watched.cameras) > 2):
             turn = _mount_directions(watched, c)
-            mounts.append(Cause("rotation", own, turn[:, :3], ("deg",) * 3))
-            mounts.append(Cause("shift", own, turn[:, 3:], ("mm",) * 3))
-            mounts.append(Cause("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
+            mounts.append(Hypothesis("rotation", own, turn[:, :3], ("deg",) * 3))
+            mounts.append(Hypothesis("shift", own, turn[:, 3:], ("mm",) * 3))
+            mounts.append(Hypothesis("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
     if several:
         scale = np.zeros((layout.count, 1))
         for c, pose in enumerate(watched.cam_from_rig[1:], start=1):
             scale[layout.mount(c)][3:, 0] = 0.01 * pose.translation_mm
-        mounts.append(Cause("scale", None, scale, ("%",)))
-    return sorted([*lenses, *mounts], key=lambda cause: cause.directions.shape[1])
+        mounts.append(Hypothesis("scale", None, scale, ("%",)))
+    return sorted([*lenses, *mounts], key=lambda hypothesis: hypothesis.directions.shape[1])
 
 
 def lens_goals(watched: Watched) -> list[Goal]:
