@@ -43,8 +43,8 @@ from rigkit.core.arrays import FloatArray
 from rigkit.detection.checks.border import ends_quietly
 from rigkit.detection.checks.evidence import (
     MIN_BLUR,
+    MIN_EXCESS_RESIDUAL,
     MIN_EXPECTED_CORNERS,
-    MIN_MISFIT,
     MIN_SPACING_CHANGE,
     OF_EXPECTED_SIZE,
     OFFSET,
@@ -108,11 +108,11 @@ class Candidate:
 
     def measures(self) -> list[float]:
         """Return the logarithms that are weighed."""
-        sigma_cells, scatter, misfit, change, raggedness, blur = self.evidence
+        sigma_cells, scatter, excess_residual, change, raggedness, blur = self.evidence
         return [
             float(np.log(sigma_cells)),
             float(np.log(scatter)),
-            float(np.log(max(misfit, MIN_MISFIT))),
+            float(np.log(max(excess_residual, MIN_EXCESS_RESIDUAL))),
             float(np.log(max(change, MIN_SPACING_CHANGE))),
             float(np.log(raggedness)),
             float(np.log(max(blur, MIN_BLUR))),
@@ -304,7 +304,10 @@ def main() -> None:
     print(f"without a say of their kind: {refused} boards refused, {taken} other patterns taken for boards")
     print_sizes(found)
     print("in use:  ", ", ".join(f"{n} {w:.2f}" for n, w in SCORE.items()), f"offset {OFFSET:.2f}")
-    print("\n| score | image | corners | sigma, cells | scatter | misfit | spacing change | raggedness | blur, cells |")
+    print(
+        "\n| score | image | corners | sigma, cells | scatter | excess residual | spacing change | raggedness "
+        "| blur, cells |"
+    )
     print("|--:|:--|--:|--:|--:|--:|--:|--:|--:|")
     for board in (True, False):
         mine = [c for c in found if c.board is board]

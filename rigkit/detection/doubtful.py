@@ -53,7 +53,7 @@ def _cause(item: RefinedLattice) -> str:
     cell_px = upper_median(_known(item, item.worst_sigma_px)) / max(evidence.sigma_cells * item.scatter, 1e-9)
     if evidence.sigma_cells > DOUBTFUL_SIGMA or blur_px > BLURRED_CELLS * cell_px:
         return "blurred" if blur_px > BLURRED_CELLS * cell_px else "small or noisy"
-    if evidence.misfit > DOUBTFUL_RESIDUAL:
+    if evidence.excess_residual > DOUBTFUL_RESIDUAL:
         return "its edges are not those of squares"
     return "its corners do not lie in smooth rows"
 

@@ -19,13 +19,13 @@ from rigkit.detection.lattice.local_fit import fit_cells
 from rigkit.detection.lattice.spacing import spacing_changes
 from rigkit.detection.subpixel.refined import RefinedLattice
 
-MIN_MISFIT, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
+MIN_EXCESS_RESIDUAL, MIN_SPACING_CHANGE, MIN_BLUR = 0.03, 0.03, 0.03
 """Smaller values are those of any sharp board seen straight on, and speak no further for it."""
 
 SCORE = {
     "sigma_cells": -3.2,
     "scatter": -1.9,
-    "misfit": -2.7,
+    "excess_residual": -2.7,
     "spacing_change": -0.25,
     "raggedness": -4.0,
     "blur_cells": -3.2,
@@ -54,7 +54,8 @@ class Evidence(NamedTuple):
     sigma_cells : standard deviation of a corner if all that the fit leaves were noise, in sides of a cell, before it is
         raised for the scatter about the lattice.
     scatter : the factor by which it is raised.
-    misfit : RMS of what the fit leaves beyond the noise, and so on both sides of the corner alike, relative to the
+    excess_residual : RMS of what the fit leaves beyond the noise, and so on both sides of the corner alike, relative to
+    the
         contrast.
     spacing_change : difference of neighbouring steps along rows or columns, whichever is larger, relative to the
         shorter step; 0 where no three corners follow each other.
@@ -65,7 +66,7 @@ class Evidence(NamedTuple):
 
     sigma_cells: float
     scatter: float
-    misfit: float
+    excess_residual: float
     spacing_change: float
     raggedness: float = 1.0
     blur_cells: float = MIN_BLUR
@@ -80,11 +81,11 @@ class Evidence(NamedTuple):
         cell_px = np.sqrt(np.maximum(fit_cells(lattice.pixels, known, degree=1).areas(), 1e-6))
         sigma_cells = refined.worst_sigma_px[known] / (refined.scatter * cell_px)
         changes = [change.every for change in spacing_changes(lattice.pixels) if np.isfinite(change.every)]
-        misfit = float(np.sqrt(max(upper_median(beyond_noise), 0.0)))
+        excess_residual = float(np.sqrt(max(upper_median(beyond_noise), 0.0)))
         return cls(
             upper_median(sigma_cells),
             refined.scatter,
-            misfit,
+            excess_residual,
             max(changes, default=0.0),
             known.size / lattice.count,
             upper_median(refined.blur_px[known] / cell_px),
@@ -96,7 +97,7 @@ class Evidence(NamedTuple):
         measures = {
             "sigma_cells": max(self.sigma_cells, 1e-9),
             "scatter": self.scatter,
-            "misfit": max(self.misfit, MIN_MISFIT),
+            "excess_residual": max(self.excess_residual, MIN_EXCESS_RESIDUAL),
             "spacing_change": max(self.spacing_change, MIN_SPACING_CHANGE),
             "raggedness": self.raggedness,
             "blur_cells": max(self.blur_cells, MIN_BLUR),
