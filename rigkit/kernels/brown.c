@@ -41,13 +41,14 @@ INLINE bent_t bend(const double *k, const int rational, double x, double y)
 
 /* Write what the points come to. */
 INLINE void differentiate(
-    const brown_points_t *at, const int rational, double *by_point, double *by, double *u, double *v, uint8_t *valid)
+    const brown_points_t *at, const int rational, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v,
+    uint8_t *valid)
 {
     const double *k = at->parameters;
     const double fx = k[FX], fy = k[FY], cx = k[CX], cy = k[CY];
     const double farthest = at->max_r * at->max_r;
     const int64_t N = at->count, P = at->rows;
-    double *by_u = by, *by_v = by + P * N;
+    double *by_u = d_pixels_d_parameters, *by_v = by_u + P * N;
 #pragma omp simd
     for (int64_t n = 0; n < N; n++) {
         const double inverse = 1.0 / at->z[n], x = at->x[n] * inverse, y = at->y[n] * inverse;
@@ -56,8 +57,9 @@ INLINE void differentiate(
         const double ux = fx * inverse * b.xx, uy = fx * inverse * b.xy;
         const double vx = fy * inverse * b.xy, vy = fy * inverse * b.yy;
         if (at->axes) {
-            by_point[n] = ux, by_point[N + n] = uy, by_point[2 * N + n] = -(ux * x + uy * y);
-            by_point[3 * N + n] = vx, by_point[4 * N + n] = vy, by_point[5 * N + n] = -(vx * x + vy * y);
+            double *by_x = d_pixels_d_point + n;
+            by_x[0] = ux, by_x[N] = uy, by_x[2 * N] = -(ux * x + uy * y);
+            by_x[3 * N] = vx, by_x[4 * N] = vy, by_x[5 * N] = -(vx * x + vy * y);
         }
         u[n] = fx * b.mx + cx;
         v[n] = fy * b.my + cy;

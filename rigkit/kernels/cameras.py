@@ -89,10 +89,11 @@ def _written(
     """Call the kernel for the points and the `camera`, members of the structure, and return u, v and valid."""
     count = len(points[0])
     x, y, z = points
-    by_point, by_parameters = (_memory(out, count) for out in (d_pixels_d_point, d_pixels_d_parameters))
-    at = struct.of(x=x, y=y, z=z, axes=by_point.shape[1], rows=by_parameters.shape[1], **camera)
-    projected: tuple[FloatArray, FloatArray, BoolArray] = kernel(at, by_point, by_parameters)
-    for out, memory in ((d_pixels_d_point, by_point), (d_pixels_d_parameters, by_parameters)):
+    wanted = d_pixels_d_point, d_pixels_d_parameters
+    written = [_memory(out, count) for out in wanted]
+    at = struct.of(x=x, y=y, z=z, axes=written[0].shape[1], rows=written[1].shape[1], **camera)
+    projected: tuple[FloatArray, FloatArray, BoolArray] = kernel(at, *written)
+    for out, memory in zip(wanted, written, strict=True):
         if out is not None and out is not memory:
             out[...] = memory
     return projected

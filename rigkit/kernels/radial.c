@@ -33,11 +33,11 @@ enum {
 
 /* Write pixels and derivatives by the points of `count` points from the `first` on: pixel = L s (x, y) + centre. */
 INLINE void write_points(
-    const radial_points_t *at, const scales_t *of, int64_t first, int64_t count, double *by_point, double *u, double *v)
+    const radial_points_t *at, const scales_t *of, int64_t first, int64_t count, double *d_pixels_d_point, double *u, double *v)
 {
     const double l00 = at->l00, l01 = at->l01, l11 = at->l11;
     const int64_t N = at->count;
-    double *by_u = by_point + first, *by_v = by_u + 3 * N;
+    double *by_u = d_pixels_d_point + first, *by_v = by_u + 3 * N;
 #pragma omp simd
     for (int64_t i = 0; i < count; i++) {
         const double x = at->x[first + i], y = at->y[first + i], scale = of->scale[i];
@@ -60,11 +60,11 @@ INLINE void write_points(
  * factor to the power of `gap`. */
 INLINE void write_shape(
     const radial_points_t *at, scales_t *of, int64_t first, int64_t count, int64_t from, int64_t terms, int64_t gap,
-    double *by_parameters)
+    double *d_pixels_d_parameters)
 {
     const int64_t N = at->count;
     for (int64_t k = 0; k < terms; k++) {
-        double *by_u = by_parameters + (from + k) * N + first, *by_v = by_u + at->rows * N;
+        double *by_u = d_pixels_d_parameters + (from + k) * N + first, *by_v = by_u + at->rows * N;
 #pragma omp simd
         for (int64_t i = 0; i < count; i++) {
             const double x = at->x[first + i], y = at->y[first + i];
@@ -76,7 +76,7 @@ INLINE void write_shape(
 }
 
 EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
-    const radial_points_t *at, double *by_point, double *by_parameters, double *u, double *v, uint8_t *valid)
+    const radial_points_t *at, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v, uint8_t *valid)
 {
     const double k1 = at->polynomial[0], k2 = at->polynomial[1], k3 = at->polynomial[2], k4 = at->polynomial[3];
     const double max_angle = at->max_angle;
@@ -106,16 +106,16 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
         }
         for (int64_t i = 0; i < count; i++)
             valid[first + i] = told[i] > 0.0;
-        write_points(at, &of, first, count, by_point, u, v);
+        write_points(at, &of, first, count, d_pixels_d_point, u, v);
         if (!at->rows)
             continue;
-        double *by_u = by_parameters + first, *by_v = by_u + at->rows * N;
+        double *by_u = d_pixels_d_parameters + first, *by_v = by_u + at->rows * N;
         for (int64_t i = 0; i < count; i++) {
             by_u[i] = of.scale[i] * at->x[first + i];
             by_v[N + i] = of.scale[i] * at->y[first + i];
             by_u[2 * N + i] = by_v[3 * N + i] = 1.0;
         }
-        write_shape(at, &of, first, count, 4, at->terms, 1, by_parameters);
+        write_shape(at, &of, first, count, 4, at->terms, 1, d_pixels_d_parameters);
     }
 }
 
@@ -168,7 +168,7 @@ INLINE void look(
 }
 
 EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(
-    const radial_points_t *at, double *by_point, double *by_parameters, double *u, double *v, uint8_t *valid)
+    const radial_points_t *at, double *d_pixels_d_point, double *d_pixels_d_parameters, double *u, double *v, uint8_t *valid)
 {
     double table[CELLS + 1], rho[POINTS], f[POINTS], slope[POINTS];
     directions_t seen;
@@ -203,11 +203,11 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(
             of.by_shape[i] = -inverse * per;
             of.factor[i] = rho[i];
         }
-        write_points(at, &of, first, count, by_point, u, v);
+        write_points(at, &of, first, count, d_pixels_d_point, u, v);
         if (!at->rows)
             continue;
-        write_shape(at, &of, first, count, 0, n, 2, by_parameters);
-        double *by_u = by_parameters + n * N + first, *by_v = by_u + at->rows * N;
+        write_shape(at, &of, first, count, 0, n, 2, d_pixels_d_parameters);
+        double *by_u = d_pixels_d_parameters + n * N + first, *by_v = by_u + at->rows * N;
         for (int64_t i = 0; i < count; i++) {
             by_u[i] = by_v[N + i] = 1.0;
             by_u[2 * N + i] = of.scale[i] * at->x[first + i];
