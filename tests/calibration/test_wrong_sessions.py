@@ -266,7 +266,7 @@ def changed_views(way: str, rng: np.random.Generator) -> list[BoardView]:
     ],
 )
 def test_what_changes_from_image_to_image(way: str, words: str, rng: np.random.Generator) -> None:
-    """In most sessions; where two ways to change follow the images nearly as well, nothing is said rather than the
+    """In most sessions; where two kinds of change follow the images nearly as well, nothing is said rather than the
     wrong one."""
     results = [calibrate(changed_views(way, rng), SIZE, model="brown", board="flat") for _ in range(4)]
     named = [result for result in results if changing_in(result)]

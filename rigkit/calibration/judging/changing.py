@@ -9,7 +9,7 @@ changes from image to image is one of them far above the others.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,18 +25,18 @@ from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 
 MIN_VARIANCE_RATIO = 6.0
-"""Variance along a way to change over that of the rest."""
+"""Variance along a kind of change over that of the rest."""
 MIN_SHARE_EXPLAINED = 0.5
-"""The main part: a way to change that explains less of all squares may be a little of something else. A board held in
+"""The main part: a kind of change that explains less of all squares may be a little of something else. A board held in
 hand before two cameras is bent by the residuals of one, sheared by those of the other, with a third of each."""
 MIN_NEIGHBOUR_CORRELATION = 0.1
-"""All ways to change are smooth over a board: where one is the main part, the residuals of neighbouring corners agree,
+"""All kinds of change are smooth over a board: where one is the main part, the residuals of neighbouring corners agree,
 by half of 0.5 and more. Those of mere noise have a correlation of 0, a little less after a pose."""
 MIN_LEAD_OF_CRITERION = 10.0
-"""By so much its Bayesian information criterion must be below that of nothing and of every other way: very strong
+"""By so much its Bayesian information criterion must be below that of nothing and of every other kind: very strong
 evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
 MIN_LEAD_OF_GAIN = 0.1
-"""And by this part of its own lead over nothing: ways to change that follow the same images nearly as well leave open
+"""And by this part of its own lead over nothing: kinds of change that follow the same images nearly as well leave open
 which of them it was, however many corners there are."""
 
 
@@ -49,42 +49,34 @@ LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
 """A focal length that is off by a hundredth moves poses by more than first order: the second round ends it."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Way:
-    """A way in which an image may differ from the others: what is said of it, and what to do."""
-
-    message: str
-    remedy: str
-
-
-WAYS = {
-    "focus": _Way(
+CHANGES = {
+    "focus": Finding.look(
         "the focal length differs from image to image",
         "switch autofocus, zoom and focus breathing off (fix the focus with a screw or tape), and retake all",
     ),
-    "lens": _Way(
+    "lens": Finding.look(
         "the picture is scaled and shifted on the sensor from image to image (focus, zoom or stabilisation)",
         "switch autofocus, zoom and image stabilisation off, and retake all, unless a program cropped, turned or "
         "resized some",
     ),
-    "shift": _Way(
+    "shift": Finding.look(
         # After its pose a board tells two numbers of what an image does to it at first order: a shear has no others.
         "the picture is shifted on the sensor from image to image, or sheared while it was read row by row",
         "switch image stabilisation off, hold camera and board still, and retake all, unless a program turned or "
         "cropped some",
     ),
-    "rows": _Way(
+    "rows": Finding.look(
         "boards are sheared as if they moved while the image was read row by row (rolling shutter)",
         "hold camera and board still while an image is taken, on a stand, or expose for a shorter time",
     ),
-    "bend": _Way("the board is bent otherwise in every image", "glue it to something stiff, and retake all"),
+    "bend": Finding.look("the board is bent otherwise in every image", "glue it to something stiff, and retake all"),
 }
-
+"""What may change from image to image, by kinds of `ViewEvidence.changes` ("lens" is focus and shift)."""
 
 OF_LENS = ("focus", "shift", "lens")
 """The last is both of the others, for a zoom whose centre is not the lens's."""
 MOTION = ("rows", NO_CHANGE)
-MOVED = _Way("boards or the camera moved while the image was read (rolling shutter)", WAYS["rows"].remedy)
+MOVED = replace(CHANGES["rows"], message="boards or the camera moved while the image was read (rolling shutter)")
 """A pose that follows a sheared board leaves nearly the same of a motion over rows as of one over columns. Where rows
 are best, and both explain nearly all, far better than all else, it was a motion, unless a bend of each board is the
 main part, too: a lens or board unlike its model shows as that."""
@@ -106,7 +98,7 @@ def changing(
     correlation : that of the residuals of neighbouring corners.
     solved : what was calibrated, where it is known: a lens that changes is then solved for, not only looked for at
         first order.
-    but : names of ways to change that are not to be told.
+    but : kinds of change that are not to be told.
     clusters : as for `view_evidence`.
     """
     evidence = view_evidence(calibration, clusters) if correlation > MIN_NEIGHBOUR_CORRELATION else None
@@ -120,36 +112,38 @@ def changing(
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
         return [kinds]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:
-        changes |= {way: _solved_for(way, evidence, calibration, *solved, changes[way], clusters) for way in OF_LENS}
-    best = min(changes, key=lambda way: changes[way].criterion)
+        changes |= {
+            kind: _solved_for(kind, evidence, calibration, *solved, changes[kind], clusters) for kind in OF_LENS
+        }
+    best = min(changes, key=lambda kind: changes[kind].criterion)
     if best in OF_LENS and _leads(changes, best, but=OF_LENS):
         # A zoom about another centre is both; what is nearly as good with one of them is that one.
-        alone = [way for way in OF_LENS[:2] if _leads(changes, way, but=("lens",))]
-        way = WAYS[alone[0] if alone else best]
+        alone = [kind for kind in OF_LENS[:2] if _leads(changes, kind, but=("lens",))]
+        found = CHANGES[alone[0] if alone else best]
     elif best == "rows" and changes["rows"].left <= MAX_LEFT_OF_CONTROL * changes[NO_CHANGE].left:
         if _leads(changes, best):
-            way = WAYS[best]
+            found = CHANGES[best]
         elif (
-            all(_leads(changes, way, but=MOTION) and changes[way].share >= MIN_SHARE_MOVED for way in MOTION)
+            all(_leads(changes, kind, but=MOTION) and changes[kind].share >= MIN_SHARE_MOVED for kind in MOTION)
             and changes["bend"].share < MIN_SHARE_EXPLAINED
         ):
-            way = MOVED
+            found = MOVED
         else:
             return []
     elif best == "bend" and _leads(changes, best):
-        way = WAYS[best]
+        found = CHANGES[best]
     else:
         return []
     if best in but:
         return []
-    message = f"{way.message}: that explains {100.0 * changes[best].share:.0f} % of the squares of all residuals"
-    return [Finding.look(message, way.remedy)]
+    message = f"{found.message}: that explains {100.0 * changes[best].share:.0f} % of the squares of all residuals"
+    return [replace(found, message=message)]
 
 
-def _leads(changes: Mapping[str, ViewChange], way: str, but: Collection[str] = ()) -> bool:
-    """Say whether a way to change is the main part of the residuals, far above all others but those of `but`."""
-    found = changes[way]
-    others = [0.0, *(change.criterion for name, change in changes.items() if name != way and name not in but)]
+def _leads(changes: Mapping[str, ViewChange], kind: str, but: Collection[str] = ()) -> bool:
+    """Say whether a kind of change is the main part of the residuals, far above all others but those of `but`."""
+    found = changes[kind]
+    others = [0.0, *(change.criterion for name, change in changes.items() if name != kind and name not in but)]
     lead = max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
     return (
         found.ratio >= MIN_VARIANCE_RATIO
@@ -159,7 +153,7 @@ def _leads(changes: Mapping[str, ViewChange], way: str, but: Collection[str] = (
 
 
 def _solved_for(
-    way: str,
+    kind: str,
     evidence: ViewEvidence,
     calibration: Calibration,
     observations: Observations,
@@ -167,11 +161,11 @@ def _solved_for(
     at_first: ViewChange,
     clusters: IntArray | None,
 ) -> ViewChange:
-    """Return what a lens that changes in this way explains when all is solved with it; `at_first` order where that is
+    """Return what a lens that changes so explains when all is solved with it; `at_first` order where that is
     more."""
     weight, start, residuals, left = fit.weight(observations), fit.state, fit.residuals, at_first.left
     before = ((fit.residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)
-    freedom, columns = evidence.freedom, columns_of(evidence.own.shape[1])[way]
+    freedom, columns = evidence.freedom, columns_of(evidence.own.shape[1])[kind]
     _, directions, amounts = evidence.explained(columns)
     for rounds in range(LENS_ROUNDS):
         if rounds:
@@ -185,8 +179,8 @@ def _solved_for(
                 return at_first
             evidence, (_, _, amounts) = now, now.explained(columns)
         views = evidence.views
-        zoom = amounts[:, 0] if way != "shift" else np.zeros(len(views))
-        shift = amounts[:, -2:] if way != "focus" else np.zeros((len(views), 2))
+        zoom = amounts[:, 0] if kind != "shift" else np.zeros(len(views))
+        shift = amounts[:, -2:] if kind != "focus" else np.zeros((len(views), 2))
         centre = start.camera.axis_px
         pixels = observations.pixels.copy()
         pixels[views] -= zoom[:, None, None] * (pixels[views] - centre) + shift[:, None]

@@ -26,9 +26,9 @@ from rigkit.calibration.clustered import MIN_LEFT
 from rigkit.calibration.judging.captured import SMALL_PX
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
 from rigkit.calibration.judging.view_evidence import (
+    CHANGE_COLUMNS,
     MIN_TELLING_CORNERS,
     MIN_TELLING_VIEWS,
-    WAY_COLUMNS,
     columns_of,
     points_of,
     rows_of,
@@ -41,7 +41,7 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
 from rigkit.kernels.departures import displacements
 
-BOWS = WAY_COLUMNS["bend"]
+BOWS = CHANGE_COLUMNS["bend"]
 BY_CHANCE = 1e-3
 """Of images of a lens that looks from one point so few show a pupil that moves."""
 ASKED_AT = 0.05

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.judging.view_evidence import COMMON, WAY_COLUMNS, ViewEvidence, columns_of
+from rigkit.calibration.judging.view_evidence import CHANGE_COLUMNS, COMMON, ViewEvidence, columns_of
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.findings import Finding
@@ -200,4 +200,4 @@ def _turned(calibration: Calibration, evidence: ViewEvidence, second: BoolArray)
 
 def _camera_rows(evidence: ViewEvidence) -> slice:
     """Return where the camera's parameters are among the rows of the evidence."""
-    return slice(COMMON.start, COMMON.start + len(evidence.scale) - WAY_COLUMNS["bend"])
+    return slice(COMMON.start, COMMON.start + len(evidence.scale) - CHANGE_COLUMNS["bend"])

@@ -21,7 +21,7 @@ from rigkit.calibration.judging.captured import (
     judge_capture,
     same_way_up,
 )
-from rigkit.calibration.judging.changing import WAYS, changing
+from rigkit.calibration.judging.changing import CHANGES, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
@@ -151,7 +151,7 @@ def _residuals(
     if mixed := two_cameras(c, clusters):
         return mixed, []
     # Where it was another lens later on, residuals of one for both are of no motion, of no board, and no second cause.
-    but = WAYS if worst(also) is Severity.BAD else ()
+    but = CHANGES if worst(also) is Severity.BAD else ()
     change = changing(c, correlation, solved, but, clusters)
     # A pupil that moves looks a little like a zoom in every image, and what changes never like a pupil.
     return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change

@@ -17,23 +17,24 @@ MIN_TELLING_CORNERS = 20
 """A view with fewer corners says too little of its own after its pose."""
 MIN_TELLING_VIEWS = 6
 MIN_OWN_PART = 1e-6
-"""A way to change that the pose, or the ways before, follow but for this part of it is none of its own."""
+"""A kind of change that the pose, or the kinds before, follow but for this part of it is none of its own."""
 MIN_COMMON_PART = 1e-6
-"""Of what is common to all images, a direction that a way to change follows but for this part of its square is open."""
+"""Of what is common to all images, a direction that a kind of change follows but for this part of its square is
+open."""
 MIN_SHARE_LEFT = 0.5
 """A bow that all images share takes no more than the rest of the squares."""
 NO_CHANGE = "columns"
 """No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
 model."""
-WAY_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
-"""How many rows of `rows_of` each way to change has, in their order before the residual; bends are common, too."""
-COMMON = slice(6, -(sum(WAY_COLUMNS.values()) - WAY_COLUMNS["bend"] + 1))
+CHANGE_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
+"""How many rows of `rows_of` each kind of change has, in their order before the residual; bends are common, too."""
+COMMON = slice(6, -(sum(CHANGE_COLUMNS.values()) - CHANGE_COLUMNS["bend"] + 1))
 """Rows of `rows_of` that are common to all images: not of the pose, nor of one image's own."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewChange:
-    """How much of the residuals a way to change from image to image explains.
+    """How much of the residuals a kind of change from image to image explains.
 
     Attributes
     ----------
@@ -50,7 +51,7 @@ class ViewChange:
 
     @classmethod
     def of(cls, left: float, freedom: int, directions: int) -> ViewChange:
-        """Return that of a way with so many directions, of residuals with so many degrees of freedom."""
+        """Return that of a kind with so many directions, of residuals with so many degrees of freedom."""
         rest = left / (freedom - directions)
         squares = 1.0 - left
         criterion = freedom * np.log(left) + directions * np.log(freedom)
@@ -85,17 +86,17 @@ class ViewEvidence:
         root = vectors * np.where(values > MIN_COMMON_PART, values, np.inf) ** -0.5 / self.scale[:, None]
         return np.asarray(root @ root.T)
 
-    def explained(self, way: slice) -> tuple[float, int, FloatArray]:
-        """Return the squares that a way to change explains when all that is common to the images follows, how many
+    def explained(self, rows: slice) -> tuple[float, int, FloatArray]:
+        """Return the squares that a kind of change explains when all that is common to the images follows, how many
         directions it has, and its amounts (V, n)."""
         # Directions of the unit vectors' own part, and how much of the residual, and of what is common, lies along
         # each.
-        size, common = self.length[:, way], COMMON
-        sizes, axes = np.linalg.eigh(self.own[:, way, way] / (size[:, :, None] * size[:, None]))
+        size, common = self.length[:, rows], COMMON
+        sizes, axes = np.linalg.eigh(self.own[:, rows, rows] / (size[:, :, None] * size[:, None]))
         known = sizes > MIN_OWN_PART**2
         back = np.swapaxes(axes * np.where(known, sizes, np.inf)[:, None] ** -0.5, -1, -2) / size[:, None]
-        amount = (back @ self.along[:, way, None])[..., 0]
-        shared = back @ self.own[:, way, common] / self.scale
+        amount = (back @ self.along[:, rows, None])[..., 0]
+        shared = back @ self.own[:, rows, common] / self.scale
         every = shared.reshape(-1, len(self.scale))
         left = self.gram - every.T @ every
         pull = self.along[:, common].sum(axis=0) / self.scale - amount.ravel() @ every
@@ -107,13 +108,13 @@ class ViewEvidence:
         return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
 
     def changes(self) -> dict[str, ViewChange]:
-        """Return what each way to change explains; nothing where the residuals leave too little freedom."""
+        """Return what each kind of change explains; nothing where the residuals leave too little freedom."""
         out = {}
-        for name, way in columns_of(self.own.shape[1]).items():
-            squares, directions, _ = self.explained(way)
+        for kind, rows in columns_of(self.own.shape[1]).items():
+            squares, directions, _ = self.explained(rows)
             if self.freedom <= 2 * directions or not self.total > squares:
                 return {}
-            out[name] = ViewChange.of(1.0 - squares / self.total, self.freedom, directions)
+            out[kind] = ViewChange.of(1.0 - squares / self.total, self.freedom, directions)
         return out
 
 
@@ -163,10 +164,11 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
 
 
 def columns_of(count: int) -> dict[str, slice]:
-    """Return where the ways to change are among `count` rows of `rows_of`."""
-    stops = count - 1 - sum(WAY_COLUMNS.values()) + np.cumsum(list(WAY_COLUMNS.values()))
+    """Return where the kinds of change are among `count` rows of `rows_of`."""
+    stops = count - 1 - sum(CHANGE_COLUMNS.values()) + np.cumsum(list(CHANGE_COLUMNS.values()))
     out = {
-        name: slice(stop - size, stop) for (name, size), stop in zip(WAY_COLUMNS.items(), stops.tolist(), strict=True)
+        name: slice(stop - size, stop)
+        for (name, size), stop in zip(CHANGE_COLUMNS.items(), stops.tolist(), strict=True)
     }
     return out | {"lens": slice(out["focus"].start, out["shift"].stop)}
 
@@ -175,7 +177,7 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
 
     With what is, in this order: the pose (6), what all images share (the parameters of camera and pupil and the 3 bows
-    of the boards), the other ways to change, and the residual last.
+    of the boards), the other kinds of change, and the residual last.
     """
     count = np.array([np.count_nonzero(view.kept) for view in views])
     start, view = np.cumsum(count) - count, np.repeat(np.arange(len(views)), count)
@@ -188,7 +190,7 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
     turned = (rotation * points).sum(axis=1)
     in_cam = turned + np.array([one.cam_from_board.translation_mm for one in views])[view].T
     p = calibration.near.parameters.size
-    rows = np.zeros((2, p + 6 + sum(WAY_COLUMNS.values()) + 1, points.shape[1]))
+    rows = np.zeros((2, p + 6 + sum(CHANGE_COLUMNS.values()) + 1, points.shape[1]))
     d_pixels_d_point = rows[:, 3:6]
     u, v, valid = calibration.near.derivatives(in_cam[0], in_cam[1], in_cam[2], d_pixels_d_point, rows[:, 6 : 6 + p])
     pixels = np.where(valid, [u, v], np.nan)
@@ -200,14 +202,14 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
         i, j = (k + 1) % 3, (k + 2) % 3
         np.multiply(lever[i], d_pixels_d_point[:, j], out=rows[:, k])
         rows[:, k] -= lever[j] * d_pixels_d_point[:, i]
-    ways = {name: rows[:, way] for name, way in columns_of(rows.shape[1]).items()}
+    of_kind = {kind: rows[:, own] for kind, own in columns_of(rows.shape[1]).items()}
     out_of_plane = (d_pixels_d_point * rotation[:, 2]).sum(axis=1)
     for k, bow in enumerate((x * x, x * y, y * y)):
-        np.multiply(out_of_plane, bow, out=ways["bend"][:, k])
-    np.subtract(pixels, centre[:, None], out=ways["focus"][:, 0])
-    ways["shift"][0, 0] = ways["shift"][1, 1] = 1.0
-    np.multiply(rows[:, :6], along_v, out=ways["rows"])
-    np.multiply(rows[:, :6], along_u, out=ways[NO_CHANGE])
+        np.multiply(out_of_plane, bow, out=of_kind["bend"][:, k])
+    np.subtract(pixels, centre[:, None], out=of_kind["focus"][:, 0])
+    of_kind["shift"][0, 0] = of_kind["shift"][1, 1] = 1.0
+    np.multiply(rows[:, :6], along_v, out=of_kind["rows"])
+    np.multiply(rows[:, :6], along_u, out=of_kind[NO_CHANGE])
     rows[:, -1] = np.concatenate([one.residuals_px[one.kept] for one in views]).T
     return rows, count
 
