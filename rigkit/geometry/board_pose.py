@@ -162,23 +162,14 @@ def ray_residuals(
 
 
 def point_residuals(rays: Rays, bases: FloatArray, points: Points) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (..., N, 2) of points in the camera frame against rays (..., N, 3), and d residual / d point.
+    """Return residuals (N, 2) of points (N, 3) in the camera frame against rays (N, 3), and d residual / d point
+    (N, 2, 3).
 
-    `bases` (..., N, 2, 3) are rows perpendicular to the rays: orthonormal for radians, the pseudo-inverse of
-    d ray / d pixel for pixels.
-
-    Notes
-    -----
-    r = 2 T u / (1 + f.u) with u the predicted unit ray: to first order the measured offset, 2 tan(angle / 2) in
-    general, which grows up to the opposite ray (T u alone would call the opposite ray a perfect fit).
+    `bases` (N, 2, 3) are rows perpendicular to the rays: orthonormal for radians, the pseudo-inverse of d ray / d pixel
+    for pixels. The formula is in board_pose.c.
     """
-    length = np.linalg.norm(points, axis=-1, keepdims=True)
-    u = points / length
-    closeness = np.maximum(1.0 + (u * rays).sum(axis=-1), 1e-9)[..., None]
-    tangent = (bases @ u[..., None])[..., 0]
-    by_u = (2.0 / closeness)[..., None] * (bases - (tangent / closeness)[..., None] * rays[..., None, :])
-    d_residuals_d_point = (by_u - (by_u @ u[..., None]) * u[..., None, :]) / length[..., None]
-    return 2.0 * tangent / closeness, d_residuals_d_point
+    residual, jacobian = kernel.ray_residuals(rays[None], bases[None], points, np.eye(3)[None], np.zeros((1, 3)))
+    return residual[0], jacobian[0, :, :, 3:]
 
 
 def _flatten(points: Points) -> tuple[Rigid3, FloatArray]:

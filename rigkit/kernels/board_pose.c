@@ -1,5 +1,6 @@
-/* How far a rigid flat board's points lie from rays, and how that changes as the board moves. The formula is that of
- * board_pose.point_residuals. */
+/* How far a rigid board's points lie from rays, and how that changes as the board moves: r = 2 T u / (1 + f . u) with f the
+ * ray, T the basis across it and u the unit ray to the point. To first order that is the measured offset, 2 tan(angle / 2) in
+ * general, which grows up to the opposite ray (T u alone would call the opposite ray a perfect fit). */
 #include "pose.h"
 
 /* Of the opposite ray: its residual is large, and finite. */

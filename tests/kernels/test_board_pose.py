@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from kernels.reference.board_pose import point_residuals as reference
 
 from rigkit.geometry.board_pose import point_residuals, ray_residuals, tangent_bases
 from rigkit.geometry.rotation import exp_so3, skew, unit
@@ -21,8 +22,8 @@ def test_residuals_of_boards_are_those_of_their_points(sets: tuple[int, ...], rn
     rays[..., 2, :] = -unit(points[2] @ rotation[0].T + translation[0])
     bases = tangent_bases(rays) * 40.0
     turned = points @ np.swapaxes(rotation, 1, 2)
-    residual, by_point = point_residuals(rays, bases, turned + translation[:, None])
-    expected = residual, np.concatenate([-by_point @ skew(turned), by_point], axis=-1)
+    residual, d_residuals_d_point = reference(rays, bases, turned + translation[:, None])
+    expected = residual, np.concatenate([-d_residuals_d_point @ skew(turned), d_residuals_d_point], axis=-1)
     found = ray_residuals(rays, bases, points, rotation, translation)
     for one, other in zip(found, expected, strict=True):
         usual = np.arange(7) != 2
@@ -33,3 +34,8 @@ def test_residuals_of_boards_are_those_of_their_points(sets: tuple[int, ...], rn
     alone = ray_residuals(rays[(0,) * len(sets)], bases[(0,) * len(sets)], points, rotation[0], translation[0])
     for one, of_many in zip(alone, found, strict=True):
         np.testing.assert_array_equal(one, of_many[0])
+    there = turned[0] + translation[0]
+    of_points = point_residuals(rays[(0,) * len(sets)], bases[(0,) * len(sets)], there)
+    for one, other in zip(of_points, (found[0][0], found[1][0, :, :, 3:]), strict=True):
+        usual = np.arange(7) != 2
+        np.testing.assert_allclose(one[usual], other[usual], rtol=0.0, atol=ROUNDING * np.abs(other[usual]).max())
