@@ -21,6 +21,7 @@ from helpers.detection_scenes import (
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
+from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.detection.detect import detect_boards
 
 RMS_PX = 0.008
@@ -272,6 +273,15 @@ def test_corner_exactly_between_pixels_counts_once() -> None:
     (found,) = detect_boards(cv2.GaussianBlur(board, (0, 0), 0.8))
     assert found.complete
     assert np.abs(found.pixels - np.round(found.pixels + 0.5) + 0.5).max() < 0.01
+
+
+def test_a_board_that_nothing_looks_for_is_told_rather_than_never_found() -> None:
+    class Stars(Chessboard):
+        type = "stars"
+
+    board = Board("a", 8, 6, 50.0, 50.0, pattern=Stars())
+    with pytest.raises(InputError, match=r"board 'a': images cannot be searched for boards of type 'stars'.*registry"):
+        detect_boards(np.zeros((60, 80), np.uint8), [board])
 
 
 @pytest.mark.parametrize("image", [np.zeros((4, 100, 100)), np.zeros((100, 100), np.int32), np.zeros((8, 8), np.uint8)])

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from rigkit.core.boards import Board
+from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
@@ -19,3 +23,13 @@ FINDERS: dict[str, Finder] = {
     Chessboard.type: ChessboardFinder(),
 }
 """In this order: what is known by its marks first, chessboards, which are what is left, last."""
+
+
+def check_sought(boards: Sequence[Board]) -> None:
+    """Raise InputError where no finder looks for the pattern of one of `boards`: it would be missing in every image."""
+    for board in boards:
+        if board.pattern.type not in FINDERS:
+            raise InputError(
+                f"board '{board.board_id}': images cannot be searched for boards of type '{board.pattern.type}'; "
+                f"a Finder for it is missing in rigkit.detection.targets.registry, which has {', '.join(FINDERS)}"
+            )
