@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -211,16 +210,12 @@ def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tupl
 
 
 def _empty(board: Board) -> Lattice:
-    shape = (board.rows, board.columns)
-    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), _rising(board))
-
-
-@lru_cache(maxsize=64)
-def _rising(board: Board) -> bool:
-    """Say whether across the first edge brightness grows downwards, with the angle: where the square below it is white;
-    that has the colour of the square before the first corner."""
-    ink = board.ink()
-    return ink.first_black == ink.inverted
+    pattern, shape = board.pattern, (board.rows, board.columns)
+    assert isinstance(pattern, Charuco)
+    # The square below the first edge has the colour of the one before the first corner; where it is white, brightness
+    # grows downwards across that edge, with the angle.
+    rising = pattern.first_black(board.rows) == pattern.inverted
+    return Lattice(np.full((*shape, 2), np.nan), np.full(shape, np.nan), rising)
 
 
 def _of(board: Board, grid: IntArray, pixels: FloatArray) -> Lattice:
