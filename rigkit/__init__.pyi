@@ -18,6 +18,7 @@ from rigkit.cameras.base import Camera as Camera
 from rigkit.cameras.compare import CameraDifference as CameraDifference
 from rigkit.cameras.compare import compare_cameras as compare_cameras
 from rigkit.cameras.registry import camera_model as camera_model
+from rigkit.coach.guide import GuideOptions as GuideOptions
 from rigkit.core.boards import Board as Board
 from rigkit.core.cloud import OrientedCloud as OrientedCloud
 from rigkit.core.detections import BoardDetection as BoardDetection
@@ -39,6 +40,7 @@ from rigkit.interop.open3d import to_open3d as to_open3d
 from rigkit.io.calibration_file import load_calibration as load_calibration
 from rigkit.io.calibration_file import load_camera as load_camera
 from rigkit.io.calibration_file import save_calibration as save_calibration
+from rigkit.io.history_file import HistoryEntry as HistoryEntry
 from rigkit.io.images import read_image as read_image
 from rigkit.io.manifest import Dataset as Dataset
 from rigkit.io.manifest import load_dataset as load_dataset
@@ -49,6 +51,7 @@ from rigkit.io.rig_session import RigSession as RigSession
 from rigkit.io.rig_session import load_rig_session as load_rig_session
 from rigkit.io.session import Session as Session
 from rigkit.io.session import load_session as load_session
+from rigkit.planning.candidates import Reach as Reach
 from rigkit.reconstruction.pairing import MatchedPair as MatchedPair
 from rigkit.reconstruction.pairing import match_pair as match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction as Reconstruction
@@ -77,6 +80,11 @@ from rigkit.workflows.calibrate_rig import calibrate_rig_session as calibrate_ri
 from rigkit.workflows.certify import CertifiedFile as CertifiedFile
 from rigkit.workflows.certify import CertifyOptions as CertifyOptions
 from rigkit.workflows.certify import certify_file as certify_file
+from rigkit.workflows.check import CheckedPictures as CheckedPictures
+from rigkit.workflows.check import CheckOptions as CheckOptions
+from rigkit.workflows.check import check_pictures as check_pictures
+from rigkit.workflows.coach import CoachOptions as CoachOptions
+from rigkit.workflows.coach import run_coach as run_coach
 from rigkit.workflows.crosscheck import DatasetCrossCheck as DatasetCrossCheck
 from rigkit.workflows.crosscheck import crosscheck_dataset as crosscheck_dataset
 from rigkit.workflows.datasets import DatasetOptions as DatasetOptions
@@ -101,9 +109,21 @@ from rigkit.workflows.handeye import HandEyeOptions as HandEyeOptions
 from rigkit.workflows.handeye import PlacedCamera as PlacedCamera
 from rigkit.workflows.handeye import calibrate_hand_eye as calibrate_hand_eye
 from rigkit.workflows.handeye import camera_on_board as camera_on_board
+from rigkit.workflows.history import add_to_history as add_to_history
+from rigkit.workflows.history import show_history as show_history
 from rigkit.workflows.inputs.camera_files import import_camera as import_camera
 from rigkit.workflows.inputs.camera_files import import_rig as import_rig
 from rigkit.workflows.inputs.corners import Cache as Cache
+from rigkit.workflows.mesh import MeshOptions as MeshOptions
+from rigkit.workflows.mesh import mesh_cloud as mesh_cloud
+from rigkit.workflows.paper import PaperOptions as PaperOptions
+from rigkit.workflows.paper import PaperValidation as PaperValidation
+from rigkit.workflows.paper import validate_as_paper as validate_as_paper
+from rigkit.workflows.plan import LensOptions as LensOptions
+from rigkit.workflows.plan import PlannedSession as PlannedSession
+from rigkit.workflows.plan import PlanOptions as PlanOptions
+from rigkit.workflows.plan import plan_lens as plan_lens
+from rigkit.workflows.plan import plan_session as plan_session
 from rigkit.workflows.print_board import MeasuredPrint as MeasuredPrint
 from rigkit.workflows.print_board import PrintOptions as PrintOptions
 from rigkit.workflows.print_board import print_board as print_board
@@ -111,6 +131,9 @@ from rigkit.workflows.print_board import store_measured_print as store_measured_
 from rigkit.workflows.reconstruct import DatasetReconstruction as DatasetReconstruction
 from rigkit.workflows.reconstruct import ReconstructOptions as ReconstructOptions
 from rigkit.workflows.reconstruct import reconstruct_dataset as reconstruct_dataset
+from rigkit.workflows.reconstruct_rig import RigScene as RigScene
+from rigkit.workflows.reconstruct_rig import RigSceneOptions as RigSceneOptions
+from rigkit.workflows.reconstruct_rig import reconstruct_rig_views as reconstruct_rig_views
 from rigkit.workflows.reconstruct_scene import SceneOptions as SceneOptions
 from rigkit.workflows.reconstruct_scene import SceneResult as SceneResult
 from rigkit.workflows.reconstruct_scene import reconstruct_views as reconstruct_views
@@ -123,6 +146,9 @@ from rigkit.workflows.study import StudyOptions as StudyOptions
 from rigkit.workflows.study import StudyResult as StudyResult
 from rigkit.workflows.study import run_studies as run_studies
 from rigkit.workflows.study import run_study as run_study
+from rigkit.workflows.truth import FetchedSet as FetchedSet
+from rigkit.workflows.truth import fetch_public_set as fetch_public_set
+from rigkit.workflows.truth import public_sets as public_sets
 from rigkit.workflows.validate import DatasetValidation as DatasetValidation
 from rigkit.workflows.validate import ValidateOptions as ValidateOptions
 from rigkit.workflows.validate import validate_dataset as validate_dataset

@@ -23,14 +23,14 @@ def run(args: argparse.Namespace) -> int:
 
     from rigkit.cli.console import note, note_written, print_json
     from rigkit.core.errors import InputError
-    from rigkit.workflows.history import add_calibration, show_history
+    from rigkit.workflows.history import add_to_history, show_history
 
     if (args.add is None) != (args.to is None):
         raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the one that it is compared with")
     if args.temperature is not None and args.add is None:
         raise InputError("history: --temperature is of a calibration that is added; give --add and --to, too")
     if args.add is not None:
-        add_calibration(args.register, args.add, args.to, temperature_c=args.temperature)
+        add_to_history(args.register, args.add, args.to, temperature_c=args.temperature)
         note(f"{args.register} has one entry more")
     entries, written = show_history(args.register, report=args.report, force=args.force)
     if args.json:

@@ -43,7 +43,7 @@ def run_manifest(args: argparse.Namespace) -> int:
     read = [*images, *(target.parent / path for path in calibrations.values())]
     ensure_writable(target, force=args.force, inputs=read)
     require_told(args)
-    found = find_pairs(root, images, [one.board for one in told], on_progress=progress_on_stderr())
+    found = find_pairs(root, images, [one.board for one in told], progress=progress_on_stderr())
     for error in found.unreadable:
         note(f"left out: {error}")
     names = [pair.name for pair in found.pairs]

@@ -80,7 +80,7 @@ def _since(register: Path, entries: Sequence[HistoryEntry]) -> Iterator[str]:
             )
 
 
-def add_calibration(register: Path, new: Path, reference: Path, *, temperature_c: float | None = None) -> None:
+def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c: float | None = None) -> None:
     """Add a calibration made anew to a register, as a change of the `reference`.
 
     Raises InputError for cameras of two models or sizes, and files that are no calibrations.

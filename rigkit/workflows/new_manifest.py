@@ -29,7 +29,7 @@ class FoundPairs:
 
 
 def find_pairs(
-    root: Path, images: Sequence[Path], boards: Sequence[Board] = (), *, on_progress: Progress = silent
+    root: Path, images: Sequence[Path], boards: Sequence[Board] = (), *, progress: Progress = silent
 ) -> FoundPairs:
     """Return the pairs among `images`, which lie below `root`, that show `boards`, or any chessboards.
 
@@ -44,7 +44,7 @@ def find_pairs(
             shown.append(ImageBoards(path, (image.shape[1], image.shape[0]), sizes))
         except InputError as error:
             unreadable.append(error)
-        on_progress("looking for boards", done, len(images))
+        progress("looking for boards", done, len(images))
     if not shown and unreadable:
         raise unreadable[0]
     if not any(image.boards for image in shown):

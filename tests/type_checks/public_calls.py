@@ -22,6 +22,16 @@ rigkit.load_calibration("a.json").reprojection_error  # type: ignore[attr-define
 rigkit.load_rig("rig.json").cameras  # type: ignore[attr-defined]  # noqa: B018
 rigkit.calibrate_rig(1, {})  # type: ignore[arg-type]
 rigkit.write_ply(Path("a.ply"), "cloud")  # type: ignore[arg-type]
+rigkit.check_pictures("calibration.json", 3)  # type: ignore[arg-type]
+rigkit.plan_session("session.toml", rigkit.PlanOptions(counts=3))  # type: ignore[call-arg]
+rigkit.plan_lens(rigkit.LensOptions(hfov_deg=90.0), rigkit.PlanOptions())  # type: ignore[call-arg]
+rigkit.mesh_cloud("cloud.ply", rigkit.MeshOptions(output="mesh.ply"))  # type: ignore[arg-type]
+rigkit.show_history("register.jsonl")  # type: ignore[arg-type]
+rigkit.add_to_history(Path("register.jsonl"), Path("calibration.json"))  # type: ignore[call-arg]
+rigkit.run_coach(Path("session"), print)  # type: ignore[arg-type]
+rigkit.validate_as_paper("lab-a", rigkit.DatasetOptions())  # type: ignore[arg-type]
+rigkit.reconstruct_rig_views("rig.json")  # type: ignore[arg-type]
+rigkit.fetch_public_set("caliper-board")  # type: ignore[arg-type]
 
 # What comes back is known as well.
 assert_type(rigkit.load_camera(Path("camera.json")), rigkit.Camera)

@@ -18,7 +18,7 @@ from rigkit.core.errors import InputError
 from rigkit.io.calibration_file import save_calibration
 from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
 from rigkit.report.history_page import drift_svg, history_facts, history_page
-from rigkit.workflows.history import add_calibration, show_history
+from rigkit.workflows.history import add_to_history, show_history
 
 
 def test_the_register_grows_and_is_drawn(calibration: Calibration, tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_a_register_of_months(calibration: Calibration, tmp_path: Path, caplog: 
         source = as_seen_from(register, tmp_path / "lab" / camera / "calibration.json")
         add_entry(register, HistoryEntry.of_check(check, source, now=datetime(2026, 3, day, tzinfo=UTC)))
     save_calibration(tmp_path / "c.json", calibration)
-    add_calibration(register, tmp_path / "c.json", tmp_path / "c.json", temperature_c=19.0)
+    add_to_history(register, tmp_path / "c.json", tmp_path / "c.json", temperature_c=19.0)
     # Two hours east, this is before the entry of 3 March; a former version said nothing of the reference.
     older = json.loads(register.read_text().splitlines()[0]) | {"date": "2026-03-03T01:00:00+02:00"}
     del older["reference"]

@@ -28,7 +28,7 @@ from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.check import fixed_text
-from rigkit.workflows.history import add_calibration
+from rigkit.workflows.history import add_to_history
 
 DEPARTURE_PX, LONGER = 0.1, 1.01
 POWER_DRAWS, POWER_NOISE_PX = 30, 0.04
@@ -200,7 +200,7 @@ def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration
 def test_the_same_calibration_again_is_no_change(calibration: Calibration, tmp_path: Path) -> None:
     """What rounding leaves of no difference at all is of no importance, however little was expected."""
     save_calibration(tmp_path / "c.json", calibration)
-    add_calibration(tmp_path / "cam.jsonl", tmp_path / "c.json", tmp_path / "c.json")
+    add_to_history(tmp_path / "cam.jsonl", tmp_path / "c.json", tmp_path / "c.json")
     (entry,) = load_history(tmp_path / "cam.jsonl")
     assert entry.holds and entry.verdict == "holds"
     assert entry.chance > 0.5
