@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,16 +55,15 @@ class Conversion:
 
 
 def convert_camera(
-    camera: Camera, model: str, *, order: int | None = None, fixed: Sequence[str] = (), outline: Pixels | None = None
+    camera: Camera, model: str, *, order: int | None = None, outline: Pixels | None = None
 ) -> Conversion:
     """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
 
-    Raises InputError: `model` or a name in `fixed` is unknown, or the model cannot follow the lens at all.
+    Raises InputError: `model` is unknown, or the model cannot follow the lens at all.
 
     Parameters
     ----------
     order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
-    fixed : names of parameters that keep the values of the start, which has no tangential terms and no skew.
     outline : (N, 2) convex, of the part of the image where the camera is known, which then counts; None: all of it.
     """
     pixels = grid_pixels(camera.size_px, CONVERT_GRID).reshape(-1, 2)
@@ -78,19 +76,17 @@ def convert_camera(
     inside = np.ones(len(pixels), dtype=bool) if outline is None else _inside(outline, pixels)
     if not inside.any():
         raise InputError("camera conversion: nothing was seen where the camera looks; calibrate it again")
-    weight = np.where(inside, 1.0, OUTSIDE_WEIGHT)
+    weight, to = np.where(inside, 1.0, OUTSIDE_WEIGHT), camera_model(model)
     found: Conversion | None = None
     for limit in LIMITS_RAD:
         near = theta <= limit
         if near.sum() < MIN_COVERED_SAMPLES or (found is not None and near.mean() == found.covered):
             continue
         try:
-            start = _start(camera_model(model), camera.size_px, theta[near], pixels[near], centre, order)
-            fitted = refit_camera(start, rays[near], pixels[near], fixed=fixed, weight=weight[near])
-        except InputError as error:
-            if not isinstance(error, _NoStart):
-                raise
+            start = _start(to, camera.size_px, theta[near], pixels[near], centre, order)
+        except InputError:
             continue
+        fitted = refit_camera(start, rays[near], pixels[near], weight=weight[near])
         trial = _held_against(fitted, rays, pixels, near, inside, float(limit))
         if found is None or trial.max_px < found.max_px:
             found = trial
@@ -116,10 +112,6 @@ def _held_against(
     return Conversion(fitted, float(known.max()), rms, float(other.max(initial=0.0)), covered, limit_rad)
 
 
-class _NoStart(InputError):
-    """The model cannot follow the radial curve."""
-
-
 def fit_camera(
     model: type[Camera],
     size_px: tuple[int, int],
@@ -139,10 +131,8 @@ def fit_camera(
     return refit_camera(start, rays, pixels)
 
 
-def refit_camera(
-    start: Camera, rays: Rays, pixels: Pixels, *, fixed: Sequence[str] = (), weight: FloatArray | None = None
-) -> Camera:
-    """Return `start` with the parameters, but for those `fixed`, that project `rays` (N, 3) nearest to `pixels` (N, 2).
+def refit_camera(start: Camera, rays: Rays, pixels: Pixels, *, weight: FloatArray | None = None) -> Camera:
+    """Return `start` with the parameters that project `rays` (N, 3) nearest to `pixels` (N, 2).
 
     Rays that the start cannot see, or only at the edge of its field of view, are left out; `weight` (N,) is that of
     each error, None: all count alike.
@@ -152,7 +142,8 @@ def refit_camera(
     used = theta < INSIDE * start.max_angle_rad
     used[used] &= start.project(rays[used])[1]
     stop = Stop(steps=MAX_CONVERT_STEPS, gain=CONVERT_SETTLED, cost=ROUNDING_PX**2 * 2 * int(used.sum()))
-    return nearest_camera(start, rays[used], pixels[used], _free(start, fixed), stop, weight[used])[0]
+    free = np.eye(start.parameters.size)
+    return nearest_camera(start, rays[used], pixels[used], free, stop, weight[used])[0]
 
 
 def _off_axis_rad(rays: Rays) -> FloatArray:
@@ -166,15 +157,6 @@ def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:
     to = pixels[..., None, :] - outline
     turn = side[:, 0] * to[..., 1] - side[:, 1] * to[..., 0]
     return np.asarray((turn >= 0.0).all(axis=-1) | (turn <= 0.0).all(axis=-1))
-
-
-def _free(camera: Camera, fixed: Sequence[str]) -> FloatArray:
-    """Return the matrix (P, F) of the free directions in parameter space."""
-    names = camera.parameter_names()
-    unknown = set(fixed) - set(names)
-    if unknown:
-        raise InputError(f"{camera.model} camera: no parameter {', '.join(sorted(unknown))}; it has {', '.join(names)}")
-    return np.eye(len(names))[:, [name not in fixed for name in names]]
 
 
 def _start(
@@ -197,4 +179,4 @@ def _start(
         curve = RadialCurve(centre, mean[0][rising], mean[1][rising])
         return model.from_radial_curve(size_px, curve, order=order)
     except InputError as error:
-        raise _NoStart(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error
+        raise InputError(f"camera conversion: a {model.model} camera cannot follow this lens ({error})") from error

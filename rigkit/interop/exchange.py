@@ -23,20 +23,15 @@ WORTH_A_WORD_PX = 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Accepted:
-    """A model that a format can hold: `order` terms, parameters in `zero` kept at zero, largest angle it can hold."""
+    """A model that a format can hold: of Brown's model `order` terms."""
 
     model: str
     order: int | None = None
-    zero: tuple[str, ...] = ()
 
     def holds(self, camera: Camera) -> bool:
         """Say whether the camera goes in as it is."""
-        if camera.model != self.model:
-            return False
-        names = camera.parameter_names()
-        if self.order is not None and camera.model == "brown" and len(names) - 4 != self.order:
-            return False
-        return all(camera.parameters[names.index(name)] == 0.0 for name in self.zero)
+        of_order = self.order is None or camera.model != "brown" or camera.parameters.size - 4 == self.order
+        return camera.model == self.model and of_order
 
 
 PERSPECTIVE = (Accepted("pinhole"), Accepted("brown", 4), Accepted("brown", 5), Accepted("brown", 8))
@@ -81,7 +76,7 @@ def best_accepted(
     found: list[tuple[float, Written]] = []
     for kind in accepted:
         try:
-            c = convert_camera(camera, kind.model, order=kind.order, fixed=kind.zero, outline=outline)
+            c = convert_camera(camera, kind.model, order=kind.order, outline=outline)
         except InputError:
             continue
         fewer = any(k.model == camera.model for k in accepted)

@@ -180,7 +180,6 @@ def grow(
     *,
     step: int,
     known: LineKnowledge | None = None,
-    min_correlation: float = MIN_CORRELATION,
     settled_px: float = GROWN_SETTLED_PX,
     wanted: BoolArray | None = None,
 ) -> GrownPatches:
@@ -206,7 +205,7 @@ def grow(
         HALF_WIDTH,
         coarsest=COARSEST,
         max_move=MAX_GROWTH_MOVE_PX,
-        min_correlation=min_correlation,
+        min_correlation=MIN_CORRELATION,
         settled_px=settled_px,
         max_sigma=MAX_SIGMA_ON_LINE_PX if np.isfinite(line.sigma_px) else MAX_SIGMA_PX,
     )
