@@ -16,9 +16,9 @@ Layers, each importing only rows below it (tests/test_architecture.py reads the 
      1  core | optim     errors, arrays, boards, detections, matches, clouds, truth | least squares, robust scale
      0  kernels          compiled loops
 
-Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match; camera x right, y down, z forward; pixel
-(0, 0) is the centre of the top-left pixel; `x2.T @ F21 @ x1 = 0`, `d2 ~ A21 @ d1`; lengths in mm; angles in radians
-inside, degrees in files and reports.
+Conventions: `b_from_a` maps a to b, `x_in_a` lives in a, touching names match. Camera x is right, y down, z forward;
+pixel (0, 0) is the centre of the top-left pixel. `x2.T @ F21 @ x1 = 0`, `d2 ~ A21 @ d1`. Lengths are in mm; angles are
+radians inside, degrees in files and reports.
 
 >>> import numpy as np, rigkit
 >>> cam2_from_cam1 = rigkit.Rigid3(np.eye(3), [-300.0, 0.0, 0.0])

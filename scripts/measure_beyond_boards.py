@@ -1,9 +1,9 @@
 """Are stated uncertainties true beyond the part of the image that boards covered? Sessions that keep to the middle.
 
-Random images of one camera, of which only the corners in an ellipse about the middle are kept, are calibrated; the
-projection is then held against the truth (lab-a, RENDERED), or against the calibration from all corners of all other
-images of the same camera (REAL; its own share is in what is stated), after the rotation that fits best where boards
-were. Bands are by the distance to the boards' cover, in parts of half the image's diagonal.
+Random images of one camera, of which only the corners in an ellipse about the middle are kept, are calibrated. After
+the rotation that fits best where boards were, the projection is held against the truth (lab-a, RENDERED), or against
+the calibration from all corners of all other images of the same camera (REAL; its own share is in what is stated).
+Bands are by the distance to the boards' cover, in parts of half the image's diagonal.
 
     python scripts/measure_beyond_boards.py [SET ...] [--data DIR] [--sessions 20] [--middle .45 .75] [--model MODEL]
         [--cache DIR]

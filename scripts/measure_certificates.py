@@ -1,8 +1,8 @@
 """Do certificates hold? Rigs and cameras calibrated from noisy corners, and what they then measure.
 
 Each trial is a pair of cameras on one mount (or one camera), calibrated from a few images of a board with noisy corners
-as a user's would be, certified, and used: lengths, depths, planes and angles at places all over the image, of known
-size, from corners with new noise. Of the errors 95 % should lie within the certificate's 95 % bounds.
+as a user's would be, certified, and used. Used means: lengths, depths, planes and angles at places all over the image,
+of known size, from corners with new noise. Of the errors 95 % should lie within the certificate's 95 % bounds.
 
 With --departs PX the lenses do what no model does: displacements of their images (powers of the radius, decentring,
 thin prisms, shear) of so many pixels at its corners, others each time; with --half boards are in the left of the image

@@ -1,10 +1,10 @@
 """Are the stated sigmas true? Freshly rendered laboratories, from images, with the calibration's share.
 
-A laboratory is a lens that nobody has seen before (drawn at random, 55 to 75 or 170 to 190 degrees, of a kind that
-none of the models is), images of a board to calibrate it from, and pairs of views of three perpendicular boards, one
-for each pose type. Everything goes the way of a user's images: boards are found, the camera is calibrated, pairs are
-reconstructed. Each angle, baseline and normal is then held against the exact truth in its stated sigmas: 68 and 95 %
-of them should lie within one and two.
+A laboratory is a lens that nobody has seen before, images of a board to calibrate it from, and pairs of views of three
+perpendicular boards, one for each pose type. The lens is drawn at random, 55 to 75 or 170 to 190 degrees, of a kind
+that none of the models is. Everything goes the way of a user's images: boards are found, the camera is calibrated,
+pairs are reconstructed. Each angle, baseline and normal is then held against the exact truth in its stated sigmas: 68
+and 95 % of them should lie within one and two.
 
     python scripts/measure_honesty.py [--labs 0:20] [--json FILE] [--model MODEL] [--views 14]
     python scripts/measure_honesty.py --sessions 20 [--images 3,4,5,7,10,20]

@@ -15,9 +15,9 @@ lens is off the truth far away (rms where boards were, after the best rotation) 
 With --pairs what the session's camera then measures: four pairs, the camera moved by 40 to 80 mm, of three boards 110
 to 300 mm away; by a central calibration, by the far camera of one with a pupil, and by that with the pupil. With --rig
 two such lenses 60 mm apart, the second's pupil moving 0.8 times as far, in 20 frames: the baseline and the lenses.
-Errors are printed with what they are in stated sigmas. --real takes REAL images of one board: by either half of them
-the camera is calibrated, and any two of the other half are a pair, whose epipolar geometry and whose board's shape from
-triangulated corners are held against the pixels and the lattice.
+Errors are printed with what they are in stated sigmas. --real takes REAL images of one board. By either half of them
+the camera is calibrated, and any two of the other half are a pair. Its epipolar geometry is held against the pixels,
+its board's shape from triangulated corners against the lattice.
 """
 
 from __future__ import annotations

@@ -4,12 +4,13 @@
 
 Runs all tests but the slow ones under coverage (a quarter of an hour of one quiet core), each a context of its own. The
 quick run can do without a test where its other tests reach every line and every branch of rigkit that it reaches. Left
-out are the dearest of these, until the rest takes --total seconds of processor time: of the tests that take longer than
-a limit, which falls until that is so, the quick run keeps those that together reach what the shorter ones do not,
-chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4, 1979), but for
-those that others chosen later make needless. It also keeps a short one of every file, `KEPT`, tests that fail under
-coverage, and those that start programs which are not Python's: what these reach is not seen. With --further only the
-quick tests of now run, in half the time, and more of them are left out. Prints seconds, lines and branches of both.
+out are the dearest of these, until the rest takes --total seconds of processor time. A limit on a test's time falls
+until that is so. Of the tests that take longer, the quick run keeps those that together reach what the shorter ones do
+not. They are chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4,
+1979), but for those that others chosen later make needless. It also keeps a short one of every file, `KEPT`, tests that
+fail under coverage, and those that start programs which are not Python's: what these reach is not seen. With --further
+only the quick tests of now run, in half the time, and more of them are left out. Prints seconds, lines and branches of
+both.
 """
 
 from __future__ import annotations

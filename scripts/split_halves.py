@@ -3,7 +3,7 @@
 The images of every set are split at random into halves. Two calibrations of one and the same camera must differ, after
 the rotation that none of them knows and where both had boards, by what they say that they may: the ratio of the
 observed difference and the predicted one is 1 over many splits. Splits of few images are nearly one and the same, and a
-difference is mostly of one kind, so that this ratio scatters by itself: beside it stands where 95 % of such ratios lie
+difference is mostly of one kind, so that this ratio scatters by itself. Beside it stands where 95 % of such ratios lie
 if the sigmas are true (the errors of all images drawn anew, the splits the same). More splits narrow that little: what
 all sets say together is the last line. And a test that never alarms is worthless: other cameras, and slightly moved
 lenses, must be found.
@@ -268,8 +268,8 @@ def shift_px(camera: Camera, pixels: np.ndarray, remaining_px: float) -> np.ndar
 
 
 def power(name: str, loaded: Loaded, model: str) -> None:
-    """Print the comparisons of one half with the other half behind a lens that was touched; and how often it would be
-    found with as many images a side as are asked of a user, of this camera and these boards: errors drawn from what
+    """Print the comparisons of one half with the other half behind a lens that was touched. Print how often it would be
+    found with as many images a side as are asked of a user, of this camera and these boards: errors are drawn from what
     all images say that calibrations err by."""
     views, size = loaded
     a_views, b_views = halves(views, np.random.default_rng(0))

@@ -1,8 +1,8 @@
 """Directions along a board's rows, columns and diagonals at every corner, with exact lengths, in pixels.
 
 A direction is the derivative of the pixel by the grid index (px per square). It is taken where straight lines are
-straight: in the plane tangent to the unit sphere at the corner's own ray, in coordinates that agree with the pixels
-there to first order, so that what is found is a direction in raw pixels, fisheye or not, however far off the axis.
+straight: in the plane tangent to the unit sphere at the corner's own ray. Coordinates there agree with the pixels to
+first order. So a direction in raw pixels is found, fisheye or not, however far off the axis.
 
 Reference: Hajder, Affine Correspondences in Stereo Vision, directions of a chessboard. Chord lengths to the neighbours
 are first-order wrong under perspective; harmonic means, or a projective fit, are exact.
@@ -81,8 +81,8 @@ def direction_field(
     Weights follow the corners' `sigma_px` through the derivative of the tangent plane by each corner's pixel.
 
     Why a patch of 5 x 5 by default: rms angle errors of 8x6 boards in random corners, degrees, for "neighbours" and
-    "patch" with window 1, 2, 3 and all: corner noise 0.05 px, regular lens .054 .028 .010 .006 .005, fisheye
-    .101 .053 .020 .012 .012; a board of 350 mm bent by 0.5 mm, no noise, .021 .022 .049 .082 .099.
+    "patch" with window 1, 2, 3 and all. Corner noise 0.05 px: regular lens .054 .028 .010 .006 .005, fisheye .101 .053
+    .020 .012 .012. A board of 350 mm bent by 0.5 mm, no noise: .021 .022 .049 .082 .099.
     """
     if window is not None and window < 1:
         raise InputError(f"directions: the window must be at least 1 square, got {window}")

@@ -14,9 +14,9 @@
 
 `compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.
 
-`rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is:
-steps, priors, steps between poses and the squares of what was left out in `solving`, what repeats in `clustered`,
-covariances and the boards' mean motion in `covariance`, how a lens follows another and what it may do beyond its model
-in `uncertainty` and `displaced`. A file of `rig` that is called as one here has only what a rig does there besides, or
+`rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is.
+`solving` has steps, priors, steps between poses and the squares of what was left out; `clustered` what repeats;
+`covariance` covariances and the boards' mean motion. `uncertainty` and `displaced` have how a lens follows another, and
+what it may do beyond its model. A file of `rig` that is called as one here has only what a rig does there besides, or
 instead.
 """

@@ -86,9 +86,9 @@ def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldOut:
     """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
-    numbers (most of the cameras') and squared held-out residuals (M, N), of each camera in units of its smallest mean:
-    cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by rounding. Those
-    whose solver was stopped say nothing where others converged."""
+    numbers (most of the cameras') and squared held-out residuals (M, N). Those of each camera are in units of its
+    smallest mean, as cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by
+    rounding. Those whose solver was stopped say nothing where others converged."""
 
     names: list[str]
     counts: list[int]

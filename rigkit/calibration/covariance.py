@@ -76,7 +76,7 @@ class GlobalCovariance:
         self, lens: slice, parts: Sequence[PoseJacobians], translation_mm: Points, more: FloatArray | None = None
     ) -> FloatArray:
         """Return the covariance (P + 6, P + 6) of the P parameters of a camera and of the mean motion (w, t) of the
-        boards before it: they move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
+        boards before it. They move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
 
         Parameters
         ----------

@@ -259,8 +259,8 @@ def telling_modes(far: FarProjection) -> FloatArray:
 
 def _amounts_like(far: FarProjection, at: Along, whole: FloatArray, fields: FloatArray, away: FloatArray) -> FloatArray:
     """Return the amounts (J,) with which the displaced camera, its parameters following, shows M rays nearest to `away`
-    (M, 2) px from where it has them, in units of `whole` (M,) px; `fields` (J, 2 M) are the displacements less what
-    parameters and a rotation have taken up, in these units.
+    (M, 2) px from where it has them, in units of `whole` (M,) px. `fields` (J, 2 M) are the displacements, in these
+    units, less what parameters and a rotation have taken up.
 
     Displacements of many pixels that parameters and a turned camera take up again but for a little would show any
     difference at first order. Of a camera that is moved so far that is not true, and what is seen in its frame turns

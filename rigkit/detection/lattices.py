@@ -111,7 +111,7 @@ class Seen:
         anything.
 
         Where bright squares run over into dark ones (too much light, thin print), or dark ones into bright ones (ink
-        that spreads), these do not meet: near a corner, the borders of the quadrants lie aside of the lines, by an
+        that spreads), these do not meet. Near a corner, the borders of the quadrants lie aside of the lines, by an
         angle that falls with the radius of the ring. On coarser levels, dots look like squares, too: what lattices are
         is seen on the finest one.
         """

@@ -1,10 +1,10 @@
 """Distance of ray pairs from an epipolar geometry, in pixels, for any central camera.
 
-With unit rays f, ray Jacobians B = d f / d q (3x2) and E21, the constraint is c = f2^T E f1 and its gradients with
-respect to the two pixels are n1 = B1^T E^T f2 and n2 = B2^T E f1: the normals of the epipolar curves in pixel units.
-A pinhole image is the special case in which n1, n2 are the usual line normals (F^T q2)[:2], (F q1)[:2], up to the
-lengths of the homogeneous vectors. Reference: Hajder, "Affine Correspondences in Stereo Vision"; Hartley and
-Zisserman, "Multiple View Geometry", 11.4.3 (Sampson distance).
+With unit rays f, ray Jacobians B = d f / d q (3x2) and E21, the constraint is c = f2^T E f1. Its gradients with respect
+to the two pixels, n1 = B1^T E^T f2 and n2 = B2^T E f1, are the normals of the epipolar curves in pixel units. A pinhole
+image is the special case in which n1, n2 are the usual line normals (F^T q2)[:2], (F q1)[:2], up to the lengths of the
+homogeneous vectors. Reference: Hajder, "Affine Correspondences in Stereo Vision"; Hartley and Zisserman, "Multiple View
+Geometry", 11.4.3 (Sampson distance).
 """
 
 from __future__ import annotations

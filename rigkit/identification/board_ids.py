@@ -54,10 +54,10 @@ def assign_board_ids(
     """Return a board id for each located board, and notes. No kind may have more located than listed boards.
 
     The rule, where several boards of a kind are listed: names that are known stay; then boards in `layout` go to the
-    sides it says; then boards listed upright (columns x rows swapped) to those seen so; the rest are taken in the order
+    sides it says; then boards listed upright (columns x rows swapped) to those seen so. The rest are taken in the order
     listed, clockwise round the centre of all boards as camera 1 sees them, from opposite the floor or ceiling board
-    (from twelve o'clock if there is none): in a corner the right wall, the floor, the left wall. Where only some
-    of three are in sight, each is named by its side in that order.
+    (from twelve o'clock if there is none). In a corner that is the right wall, the floor, the left wall. Where only
+    some of three are in sight, each is named by its side in that order.
     """
     notes: list[str] = []
     names: list[str | None] = [item.board_id for item in located]

@@ -59,10 +59,10 @@ def identify_pair(
 
     Notes
     -----
-    With n boards in both images the joint fit takes 6 (n - 1) degrees of freedom from the free one (every board its own
-    pose in every image); the excess of chi2 over the free fit is what an assignment has to answer for, noise and an
-    imperfect calibration alike. With an unknown scale of these errors the odds of two assignments are
-    (excess_b / excess_a) ** (3 (n - 1)): one board alone never decides, several do unless their arrangement is itself
+    With n boards in both images the joint fit takes 6 (n - 1) degrees of freedom from the free one, in which every
+    board has its own pose in every image. An assignment has to answer for the excess of chi2 over the free fit, noise
+    and an imperfect calibration alike. With an unknown scale of these errors the odds of two assignments are (excess_b
+    / excess_a) ** (3 (n - 1)): one board alone never decides, several do unless their arrangement is itself
     symmetric. Ties within 1000 : 1 go to the smallest roll between the cameras, and are reported.
     """
     kinds = _checked_kinds(boards)

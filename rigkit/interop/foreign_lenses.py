@@ -83,8 +83,8 @@ def thin_prism_fisheye_lens(core: FloatArray, d: FloatArray) -> Lens:
 
 
 def cahvor_lens(core: FloatArray, angles: FloatArray, r: FloatArray) -> Lens:
-    """Return mrcal's CAHVOR of `angles` alpha and beta: the ray p is moved away from the axis o by mu = r0 + r1 tau +
-    r2 tau^2, where tau is the squared tangent of its angle to o = (sin alpha cos beta, sin beta, cos alpha cos beta).
+    """Return mrcal's CAHVOR of `angles` alpha and beta. The ray p is moved away from the axis o = (sin alpha cos beta,
+    sin beta, cos alpha cos beta) by mu = r0 + r1 tau + r2 tau^2, where tau is the squared tangent of its angle to o.
 
     Reference: Y. Yakimovsky and R. Cunningham, "A system for extracting three-dimensional measurements from a stereo
     pair of TV cameras", 1978; D. Gennery, 2001; the axis as mrcal's documentation has it.

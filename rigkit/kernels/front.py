@@ -57,8 +57,8 @@ class _CornerArrays(Struct):
 
 def has_mosaic(image: GreyImage, step: int, least: float, share: float) -> bool:
     """Return whether a place in squares of 2 x 2 pixels is brighter or darker than the mean of its square by `share` of
-    that: in the upper median over those squares, of every `step`-th both ways, that are brighter than the upper median
-    of all, and than `least`."""
+    that. It is so in the upper median over the squares, of every `step`-th both ways, that are brighter than the upper
+    median of all, and than `least`."""
     return bool(kernels().has_mosaic(image, step, least, share))
 
 

@@ -1,9 +1,9 @@
 """The boards' planes from their known lattice: joint maximum likelihood over relative pose and boards' poses.
 
-All corners of both views take part, also those that only one view shows. A free plane is known along the lines of
-sight no better than its triangulated points; the lattice fixes its tilt by perspective in each view as well, and the
-relative pose ties both views together: the planes are several times more certain, most of all where the baseline is
-short or points at the boards.
+All corners of both views take part, also those that only one view shows. A free plane is known along the lines of sight
+no better than its triangulated points. The lattice fixes its tilt by perspective in each view as well, and the relative
+pose ties both views together. So the planes are several times more certain, most of all where the baseline is short or
+points at the boards.
 """
 
 from __future__ import annotations

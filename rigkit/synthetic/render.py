@@ -1,12 +1,12 @@
 """Images of boards through any central camera, exact to a thousandth of a pixel.
 
 Every pixel is the integral of the scene over the pixel's square and the optical blur. The scene is cut into tiles. In a
-tile that a board or panel touches, rays are polynomial in the pixel (fitted to the camera's own rays at Chebyshev
-nodes), reflectance is evaluated on a grid of sub-samples, each of which integrates over its own square cell (exactly
-where one straight edge crosses it), and one separable kernel (pixel box convolved with a Gaussian) reduces sub-samples
-to pixels. Cells fill the plane and the kernel is symmetric and the same for every pixel, so edges carry no bias,
-whatever their direction. With 4 sub-samples and a blur of 0.3 px corners are right to 0.0004 px (rms; to 0.0007 px on
-tilted boards with rows along the image's), sharper ones to about 0.001 px.
+tile that a board or panel touches, rays are polynomial in the pixel, fitted to the camera's own rays at Chebyshev
+nodes. Reflectance is evaluated on a grid of sub-samples, each of which integrates over its own square cell, exactly
+where one straight edge crosses it. One separable kernel (pixel box convolved with a Gaussian) reduces sub-samples to
+pixels. Cells fill the plane and the kernel is symmetric and the same for every pixel, so edges carry no bias, whatever
+their direction. With 4 sub-samples and a blur of 0.3 px corners are right to 0.0004 px (rms; to 0.0007 px on tilted
+boards with rows along the image's), sharper ones to about 0.001 px.
 
 Photometry (light, gamma, noise, JPEG) follows in `rigkit.synthetic.photometry`.
 """

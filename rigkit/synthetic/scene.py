@@ -1,8 +1,8 @@
 """Boards and plain panels in space, and the exact image of their corners through any camera.
 
 The world frame of a trihedral capture has its origin where the three planes meet, x to the right, y down, z away from
-the viewer: plane 1 is the wall in front (normal z), plane 2 the floor (normal y), plane 3 the wall on the right
-(normal x), and the room that the cameras stand in is x, y, z < 0.
+the viewer. Plane 1 is the wall in front (normal z), plane 2 the floor (normal y), plane 3 the wall on the right (normal
+x); cameras stand at x, y, z < 0.
 """
 
 from __future__ import annotations

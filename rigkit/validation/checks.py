@@ -1,8 +1,8 @@
 """A reconstruction against what a person measured: each quantity with both uncertainties and a verdict.
 
-A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2). k = 2 is the usual coverage factor
-of a stated measurement (about 95 %, JCGM 100 "GUM", section 6): a correct result fails one check in twenty if every
-sigma is honest, and fewer where people state theirs generously.
+A check passes where |ours - measured| <= k sqrt(sigma_ours^2 + sigma_measured^2). k = 2 is the usual coverage factor of
+a stated measurement (about 95 %, JCGM 100 "GUM", section 6). A correct result fails one check in twenty if every sigma
+is honest, and fewer where people state theirs generously.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Planes through the points of a board, the angles between them, and how far normals are from them.
 
-A plane is n . x = offset with a unit normal that faces the camera at the origin. PCA is Open3D's; where the points'
-uncertainty across the plane is known, the fit is repeated with those weights, and points that lie far off in spite of
-it (the edge of something in front of a board, taken for a corner) are left out: Open3D's RANSAC finds the plane of the
+A plane is n . x = offset with a unit normal that faces the camera at the origin. PCA is Open3D's. Where the points'
+uncertainty across the plane is known, the fit is repeated with those weights. Points that lie far off in spite of it
+(the edge of something in front of a board, taken for a corner) are left out: Open3D's RANSAC finds the plane of the
 others.
 
 A point is uncertain by its own noise, and by errors that it shares with all others: those of the pose and of the

@@ -71,8 +71,8 @@ def ready_dataset(
     """Return the pairs asked for of a data set, given its folder or manifest or the data set as loaded.
 
     Raises InputError for what can be known before the work: no such pair, no image of any pair, fewer than one process,
-    a pair's name that cannot be a folder beside the files called `reserved`, a folder that results cannot go to, and
-    with `measured` that nothing was measured of any pair.
+    a pair's name that cannot be a folder beside the files called `reserved`, a folder that results cannot go to. With
+    `measured` also where nothing was measured of any pair.
     """
     process_count(options.jobs)
     known = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)

@@ -5,9 +5,9 @@
 The .npz holds observations (N, rows, columns, 3) as mrcal has them, frame_camera (N, 2), the spacing in mm, the size of
 the images, the lens model, and whether the board may be warped and outliers be rejected, as mrcal-calibrate-cameras
 does. Each line on the standard input is JSON: {"hold_out": [frames]}. It calibrates from the other frames in the stages
-of mrcal-calibrate-cameras (seed; poses; poses and stereographic core; everything) and answers with a line of JSON: CPU
-seconds, RMS in px per coordinate, intrinsics, mounts (rotation vector, mm), the board's corners, and of the frames held
-out, with nothing but the board's pose refitted, the sum of squares in px^2 and the number of corners.
+of mrcal-calibrate-cameras (seed; poses; poses and stereographic core; everything). It answers with a line of JSON: CPU
+seconds, RMS in px per coordinate, intrinsics, mounts (rotation vector, mm), the board's corners. Of the frames held
+out, with nothing but the board's pose refitted, follow the sum of squares in px^2 and the number of corners.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ def lattice_affinities(
     marks1: dict[tuple[int, int], FloatArray], marks2: dict[tuple[int, int], FloatArray]
 ) -> tuple[list[tuple[int, int]], Pixels, Pixels, FloatArray]:
     """Return which marks both images have with two neighbours on each of four sides, their pixels, and A21 (N, 2, 2)
-    there, from the differences along rows and columns, to fourth order: on a surface that bends, the nearest neighbours
+    there, from the differences along rows and columns, to fourth order. On a surface that bends, the nearest neighbours
     alone say a derivative wrong by a sixth of the third one times the square of their distance."""
     both = marks1.keys() & marks2.keys()
     arms = [(step * i, step * j) for i, j in ((1, 0), (0, 1)) for step in (-2, -1, 1, 2)]

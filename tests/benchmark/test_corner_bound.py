@@ -36,8 +36,8 @@ def upright(square_px: float) -> BenchScene:
 
 @pytest.mark.parametrize("blur_px", [0.7, 1.5])
 def test_information_of_perpendicular_lines(blur_px: float) -> None:
-    """Moving a corner along u moves one line of length L, a step of height h: in noise of variance 1 its information is
-    h^2 / (2 sqrt(pi) s) times L less what is lost at the other line, where the step changes sign; s^2 is the variance
+    """Moving a corner along u moves one line of length L, a step of height h. In noise of variance 1 its information is
+    h^2 / (2 sqrt(pi) s) times L less what is lost at the other line, where the step changes sign. s^2 is the variance
     of blur and pixel together."""
     square_px = 24.0
     scene = upright(square_px)

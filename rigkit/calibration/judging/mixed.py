@@ -1,8 +1,8 @@
 """Two cameras whose images were mixed: the board before the one, then before the other.
 
 Cameras that stand beside each other see every board from two places, and always the same motion lies between them. Of
-one camera before which a board is held here and there, no motion comes twice; a board that is moved by equal steps
-comes from each place on to the next one, so that the same image is the end of one step and the start of another.
+one camera before which a board is held here and there, no motion comes twice. A board that is moved by equal steps
+comes from each place on to the next one: the same image is the end of one step and the start of another.
 """
 
 from __future__ import annotations

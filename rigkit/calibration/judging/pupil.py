@@ -127,9 +127,9 @@ class MovingPupil:
 
 
 def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | None:
-    """Return products (V, K, K) of how the corners of V views move, their poses eliminated, with what is common to all
-    images (the camera's P parameters, displacements of the image and bows of the boards), with the pupil and with the
-    residual; which image (V,) each is of, and P. None where that is nothing."""
+    """Return products (V, K, K) of how the corners of V views move, their poses eliminated; which image (V,) each is
+    of, and P. They move with what is common to all images (the camera's P parameters, displacements of the image and
+    bows of the boards), with the pupil and with the residual. None where that is nothing."""
     views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
     if len(views) < MIN_TELLING_VIEWS:
         return None

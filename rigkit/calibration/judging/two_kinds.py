@@ -3,7 +3,7 @@
 Nothing says which image is of which kind; the residuals do. Each image has an amount by which its lens lies on the way
 from the one kind to the other, and where there are two kinds those amounts lie at two places, far apart against their
 scatter. What else is not as the model says, a lens, a board, a motion, scatters them without a gap. So the unit that
-counts is the image, not the corner: two places are held against one by the scatter of the amounts, and against what
+counts is the image, not the corner. Two places are held against one by the scatter of the amounts, and against what
 else tells the images apart: a lens unlike its model differs between boards here and there, near and far, tilted this
 way and that, too.
 """

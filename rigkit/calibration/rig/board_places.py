@@ -1,8 +1,8 @@
 """Boards that are mounted to each other: which is which in every image, and where each roughly sits on their target.
 
 Boards that look alike, or that look the same turned, have no name and no first corner of their own; their arrangement
-gives them both. One scene (an image, or a frame of several cameras) that shows most of them is the reference; in every
-other scene all names and orientations of one board are tried, each fixes the target, and the one that puts the other
+gives them both. One scene (an image, or a frame of several cameras) that shows most of them is the reference. In every
+other scene all names and orientations of one board are tried. Each fixes the target, and the one that puts the other
 boards of the scene where they are seen wins.
 """
 

@@ -1,8 +1,8 @@
 """Where a calibration starts, without any guess, from 30 degrees to beyond 200.
 
 Each view gives two rows of its pose by radial alignment. With s the distance of a corner from the optical axis, all
-views together give the rest linearly: a point with |offset| = rho has depth z = s f(rho) / rho for the polynomial
-f(rho) = a0 + a2 rho^2 + a3 rho^3 + a4 rho^4 of Scaramuzza, so
+views together give the rest linearly. A point with |offset| = rho has depth z = s f(rho) / rho for Scaramuzza's
+polynomial f(rho) = a0 + a2 rho^2 + a3 rho^3 + a4 rho^4, so
 
     s f(rho) / rho - t3 = +-(r31 x + r32 y)
 

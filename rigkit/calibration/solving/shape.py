@@ -165,9 +165,10 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
 
 
 def warp_of_board(points: Points) -> ShapeModel:
-    """Return the warp of a board with its corners at `points` (N, 3): aspect, shear, bow along x, bow along y, twist
-    (bows in mm at the centre, twist in mm at the corner), and six of a stretch that changes over the print (mm at the
-    rim: x and y, each quadratic in x and y). An overall scale would only move the board away: it is not among them."""
+    """Return the warp of a board with its corners at `points` (N, 3): aspect, shear, bow along x, bow along y, twist,
+    and six of a stretch that changes over the print (x and y, each quadratic in x and y). Bows are in mm at the centre,
+    the twist at the corner, the stretch at the rim. An overall scale would only move the board away: it is not among
+    them."""
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     half = 0.5 * np.ptp(points, axis=0)
     x, y = ((points - centre)[:, :2]).T

@@ -1,10 +1,10 @@
 """Where a part of a board of known size lies in the board: which of its sides are the board's own border.
 
-Beyond the last corners of a board there is one more square, and then white paper, or what the board is glued to. So one
-and a quarter squares beyond the last row seen, either the squares go on alternating (the board goes on: what follows
-was missed, or is out of the image), or it is equally bright all along and the squares end on one line, where they
-should (a border), or it is something else, and nothing is known. Borders and the known size together may leave one
-place for the part, or several: then it remains a part.
+Beyond the last corners of a board there is one more square, and then white paper, or what the board is glued to. One
+and a quarter squares beyond the last row seen there are three cases. Squares go on alternating: the board goes on, and
+what follows was missed, or is out of the image. It is equally bright all along, and the squares end on one line, where
+they should: that is a border. Else nothing is known. Borders and the known size together may leave one place for the
+part, or several: then it remains a part.
 """
 
 from __future__ import annotations

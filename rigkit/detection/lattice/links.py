@@ -1,7 +1,7 @@
 """Which corners are neighbours along an edge of a chessboard.
 
-Only local evidence counts, so any number of boards, any perspective and any lens will do: the two corners lie in the
-direction of each other's arms, one sees the edge rise where the other sees it fall, and the brightness along the way is
+Only local evidence counts, so any number of boards, any perspective and any lens will do. The two corners lie in the
+direction of each other's arms, and one sees the edge rise where the other sees it fall. The brightness along the way is
 dark on one side and bright on the other as the arms say.
 """
 

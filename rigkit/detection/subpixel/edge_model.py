@@ -2,10 +2,10 @@
 
     I(p) = (1 + g . (p - c)) (a + b S(d1 / s) S(d2 / s))
 
-with d1, d2 the distances of pixel p from the two lines through the corner (with curvatures, so that a fisheye's bent
-rows do not pull the corner aside), S the step of an edge as a Gaussian lens and the square of a pixel blur it, of
-standard deviation s together, a and b brightness and half contrast, g the gradient of the light. Parameters: corner
-(2), angles of the lines (2), s, a, b, g (2), curvatures (2).
+with d1, d2 the distances of pixel p from the two lines through the corner, a and b brightness and half contrast, g the
+gradient of the light. S is the step of an edge as a Gaussian lens and the square of a pixel blur it, of standard
+deviation s together. The lines have curvatures, so that a fisheye's bent rows do not pull the corner aside. Parameters:
+corner (2), angles of the lines (2), s, a, b, g (2), curvatures (2).
 
 The corner of a square that stands alone, on the sides n1 and n2 (+1, -1) of the lines, has S1 S2 + n2 S1 + n1 S2 in
 place of S1 S2, and 4 b is its contrast.

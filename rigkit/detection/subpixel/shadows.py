@@ -3,7 +3,7 @@
 A shadow is a factor of the light. Across its edge, seen through a window, that goes in one straight step from 1 to what
 is left; the edge model, whose light is smooth, takes part of the step for a shift of the corner. What corner and step
 are together the window tells (eleven unknowns). The corner found so is still drawn aside by what the model does not
-know of the edges, which mirrors itself at the corner in even light, but not here; so the window's pixels are divided by
+know of the edges: in even light that mirrors itself at the corner, but not here. So the window's pixels are divided by
 the light, and the corner is fitted in them as any other.
 """
 

@@ -259,7 +259,7 @@ def _beside_paper(
     sheet: _Stacked, windows: _Windows, fit: EdgeFit, mine: IntArray, wanted: BoolArray | None
 ) -> EdgeFit:
     """Return the `fit` of the corners in their `windows` with those fitted again that see what lies beyond the boards,
-    `mine` (N,), that they are of: without it the outermost corners of a blurred board move by tenths of a pixel, and
+    `mine` (N,), that they are of. Without it the outermost corners of a blurred board move by tenths of a pixel, and
     with them the lines through the others. `wanted` (N,) as of `fitted_beside_paper`."""
 
     def fitted(which: BoolArray | slice, geometry: Geometry) -> EdgeFit:

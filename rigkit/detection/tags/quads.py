@@ -57,10 +57,10 @@ def placed_tags(image: GreyImage, board: TagBoard) -> FloatArray:
 def quadrilaterals(image: GreyImage) -> FloatArray:
     """Return quadrilaterals (N, 4, 2) of an image that may be tags, corners in order of growing angle from u to v.
 
-    Outlines of what is darker than the mean around it, by squares of several sizes, that four corners describe: as
-    Garrido-Jurado et al., Automatic generation and detection of highly reliable fiducial markers under occlusion,
-    Pattern Recognition 47 (2014), section 4.1, seek markers. cv2.aruco would try to read them, too, in four fifths of
-    the time, and knows neither wide borders nor more than one dictionary.
+    Outlines of what is darker than the mean around it, by squares of several sizes, that four corners describe. So
+    markers are sought by Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers
+    under occlusion", Pattern Recognition 47 (2014), section 4.1. In four fifths of the time cv2.aruco would try to read
+    them, too, but knows neither wide borders nor more than one dictionary.
     """
     grey = image if image.dtype == np.uint8 else np.clip(np.rint(image), 0, 255).astype(np.uint8)
     fewest = max(MIN_PERIMETER * max(grey.shape), MIN_OUTLINE_PX)

@@ -313,9 +313,9 @@ def _drawn_by_markers(
 ) -> float:
     """Return how far corners go back, in parts of the shift, where their markers are wiped out a little beside.
 
-    What is left of such markers draws a corner to where it belongs: wiped out beside corners that are off by e, they
-    leave corners off by P n - c e, n being the noise, P n what it does on a chessboard, and c what is returned. Done
-    over and over that ends at e = P n / (1 + c): markers, too, say where corners are.
+    What is left of such markers draws a corner to where it belongs. Wiped out beside corners that are off by e, they
+    leave corners off by P n - c e: n is the noise, P n what it does on a chessboard, and c what is returned. Done over
+    and over that ends at e = P n / (1 + c): markers, too, say where corners are.
 
     told, found : the corners around which markers were wiped out, and where they were then found.
     """

@@ -1,7 +1,7 @@
 """Clouds of several pairs of views with known poses, fused into one.
 
 What one pair says of a place, another pair may have said before: then the two are one point. A point of a later cloud
-is looked for where the camera of an earlier one saw it; where its distance from the surface there is no more than the
+is looked for where the camera of an earlier one saw it. Where its distance from the surface there is no more than the
 errors of both along the surface's normal, the two are merged by these errors, and their colours with them. Distances
 across the surface do not matter: both clouds are samples of it. What calibrations err by parts clouds as noise does,
 but merging does not average it away: all points of a pair have it together, and pairs with a camera in common, too.

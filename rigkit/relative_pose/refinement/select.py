@@ -1,10 +1,10 @@
 """Which pose type do the matches speak for, and does the declared one hold?
 
-For each type the marginal likelihood of the points (Laplace's approximation) under "the pose is of this type up to the
-spirit level's sigma": a type is preferred over a more general one if its deviations are no larger than noise and level
+Each type has the marginal likelihood of the points (Laplace's approximation) under "the pose is of this type up to the
+spirit level's sigma". A type is preferred over a more general one if its deviations are no larger than noise and level
 allow, because it spends no probability on poses that were not taken. The noise is that of the matches' sigmas,
-corrected by what the general fit leaves over. A declared type is contradicted if the deviations of the general fit
-from it cannot come from noise and level together.
+corrected by what the general fit leaves over. A declared type is contradicted if the deviations of the general fit from
+it cannot come from noise and level together.
 """
 
 from __future__ import annotations

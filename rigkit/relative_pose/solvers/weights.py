@@ -90,7 +90,8 @@ def pixel_share(matches: Matches, E21: Mat3) -> FloatArray:
     Notes
     -----
     With M = B2^T E B1 the derivatives of A^T n2 + n1 by the pixels are A^T M and M^T, but for how B1 and B2 change with
-    them: along the line of sight, which multiplies the zero A^T n2 + n1, and by the lens's distortion, far less.
+    them. They change along the line of sight, which multiplies the zero A^T n2 + n1, and by the lens's distortion, far
+    less.
     """
     m = matches
     if m.A21 is None:

@@ -4,8 +4,8 @@ Of a pair of cameras every match has a Sampson distance r with derivatives J by 
 scores -J^T r have the mean J^T J d, as those of boards have. How much matches scatter is what is left once everything
 that theta could explain is taken away: else a change would hide behind the scatter that it makes. Matches of one part
 of the image share their errors: by how much more the parts disagree than independent matches would, counts against all
-of them. What they share alike all over the image would pass for a change: patches are aligned by affine warps, and
-between lenses that distort the map is none, which moved matches by up to 0.02 px where their noise is 0.007, and by
+of them. What they share alike all over the image would pass for a change. Patches are aligned by affine warps, and
+between lenses that distort the map is none: that moved matches by up to 0.02 px where their noise is 0.007, and by
 0.007 degrees of a mount between lenses of 90 degrees. The rig as it is known tells by how much: that is taken back.
 """
 

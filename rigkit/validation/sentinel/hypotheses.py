@@ -106,8 +106,8 @@ def turn_weight(camera: Camera) -> FloatArray:
 
 def _lens_directions(camera: Camera) -> FloatArray:
     """Return the changes of the parameters (P, 6) that scale the image by a hundredth, move it by a pixel right and
-    down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius: as near as the model
-    comes, whatever the lens may do beyond it."""
+    down, and bend it by a pixel at its rim with the third, fifth and seventh power of the radius. They do so as nearly
+    as the model can, whatever the lens may do beyond it."""
     out = np.zeros((camera.parameters.size, 6))
     camera = lens_of(far_camera(camera))
     pixels = grid_pixels(camera.size_px, FIELD_GRID).reshape(-1, 2)

@@ -290,10 +290,10 @@ def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
 
 
 def _sizes_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> tuple[float, float]:
-    """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`: over the image of the
-    camera that suffers most, after the best rotation; how far a camera that turned on its mount sees what is far away
-    move; or what the corners show of it. The square of an estimate is too large by its variance, which is taken off;
-    and the same where it is not."""
+    """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`. It is the largest of:
+    over the image of the camera that suffers most, after the best rotation; how far a camera that turned on its mount
+    sees what is far away move; what the corners show of it. The square of an estimate is too large by its variance,
+    which is taken off; and the same where it is not."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     turns = [_turn_weight(watched, c) for c in range(1, len(watched.cameras))]
     weights = [shown, *(goal.weight for goal in lens_goals(watched)), *turns]

@@ -1,8 +1,8 @@
 """Scores of fresh frames in units of their own scatter, and what unchanged cameras would show.
 
-With A the frames' information over their variance, A = L L^T, and C the covariance of theta, w = L^+ score has the
-covariance I + L^T C L where nothing changed (the frames scatter, and the calibration was a little off from the start),
-and a change d of theta moves it by L^T d.
+A = L L^T is the frames' information over their variance, and C the covariance of theta. Where nothing changed, w = L^+
+score has the covariance I + L^T C L: the frames scatter, and the calibration was a little off from the start. A change
+d of theta moves it by L^T d.
 """
 
 from __future__ import annotations
