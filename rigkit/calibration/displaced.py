@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import Along, FarProjection
-from rigkit.cameras.base import Camera, RadialCurve, image_center
+from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
@@ -67,10 +67,6 @@ class DisplacedCamera(Camera):
         object.__setattr__(self, "_amounts", self.modes @ amounts)
         turned = None if self.turns is None or not amounts.any() else exp_so3(self.turns @ amounts)
         object.__setattr__(self, "_turned", turned)
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        raise InputError("a displaced camera is one that was calibrated; a radial curve starts its lens alone")
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         return type(self)(self.size_px, np.asarray(parameters, dtype=np.float64), self.lens, self.modes, self.turns)

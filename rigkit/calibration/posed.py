@@ -21,10 +21,10 @@ from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.usable import usable_views
-from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.detections import BoardView
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
@@ -139,10 +139,6 @@ class HeldLens(Camera):
     def of(cls, lens: Camera) -> HeldLens:
         """Return the lens, held."""
         return cls(lens.size_px, np.zeros(0), lens)
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        raise InputError("a held lens is not made of a curve; it is one that is known")
 
     def parameter_names(self) -> tuple[str, ...]:
         return ()

@@ -142,17 +142,18 @@ class Camera(ABC):
         return
 
     @classmethod
-    @abstractmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
         """Return the camera of this model nearest to a sampled radial curve: where every calibration starts.
 
-        Raises InputError: a model of this kind cannot follow the curve (a pinhole beyond 90 degrees).
+        Raises InputError: a model of this kind cannot follow the curve (a pinhole beyond 90 degrees), or is no lens
+        that a calibration starts with.
 
         Parameters
         ----------
         curve : where the optical axis meets the image, and radii over angles.
         order : for models of several sizes: Brown's number of distortion terms, Scaramuzza's degree.
         """
+        raise InputError(f"no '{cls.model}' camera starts at a radial curve")
 
     @abstractmethod
     def parameter_names(self) -> tuple[str, ...]:

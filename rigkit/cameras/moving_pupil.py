@@ -23,9 +23,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays
-from rigkit.core.errors import InputError
 
 PUPIL_TERMS = 2
 PUPIL_NAMES = ("pupil_mm_per_rad2", "pupil_mm_per_rad4")
@@ -58,10 +57,6 @@ class NearCamera(Camera):
     def of(cls, lens: Camera, pupil: ArrayLike = (0.0, 0.0)) -> NearCamera:
         """Return the lens with the pupil (2,), mm rad^-2 and mm rad^-4."""
         return cls(lens.size_px, np.append(lens.parameters, pupil), lens)
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        raise InputError("a radial curve says nothing of a pupil; calibrate the central camera first")
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         values = np.asarray(parameters, dtype=np.float64)

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
-from rigkit.cameras.base import Camera, RadialCurve
+from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.errors import InputError
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,10 +26,6 @@ class Panorama(Camera):
     """
 
     horizontal_axis: ClassVar[bool] = False
-
-    @classmethod
-    def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        raise InputError(f"a {cls.model} image has no radial curve: it is a target of rectification, not a lens")
 
     @property
     def max_angle_rad(self) -> float:

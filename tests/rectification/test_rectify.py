@@ -80,7 +80,7 @@ def test_panoramas_refuse_what_they_do_not_show(name: str) -> None:
     pixel = np.array([400.0, 200.0])
     pixel[axis] += 118.0 * 3.3
     assert not camera.unproject(pixel)[1]
-    with pytest.raises(InputError, match="target of rectification"):
+    with pytest.raises(InputError, match="camera starts at a radial curve"):
         curve = RadialCurve(np.array([5.0, 5.0]), np.array([0.1, 0.2, 0.3, 0.4]), np.array([1.0, 2.0, 3.0, 4.0]))
         type(camera).from_radial_curve((10, 10), curve)
 

@@ -51,7 +51,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
     state = fit.state.with_boards_held()
-    pulls, order = _Pulls.of(observations, fit, number), np.arange(len(images))
+    pulls, order = _Pulls.of(fit, number), np.arange(len(images))
     first = pulls.parted_at(order)
     later = order >= first
     named = _named_alike(images)
@@ -94,7 +94,7 @@ class _Pulls:
     min_images: int
 
     @classmethod
-    def of(cls, observations: Observations, fit: Fit, number: IntArray) -> _Pulls:
+    def of(cls, fit: Fit, number: IntArray) -> _Pulls:
         """Return those of the images that the views (V,) are of, all else that is solved for held."""
         p = fit.state.camera.parameters.size
         rows = np.r_[:p, -7:0] % fit.data.products[0].shape[-1]
