@@ -55,11 +55,11 @@ class _CornerArrays(Struct):
     """The corners that links are sought for."""
 
 
-def has_mosaic(image: GreyImage, step: int, least: float, share: float) -> bool:
+def has_mosaic(image: GreyImage, step: int, min_level: float, share: float) -> bool:
     """Return whether a place in squares of 2 x 2 pixels is brighter or darker than the mean of its square by `share` of
     that. It is so in the upper median over the squares, of every `step`-th both ways, that are brighter than the upper
-    median of all, and than `least`."""
-    return bool(kernels().has_mosaic(image, step, least, share))
+    median of all, and than `min_level`."""
+    return bool(kernels().has_mosaic(image, step, min_level, share))
 
 
 def bad_pixels(image: GreyImage, first: int, apart: int, step: float, share: float) -> tuple[int, float]:

@@ -68,12 +68,13 @@ def shifts_of_edges(
     reach: float,
     along: Sequence[float],
     steps: int,
-    most: int,
+    max_edges: int,
 ) -> FloatArray:
-    """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, from about `most` edges."""
+    """Return how far edges lie aside, (K,), as `detection.checks.validate._edge_offsets`, of about `max_edges`
+    edges."""
     level, sign = ImageOf.of(brightness=image), 1.0 if rising else -1.0
     places = np.array(along)
-    return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, reach, places, steps, most))
+    return np.asarray(kernels().edge_shifts(pixels, sign, level, scale, offset, reach, places, steps, max_edges))
 
 
 def clearest_splits(

@@ -163,9 +163,9 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
     return "".join([*out, *_points(entries, name, x, top), *_below(x, told), "</svg>"])
 
 
-def _top(least: float, value: FloatArray, sigma: FloatArray) -> float:
+def _top(limit: float, value: FloatArray, sigma: FloatArray) -> float:
     """Return the amount at the upper rim of a drawing."""
-    return 1.1 * max(least, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
+    return 1.1 * max(limit, float((np.abs(value) + sigma).max()), np.finfo(float).tiny)
 
 
 def _across(values: FloatArray) -> FloatArray:

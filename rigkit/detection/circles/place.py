@@ -58,10 +58,11 @@ def may_be_part(found: CircleGrid, board: Board) -> bool:
     return _open_place(found, board, TELLING) is not None
 
 
-def _open_place(found: CircleGrid, board: Board, most: int) -> _Place | None:
-    """Return a place in the board that leaves `most` places empty that the image shows; None where there is none."""
-    least = min(_places_on(found, board), key=lambda place: place.empty, default=None)
-    return None if least is None or least.empty > most else least
+def _open_place(found: CircleGrid, board: Board, max_empty: int) -> _Place | None:
+    """Return a place in the board that leaves at most `max_empty` places empty that the image shows; None where there
+    is none."""
+    fullest = min(_places_on(found, board), key=lambda place: place.empty, default=None)
+    return None if fullest is None or fullest.empty > max_empty else fullest
 
 
 def placed_on(found: CircleGrid, board: Board) -> BoardDetection | None:

@@ -178,10 +178,10 @@ class _Windows:
         return cls(start.lattice, geometry, curvature_sigma, blur[known], radius_px)
 
     def fit(
-        self, image: GreyImage, signs: FloatArray, which: BoolArray | slice, geometry: Geometry, most: tuple[int, float]
+        self, image: GreyImage, signs: FloatArray, which: BoolArray | slice, geometry: Geometry, stop: tuple[int, float]
     ) -> EdgeFit:
-        """Return the fit of the corners `which` (N,), with `geometry` instead of their own, in the `most` steps until
-        one is so short, px; `signs` (R, C)."""
+        """Return the fit of the corners `which` (N,), with `geometry` instead of their own; `signs` (R, C).
+        `stop`: after so many steps, or one so short, px."""
         known = self.lattice.known
         return fit_edges(
             image,
@@ -190,8 +190,8 @@ class _Windows:
             signs[known][which],
             self.blur[which],
             radius_px=self.radius_px,
-            iterations=most[0],
-            converged_px=most[1],
+            iterations=stop[0],
+            converged_px=stop[1],
             curvature_sigma=self.curvature_sigma[which],
             contrast=self.lattice.contrast[known][which],
         )

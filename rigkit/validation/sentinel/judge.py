@@ -34,7 +34,7 @@ ALARM_PX = 0.07
 """What moves the projection by less is of no importance, however surely it is there."""
 FIX_ROUNDS = 3
 """Times that a change is linearised anew where it was found."""
-WILD = 3.0
+MAX_OF_EXPECTED = 3.0
 """Corners that scatter so many times as much as expected after every explanation are explained by none."""
 MAX_SIGMA = 100.0
 """Percent, pixels, degrees, millimetres: what is known no better is not seen at all."""
@@ -128,7 +128,7 @@ class SentinelCheck:
     @property
     def unexplained(self) -> bool:
         """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
-        return _wild(self.rms_fixed_px, self.expected_px)
+        return _inexplicable(self.rms_fixed_px, self.expected_px)
 
     @property
     def holds(self) -> bool:
@@ -138,9 +138,9 @@ class SentinelCheck:
         return self.change is None or self.chance >= ALARM_CHANCE or self.change.max_px < ALARM_PX
 
 
-def _wild(rms_px: float, expected_px: float) -> bool:
+def _inexplicable(rms_px: float, expected_px: float) -> bool:
     """Say whether residuals are beyond all that is expected; those that are no numbers are."""
-    return not rms_px <= max(WILD * expected_px, ALARM_PX)
+    return not rms_px <= max(MAX_OF_EXPECTED * expected_px, ALARM_PX)
 
 
 def check_views(watched: Watched, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
@@ -161,7 +161,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(watched)) if c is not None]
     except DegenerateError:
         # Pictures of something else are far from all that can be linearised: that is the verdict.
-        if not _wild(evidence.rms_px, expected_px):
+        if not _inexplicable(evidence.rms_px, expected_px):
             raise
         chance = 0.0
     step, covariance, change = np.zeros(watched.layout.count), watched.covariance, None
@@ -199,7 +199,7 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         corners=evidence.corners,
         tried=tuple(known),
         powers=()
-        if _wild(after.rms_px, expected_px)
+        if _inexplicable(after.rms_px, expected_px)
         else powers_of(watched, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,

@@ -44,11 +44,11 @@ class ChangeAim:
     unit: str = "px"
 
     @classmethod
-    def of(cls, watched: Watched, inverse: FloatArray, most: FloatArray) -> ChangeAim:
+    def of(cls, watched: Watched, inverse: FloatArray, of_all: FloatArray) -> ChangeAim:
         """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); hypotheses of which even
-        `most` (T, T), what all frames say that could be taken, tells nothing are left out."""
+        `of_all` (T, T), what all frames say that could be taken, tells nothing are left out."""
         several = len(watched.cameras) > 1
-        by_all, shown = covariance_of(inverse + most), []
+        by_all, shown = covariance_of(inverse + of_all), []
         for hypothesis in hypotheses_of(watched):
             metric = _metric(watched, hypothesis)
             if metric is None:
