@@ -14,7 +14,7 @@ import numpy as np
 
 from rigkit.calibration.choice import Option
 from rigkit.calibration.lens_choice import Lenses, lenses_on_boards, lenses_on_flat_boards
-from rigkit.calibration.models_tried import How, Wanted, fit_all, wanted_models
+from rigkit.calibration.models_tried import ModelInQuestion, Request, fit_all, wanted_models
 from rigkit.calibration.one_model import Solved, only, solved
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.views.observations import Observations
@@ -50,11 +50,11 @@ class Begun:
     compared on flat boards where there are several. What each model comes to is found once."""
 
     name: str
-    how: How
+    request: Request
     views: Sequence[BoardView]
     dropped: tuple[tuple[str, str], ...]
     observations: Observations
-    wanted: Wanted
+    wanted: list[ModelInQuestion]
     options: list[Option]
     failed: list[Candidate]
     tried: Lenses
@@ -66,21 +66,21 @@ class Begun:
         if model not in self._solved:
             with about_camera(self.name, self.observations.views):
                 own, wanted = only(self.options, self.wanted, model)
-                self._solved[model] = solved(self.observations, own, wanted, self.failed, self.how)
+                self._solved[model] = solved(self.observations, own, wanted, self.failed, self.request)
         return self._solved[model]
 
     def on_boards(self, model: str, names: Sequence[str]) -> Lenses:
         """Return the lenses tried, those of the `names`, on boards as a camera model found them."""
         done = self._on_boards.setdefault(model, {})
-        return lenses_on_boards(self.solved(model), self.tried, names, self.how, done)
+        return lenses_on_boards(self.solved(model), self.tried, names, self.request, done)
 
-    def asked(self, name: str, views: Sequence[BoardView], how: How) -> Self | None:
+    def asked(self, name: str, views: Sequence[BoardView], request: Request) -> Self | None:
         """Return it as a camera of another name, or alone, with the pupil asked for; None where it is of other views,
         or was begun otherwise. What is found of either is kept for both."""
-        then, now = ((h.size_px, h.model, h.degree, h.board, h.folds) for h in (self.how, how))
+        then, now = ((h.size_px, h.model, h.degree, h.board, h.folds) for h in (self.request, request))
         if then != now or len(views) != len(self.views) or not all(map(_same, self.views, views)):
             return None
-        return replace(self, name=name, how=how)
+        return replace(self, name=name, request=request)
 
 
 def _same(a: BoardView, b: BoardView) -> bool:
@@ -90,18 +90,18 @@ def _same(a: BoardView, b: BoardView) -> bool:
     return named and all(np.array_equal(x, y) for x, y in arrays)
 
 
-def begin(name: str, views: Sequence[BoardView], how: How) -> Begun:
-    """Return a camera with all models fitted that `how` asks for; errors as of `calibrate`, with its name."""
+def begin(name: str, views: Sequence[BoardView], request: Request) -> Begun:
+    """Return a camera with all models fitted that `request` asks for; errors as of `calibrate`, with its name."""
     with about_camera(name, views):
-        wanted = wanted_models(how)
-        used, dropped = usable_views(views, how.size_px)
+        wanted = wanted_models(request)
+        used, dropped = usable_views(views, request.size_px)
         observations = Observations.from_views(used)
-        options, failed = fit_all(observations, how.size_px, wanted, how.progress)
+        options, failed = fit_all(observations, request.size_px, wanted, request.progress)
         several = len({option.fit.state.camera.model for option in options}) > 1
-        tried = lenses_on_flat_boards(observations, options, how) if several else Lenses(observations, options)
+        tried = lenses_on_flat_boards(observations, options, request) if several else Lenses(observations, options)
     return Begun(
         name=name,
-        how=how,
+        request=request,
         views=views,
         dropped=dropped,
         observations=observations,

@@ -24,7 +24,7 @@ from rigkit.calibration.lens_choice import (
     choose_lenses,
     twins,
 )
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.calibration.one_model import Solved, on_same_images
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.uncertainty import FarProjection
@@ -81,12 +81,14 @@ def calibrate(
         The views do not determine the camera.
     """
     require_known(pupil)
-    how = How(size_px=size_px, model=model, degree=degree, board=board, folds=folds, progress=progress, pupil=pupil)
-    return calibrate_together([("", views, how)])[0]
+    request = Request(
+        size_px=size_px, model=model, degree=degree, board=board, folds=folds, progress=progress, pupil=pupil
+    )
+    return calibrate_together([("", views, request)])[0]
 
 
 def calibrate_together(
-    cameras: Sequence[tuple[str, Sequence[BoardView], How]],
+    cameras: Sequence[tuple[str, Sequence[BoardView], Request]],
     *,
     known: Sequence[Begun] = (),
     progress: Progress = silent,
@@ -95,10 +97,10 @@ def calibrate_together(
     models that "auto" asks for are chosen together where cameras are alike. What was `known` before of the same views
     is not done again. Errors as of `calibrate`, with the name (none for "")."""
     begun = []
-    for k, (name, views, how) in enumerate(cameras):
+    for k, (name, views, request) in enumerate(cameras):
         progress("cameras", k, len(cameras))
-        done = (one.asked(name, views, how) for one in known)
-        begun.append(next((one for one in done if one is not None), None) or begin(name, views, how))
+        done = (one.asked(name, views, request) for one in known)
+        begun.append(next((one for one in done if one is not None), None) or begin(name, views, request))
     out: dict[int, Calibration] = {}
     for group in twins([one.tried.alone.fit.state.camera for one in begun]):
         out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
@@ -150,23 +152,23 @@ def _result(
     begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
 ) -> Calibration:
     """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
-    central, how = _judged(begun, found, tried, rivals, likely), begun.how
-    if how.pupil == "central" or (how.pupil == "auto" and not may_move(central)):
+    central, request = _judged(begun, found, tried, rivals, likely), begun.request
+    if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
         return central
-    moving = solved_with_pupil(found, begun.observations, how)
+    moving = solved_with_pupil(found, begun.observations, request)
     if moving is not None:
         if len(tried.models) == 1:
             rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()
-        better, candidates = against_central(found, moving, how)
+        better, candidates = against_central(found, moving, request)
         moving = replace(moving, candidates=[*candidates, *moving.candidates])
         try:
             result = _judged(begun, moving, tried, rivals, likely)
         except DegenerateError:
             result = central
-        if result.pupil is not None and (how.pupil == "moving" or (better and surely_moves(result))):
+        if result.pupil is not None and (request.pupil == "moving" or (better and surely_moves(result))):
             return result
         central = replace(central, candidates=(*central.candidates, *kept_central(candidates)))
-    if how.pupil == "moving":
+    if request.pupil == "moving":
         raise DegenerateError(
             "calibration: the images do not tell how the entrance pupil moves; take boards near and far, up to the "
             'rim of the image, or pupil = "auto"'
@@ -178,7 +180,7 @@ def _judged(
     begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
 ) -> Calibration:
     """Return the result of a camera as it was solved for, with its verdicts."""
-    how, fit = begun.how, found.chosen.fit
+    request, fit = begun.request, found.chosen.fit
     others = _others(tried, far_camera(fit.state.camera).model) if len(tried.models) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
     if not begun.name:
@@ -192,8 +194,8 @@ def _judged(
         with_rivals([*others, *found.candidates], [one.rival for one in close]),
         close,
     )
-    in_force = [name for name, value in (("model", how.model), ("board_shape", how.board)) if value == "auto"]
-    moved = moved_lens(found.observations, fit) if how.folds else ()
+    in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
+    moved = moved_lens(found.observations, fit) if request.folds else ()
     also = [*moved, *_at_the_end(found.beyond, result, in_force)]
     far, clusters = _determined(result), found.observations.clusters()
     solved_for = found.observations, fit

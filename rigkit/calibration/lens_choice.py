@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, settled
 from rigkit.calibration.heldout import heldout_squares
-from rigkit.calibration.models_tried import How, agreeing, compared, fit_of_views, reweighted
+from rigkit.calibration.models_tried import Request, agreeing, compared, fit_of_views, reweighted
 from rigkit.calibration.one_model import Solved
 from rigkit.calibration.solving.fit import fit_other_lens
 from rigkit.calibration.views.observations import Observations
@@ -51,13 +51,13 @@ class Choice:
     likely: dict[str, float]
 
 
-def lenses_on_flat_boards(observations: Observations, options: list[Option], how: How) -> Lenses:
+def lenses_on_flat_boards(observations: Observations, options: list[Option], request: Request) -> Lenses:
     """Return the options as they compare on the same corners of the views that agree with them."""
     keep, _ = agreeing(observations, options)
     seen = observations.subset(np.flatnonzero(keep))
     same = options if keep.all() else [replace(o, fit=fit_of_views(seen, o.fit, keep)) for o in options]
     seen = reweighted(seen, same)
-    return Lenses(seen, compared(seen, same, how.folds, how.progress))
+    return Lenses(seen, compared(seen, same, request.folds, request.progress))
 
 
 def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
@@ -74,7 +74,7 @@ def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
 
 
 def lenses_on_boards(
-    found: Solved, tried: Lenses, names: Sequence[str], how: How, done: dict[str, Option] | None = None
+    found: Solved, tried: Lenses, names: Sequence[str], request: Request, done: dict[str, Option] | None = None
 ) -> Lenses:
     """Return the lenses tried, those of the `names`, fitted to boards with their corners as they were found and warps
     that are free again. `done` are those that were fitted before, by name; what is fitted now comes to them."""
@@ -92,7 +92,7 @@ def lenses_on_boards(
     for name in order:
         if all(done[name].fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
             if done[name].heldout is None:
-                done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, how.folds))
+                done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, request.folds))
             judged.append(done[name])
     return Lenses(observations, list(settled(judged)))
 

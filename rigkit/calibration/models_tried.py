@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,12 +33,16 @@ DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
 """and those tried where the largest of them is the best: precise corners, or lenses of more than 200 degrees."""
 
 
-Wanted = list[tuple[str, type[Camera], int | None]]
-"""Name, camera model and size of what is to be fitted."""
+class ModelInQuestion(NamedTuple):
+    """A camera model of one size (`order`, where it has several) that is to be fitted, and what it is called."""
+
+    name: str
+    camera: type[Camera]
+    order: int | None
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class How:
+class Request:
     """What `calibrate` was asked for."""
 
     size_px: tuple[int, int]
@@ -50,35 +55,35 @@ class How:
     """Or "auto", "moving": see `calibrate`."""
 
 
-def wanted_models(how: How) -> Wanted:
-    """Return name, camera model and size of what is to be fitted. Raises InputError for options without a meaning."""
-    if how.board not in (*SHAPES, "auto"):
-        raise InputError(f"board shape '{how.board}' is unknown; known: auto, {', '.join(SHAPES)}")
-    if how.folds < 0 or how.folds == 1:
-        raise InputError(f"cross-validation in {how.folds} folds: give 2 or more, or 0 for none")
-    if how.degree is not None:
-        check_order(how.model, how.degree)
-    out: Wanted = []
-    for name in list(MODELS) if how.model == "auto" else [how.model]:
+def wanted_models(request: Request) -> list[ModelInQuestion]:
+    """Return the camera models that are to be fitted. Raises InputError for options without a meaning."""
+    if request.board not in (*SHAPES, "auto"):
+        raise InputError(f"board shape '{request.board}' is unknown; known: auto, {', '.join(SHAPES)}")
+    if request.folds < 0 or request.folds == 1:
+        raise InputError(f"cross-validation in {request.folds} folds: give 2 or more, or 0 for none")
+    if request.degree is not None:
+        check_order(request.model, request.degree)
+    out: list[ModelInQuestion] = []
+    for name in list(MODELS) if request.model == "auto" else [request.model]:
         cls = camera_model(name)
-        orders = (how.degree,) if how.degree is not None else DEGREES_TRIED.get(name, (None,))
-        out += [(name if order is None else f"{name} {order}", cls, order) for order in orders]
+        orders = (request.degree,) if request.degree is not None else DEGREES_TRIED.get(name, (None,))
+        out += [ModelInQuestion(name if order is None else f"{name} {order}", cls, order) for order in orders]
     return out
 
 
-def larger_sizes(chosen: Option) -> Wanted:
+def larger_sizes(chosen: Option) -> list[ModelInQuestion]:
     """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
     camera = chosen.fit.state.camera
     tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
     if chosen.name != f"{camera.model} {tried[-1]}":
         return []
-    return [(f"{camera.model} {order}", type(camera), order) for order in more]
+    return [ModelInQuestion(f"{camera.model} {order}", type(camera), order) for order in more]
 
 
 def fit_all(
     observations: Observations,
     size_px: tuple[int, int],
-    wanted: Wanted,
+    wanted: Sequence[ModelInQuestion],
     progress: Progress,
     known: Sequence[Option] = (),
 ) -> tuple[list[Option], list[Candidate]]:

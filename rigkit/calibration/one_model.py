@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rigkit.calibration.board_orientation import turned_views, with_views_turned
 from rigkit.calibration.choice import SURELY, Option, choose, described
-from rigkit.calibration.models_tried import How, Wanted, agreeing, compared, fit_all, larger_sizes, reweighted
+from rigkit.calibration.models_tried import (
+    ModelInQuestion,
+    Request,
+    agreeing,
+    compared,
+    fit_all,
+    larger_sizes,
+    reweighted,
+)
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.evidence import fit_shapes
 from rigkit.calibration.solving.fit import Fit
@@ -30,22 +39,28 @@ class Solved:
     reasons: tuple[tuple[str, str], ...]
     chosen: Option
     candidates: list[Candidate]
-    beyond: Wanted
+    beyond: list[ModelInQuestion]
     sizes: list[Option]
     shapes: list[Option]
 
 
-def only(options: list[Option], wanted: Wanted, model: str) -> tuple[list[Option], Wanted]:
+def only(
+    options: list[Option], wanted: Sequence[ModelInQuestion], model: str
+) -> tuple[list[Option], list[ModelInQuestion]]:
     """Return the options and what was wanted of one camera model."""
     own = [option for option in options if option.fit.state.camera.model == model]
-    return own, [w for w in wanted if w[1].model == model]
+    return own, [one for one in wanted if one.camera.model == model]
 
 
 def solved(
-    observations: Observations, options: list[Option], wanted: Wanted, failed: list[Candidate], how: How
+    observations: Observations,
+    options: list[Option],
+    wanted: Sequence[ModelInQuestion],
+    failed: list[Candidate],
+    request: Request,
 ) -> Solved:
     """Return what one camera model comes to; what else was tried changes nothing."""
-    size_px, board, folds, progress = how.size_px, how.board, how.folds, how.progress
+    size_px, board, folds, progress = request.size_px, request.board, request.folds, request.progress
     keep, reasons = agreeing(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
@@ -53,12 +68,12 @@ def solved(
     observations = reweighted(observations, options)
     options = compared(observations, options, folds, progress)
     chosen = choose(options, SURELY)
-    beyond = [] if how.degree is not None else larger_sizes(chosen)
+    beyond = [] if request.degree is not None else larger_sizes(chosen)
     if beyond:
         options, unfit = fit_all(observations, size_px, beyond, progress, options)
         options = compared(observations, options, folds, progress)
         chosen, failed = choose(options, SURELY), [*failed, *unfit]
-    candidates = [*described(options, chosen, rivals=how.model == "auto"), *failed]
+    candidates = [*described(options, chosen, rivals=request.model == "auto"), *failed]
     observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
     return Solved(
         observations=observations,

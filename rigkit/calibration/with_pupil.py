@@ -16,7 +16,7 @@ import numpy as np
 from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.judging.pupil import BY_CHANCE
-from rigkit.calibration.models_tried import How, compared, enough_agree, reweighted
+from rigkit.calibration.models_tried import Request, compared, enough_agree, reweighted
 from rigkit.calibration.one_model import Solved, on_same_images, with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, posed, robust_sigma
@@ -33,7 +33,7 @@ CENTRAL, MOVING = "one point of view", "moving pupil"
 """Names of the candidates."""
 
 
-def solved_with_pupil(found: Solved, everything: Observations, how: How) -> Solved | None:
+def solved_with_pupil(found: Solved, everything: Observations, request: Request) -> Solved | None:
     """Return what a camera comes to with a pupil that moves, its model's sizes and the boards' shape chosen again; None
     where the images do not tell it from the rest. Of `everything` that was seen, views that the central lens left out
     and that agree with this one are taken back."""
@@ -47,10 +47,12 @@ def solved_with_pupil(found: Solved, everything: Observations, how: How) -> Solv
     if not options:
         return None
     observations = found.observations
-    options = compared(observations, options, how.folds, how.progress)
+    options = compared(observations, options, request.folds, request.progress)
     chosen = choose(options, SURELY)
-    candidates = described(options, chosen, rivals=how.model == "auto")
-    observations, chosen, shapes, tried = with_board_shape(observations, chosen, how.board, how.folds, how.progress)
+    candidates = described(options, chosen, rivals=request.model == "auto")
+    observations, chosen, shapes, tried = with_board_shape(
+        observations, chosen, request.board, request.folds, request.progress
+    )
     return replace(
         found,
         observations=observations,
@@ -108,12 +110,12 @@ def _taken_back(
     return replace(found, observations=whole, used=used, reasons=reasons), poses, kept_of_all
 
 
-def against_central(central: Solved, moving: Solved, how: How) -> tuple[bool, list[Candidate]]:
+def against_central(central: Solved, moving: Solved, request: Request) -> tuple[bool, list[Candidate]]:
     """Return whether images that took no part are shown better with the pupil, on the same corners, and both as
     candidates."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
-        options = compared(central.observations, options, how.folds, how.progress)
+        options = compared(central.observations, options, request.folds, request.progress)
     chosen = choose(options, SURELY)
     return chosen.name == MOVING, described(options, chosen)
 

@@ -16,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from rigkit.calibration.begun import Begun, begin
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.detections import BoardView
@@ -58,10 +58,12 @@ class Whole:
 def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Whole | None:
     """Return what `calibrate` makes of frames, each of which is an image; None where they do not determine the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
-    how = How(size_px=size_px, model="auto", degree=None, board="auto", folds=FOLDS, progress=silent, pupil="auto")
+    request = Request(
+        size_px=size_px, model="auto", degree=None, board="auto", folds=FOLDS, progress=silent, pupil="auto"
+    )
     try:
-        begun = begin("", named, how)
-        (found,) = calibrate_together([("", named, how)], known=[begun])
+        begun = begin("", named, request)
+        (found,) = calibrate_together([("", named, request)], known=[begun])
         return Whole(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
     except (InputError, DegenerateError):
         return None

@@ -11,11 +11,11 @@ from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_view
 
 from rigkit.calibration.begun import begin
 from rigkit.calibration.calibrate import calibrate_together
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.core.detections import BoardView
 from rigkit.core.progress import silent
 
-HOW = How(size_px=SIZE, model="auto", degree=None, board="auto", folds=2, progress=silent, pupil="auto")
+HOW = Request(size_px=SIZE, model="auto", degree=None, board="auto", folds=2, progress=silent, pupil="auto")
 
 
 @pytest.fixture(scope="module")
@@ -48,9 +48,9 @@ def test_what_is_known_of_a_camera_is_not_found_again(views: list[BoardView], mo
 
 def test_of_other_views_or_another_question_nothing_is_known(views: list[BoardView]) -> None:
     known = begin("", views, replace(HOW, model="brown", degree=5, board="flat", folds=0))
-    assert known.asked("left", views, known.how) is not None
+    assert known.asked("left", views, known.request) is not None
     moved = [*views[:-1], replace(views[-1], pixels=views[-1].pixels + 0.1)]
     for other in (moved, views[:-1], [*views[:-1], replace(views[-1], image="other")]):
-        assert known.asked("left", other, known.how) is None
-    for how in (replace(known.how, folds=2), replace(known.how, board="auto"), HOW):
-        assert known.asked("left", views, how) is None
+        assert known.asked("left", other, known.request) is None
+    for request in (replace(known.request, folds=2), replace(known.request, board="auto"), HOW):
+        assert known.asked("left", views, request) is None

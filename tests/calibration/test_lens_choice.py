@@ -14,7 +14,7 @@ from rigkit.calibration.between_models import rival_fits, rival_shapes
 from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
 from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.calibration.one_model import Solved
 from rigkit.calibration.result import Rival
 from rigkit.calibration.solving.fit import Fit, fit_model
@@ -185,16 +185,17 @@ def test_where_no_board_was_a_richer_rival_counts_with_what_it_leaves_open() -> 
 
 def test_errors_name_the_camera_of_a_rig() -> None:
     views, *_ = random_views(lens("reg"), 6, np.random.default_rng(3), reach_deg=REACH_DEG["reg"])
-    how = How(size_px=SIZE, model="nonsense", degree=None, board="flat", folds=0, progress=silent)
+    request = Request(size_px=SIZE, model="nonsense", degree=None, board="flat", folds=0, progress=silent)
     with pytest.raises(Exception, match=r"camera 'left': .*nonsense"):
-        calibrate_together([("left", views, how)])
+        calibrate_together([("left", views, request)])
 
 
 def test_cameras_of_a_rig_come_in_their_order() -> None:
     rng = np.random.default_rng(2)
-    how = How(size_px=SIZE, model="auto", degree=None, board="flat", folds=0, progress=silent)
+    request = Request(size_px=SIZE, model="auto", degree=None, board="flat", folds=0, progress=silent)
     asked = [
-        (name, random_views(lens(name), 8, rng, reach_deg=REACH_DEG[name])[0], how) for name in ("reg", "wide", "reg")
+        (name, random_views(lens(name), 8, rng, reach_deg=REACH_DEG[name])[0], request)
+        for name in ("reg", "wide", "reg")
     ]
     found = calibrate_together(asked)
     focal = [lens(name).focal_px for name in ("reg", "wide", "reg")]
@@ -236,7 +237,7 @@ def test_boards_in_doubt_widen_the_sigmas_by_what_they_make_of_the_lens(monkeypa
             (
                 "left",
                 views,
-                How(size_px=SIZE, model="kannala_brandt", degree=None, board="auto", folds=5, progress=silent),
+                Request(size_px=SIZE, model="kannala_brandt", degree=None, board="auto", folds=5, progress=silent),
             )
         ]
     )

@@ -14,7 +14,7 @@ from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 from helpers.calibration_scenes import noisy_view
 
 from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.coach.coach import Coach, Take
@@ -92,7 +92,7 @@ def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[Glance]:
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     # Many calibrations: which model the lens has is told, not found each time.
-    monkeypatch.setattr("rigkit.coach.whole.How", lambda **how: How(**(how | {"model": "brown"})))
+    monkeypatch.setattr("rigkit.coach.whole.Request", lambda **asked: Request(**(asked | {"model": "brown"})))
     monkeypatch.setattr(
         "rigkit.coach.rig_whole.calibrate_rig",
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5),

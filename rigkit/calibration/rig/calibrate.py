@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from rigkit.calibration.begun import Begun
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.models_tried import How
+from rigkit.calibration.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
@@ -202,7 +202,7 @@ class _Options:
     def each_alone(self, views: Views, progress: Progress) -> RigViews:
         """Return the views as each camera alone is calibrated with them; errors name the camera."""
         found: dict[str, Calibration] = {}
-        asked: list[tuple[str, Sequence[BoardView], How]] = []
+        asked: list[tuple[str, Sequence[BoardView], Request]] = []
         for name, own in views.items():
             alone = [view for _, view in own]
             if self.known is not None and name in self.known.cameras:
@@ -220,7 +220,7 @@ class _Options:
                 (
                     name,
                     alone,
-                    How(
+                    Request(
                         size_px=self.sizes_px[name],
                         model=model,
                         degree=degree,
@@ -239,13 +239,13 @@ class _Options:
         return RigViews(list(views), seen, tuple(found[name] for name in views), {})
 
 
-def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], How]]) -> dict[str, Calibration]:
+def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]) -> dict[str, Calibration]:
     """Return those of the cameras, beside others of the rig whose pupil moves, whose images agree that theirs does too:
     they need not show it so well as where nothing else speaks for it."""
     out = {}
-    for name, views, how in cameras:
+    for name, views, request in cameras:
         try:
-            (moving,) = calibrate_together([(name, views, replace(how, pupil="moving"))])
+            (moving,) = calibrate_together([(name, views, replace(request, pupil="moving"))])
         except DegenerateError:
             continue
         if surely_moves(moving):
