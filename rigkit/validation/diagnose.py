@@ -107,7 +107,7 @@ def diagnose_cameras(
     return tuple(out)
 
 
-def diagnose_squares(pair_id: str, fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
+def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
     """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
     said = []
     for one in fitting:
@@ -116,7 +116,7 @@ def diagnose_squares(pair_id: str, fitting: Sequence[FittingSquares]) -> tuple[s
         said.append(
             f"{of} would fit the others with squares of {one.factor * declared_mm:.1f} mm ({declared_mm:g} is declared)"
         )
-    return (f"pair '{pair_id}': {', or '.join(said)}; measure them again",) if said else ()
+    return (f"{', or '.join(said)}; measure them again",) if said else ()
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:

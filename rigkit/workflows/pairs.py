@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,9 +13,10 @@ from rigkit.affine.directions import Support
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.detections import BoardDetection
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.planes import Planes
 from rigkit.detection.detect import detect_boards
+from rigkit.identification.wrong_squares import fitting_squares
 from rigkit.io.images import read_image_of, to_grey
 from rigkit.io.manifest import Pair
 from rigkit.reconstruction.board_planes import BoardPlanes
@@ -23,6 +25,7 @@ from rigkit.reconstruction.geometry import PairGeometry, pair_geometry
 from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
+from rigkit.validation.diagnose import diagnose_squares
 from rigkit.workflows.datasets import LoadedCamera
 
 Detections: TypeAlias = tuple[BoardDetection, ...]
@@ -53,9 +56,23 @@ def find_boards(pair: Pair, camera1: Camera, camera2: Camera) -> tuple[Detection
 def match_images(
     pair: Pair, camera1: Camera, camera2: Camera, chain: str, support: Support = "patch"
 ) -> tuple[MatchedPair, Image, Image]:
-    """Return the matched corners of a pair, and its two images."""
+    """Return the matched corners of a pair, and its two images.
+
+    Of a board that fits nowhere as declared, the squares with which it would fit are said: in the notes, or in the
+    error raised where no board is left.
+    """
     found1, found2, image1, image2 = find_boards(pair, camera1, camera2)
-    return match_found(pair, camera1, camera2, found1, found2, chain, support), image1, image2
+    try:
+        matched = match_found(pair, camera1, camera2, found1, found2, chain, support)
+    except RigkitError as error:
+        said = squares_that_fit(pair, camera1, camera2, found1, found2)
+        if not said:
+            raise
+        raise type(error)(f"pair '{pair.pair_id}': {'; '.join(said)} ({error})") from error
+    if matched.identity.missing:
+        said = squares_that_fit(pair, camera1, camera2, found1, found2)
+        matched = replace(matched, notes=(*said, *matched.notes))
+    return matched, image1, image2
 
 
 def match_found(
@@ -80,6 +97,18 @@ def match_found(
         chain="rectified" if chain == "rectified" else "raw",
         support=support,
     )
+
+
+def squares_that_fit(
+    pair: Pair,
+    camera1: Camera,
+    camera2: Camera,
+    detections1: Sequence[BoardDetection],
+    detections2: Sequence[BoardDetection],
+) -> tuple[str, ...]:
+    """Return in words with which squares a board would fit the others of a pair, where it fits nowhere as declared."""
+    fitting = fitting_squares(detections1, detections2, pair.boards, far_camera(camera1), far_camera(camera2))
+    return diagnose_squares(fitting)
 
 
 def geometry_of(matched: MatchedPair, pair: Pair) -> PairGeometry:

@@ -11,13 +11,11 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rigkit.affine.registry import AFFINE_METHODS
-from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.identification.wrong_squares import fitting_squares
 from rigkit.io.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
@@ -32,11 +30,19 @@ from rigkit.report.page_facts import PageFacts
 from rigkit.report.validation_page import crosscheck_table, pair_section
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.validation.diagnose import diagnose, diagnose_cameras, diagnose_squares
+from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
 from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import find_boards, geometry_of, match_found, planes_of, reconstruct_other_chain, shifts_of
+from rigkit.workflows.pairs import (
+    find_boards,
+    geometry_of,
+    match_found,
+    planes_of,
+    reconstruct_other_chain,
+    shifts_of,
+    squares_that_fit,
+)
 from rigkit.workflows.paper import printed_tables
 from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
 
@@ -142,8 +148,8 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
 
     def wrong_squares() -> tuple[str, ...]:
-        fitting = fitting_squares(found1, found2, pair.boards, far_camera(camera1), far_camera(camera2))
-        return diagnose_squares(pair.pair_id, fitting)
+        said = squares_that_fit(pair, camera1, camera2, found1, found2)
+        return tuple(f"pair '{pair.pair_id}': {words}" for words in said)
 
     try:
         matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)

@@ -199,6 +199,15 @@ def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
     assert f"probable cause: pair 'same': {said}" in text
 
 
+def test_reconstruct_names_the_board_that_fits_nowhere_too(
+    capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    declare_squares(folder, capture, "43.0")
+    assert main(["reconstruct", str(folder), "-j", "1", "--no-pictures", "-o", str(folder / "clouds")]) == 0
+    said = "same: board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    assert said in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("what", ["images", "cameras"])
 def test_swapped_images_and_cameras_are_named(
     capture: tuple[Path, dict[str, StereoScene]], folder: Path, capsys: pytest.CaptureFixture[str], what: str

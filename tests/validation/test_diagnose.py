@@ -139,9 +139,9 @@ def test_boards_that_are_all_stretched_alike_are_one_cause() -> None:
 def test_a_board_that_fits_nowhere_is_named_with_its_size_or_its_place() -> None:
     one, alike = (FittingSquares(b, 1.25, "the 8x6 grid round (9, 7)") for b in (BOARDS[:1], BOARDS[1:]))
     size = "would fit the others with squares of 62.5 mm (50 is declared)"
-    assert diagnose_squares("made", []) == ()
-    assert diagnose_squares("made", [one, alike]) == (
-        f"pair 'made': board 'plane1' {size}, or one of 'plane2', 'plane3', the 8x6 grid round (9, 7) in image 1, "
+    assert diagnose_squares([]) == ()
+    assert diagnose_squares([one, alike]) == (
+        f"board 'plane1' {size}, or one of 'plane2', 'plane3', the 8x6 grid round (9, 7) in image 1, "
         f"{size}; measure them again",
     )
 
