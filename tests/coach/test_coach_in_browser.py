@@ -129,6 +129,11 @@ def test_the_page_finds_a_board_and_takes_a_frame_and_obeys_keys(tmp_path: Path)
         assert page.evaluate('document.getElementById("stage").contains(document.getElementById("scale"))')
         # The flash is over the picture, not behind it.
         assert page.evaluate(FLASHES)
+        # Who went to a button by keys presses that one, and takes no picture.
+        page.evaluate('document.getElementById("quiet").focus()')
+        page.press(" ")
+        page.wait('document.getElementById("quiet").ariaPressed == "false"', PATIENCE_S)
+        page.evaluate("document.activeElement.blur()")
         # One pose is all there is: what is taken now is taken because somebody asked for it.
         page.press(" ")
         page.wait("coach.state.frames >= 2", PATIENCE_S)
@@ -165,11 +170,16 @@ def test_who_has_no_camera_is_told_what_to_do(tmp_path: Path) -> None:
     with _guided(None, tmp_path / "a", tmp_path / "pa", "--watch", str(tmp_path / "incoming")) as page:
         page.wait("coach.looks > 2", PATIENCE_S)
         assert _words(page).startswith("Waiting for pictures in ")
+        assert page.evaluate('["sharp", "still", "light"].every((id) => document.getElementById(id).hidden)')
+        assert page.evaluate('document.querySelector("img").hidden'), "an empty picture has a frame"
         page.press("u")
         page.wait('document.getElementById("words").textContent.includes("no frame to undo")', PATIENCE_S)
     with _guided(None, tmp_path / "b", tmp_path / "pb") as page:
         page.wait('document.getElementById("words").textContent.startsWith("No live camera: no camera")', PATIENCE_S)
         assert page.evaluate('!document.getElementById("photo").hidden')
+        page.evaluate('document.querySelector("#photo input").onclick = () => { window.asked = true; return false; }')
+        page.press(" ")
+        page.wait("window.asked", PATIENCE_S)
 
 
 @pytest.mark.slow
