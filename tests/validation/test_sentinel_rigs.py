@@ -23,7 +23,7 @@ from rigkit.planning.candidates import Reach
 from rigkit.report.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, straightened
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, straightened
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
 from rigkit.workflows.next_pictures import TASK_CELLS, length_goals
@@ -273,3 +273,42 @@ def test_the_size_of_a_change_is_not_that_of_its_uncertainty() -> None:
         sizes.append(check.change.size_px)
     # Nothing happened, and sixty matches do not say so well: of the estimates alone the median is 0.09 px.
     assert np.median(sizes) < ALARM_PX / 2.0
+
+
+def test_few_matches_raise_no_alarm() -> None:
+    """A fit of the lenses and the mount could follow so few, and what it left would pass for their scatter."""
+    draws, lens_px = 12, 20.0
+    unsure = replace(
+        _rig(), covariance=np.diag([*lens_px * np.array(LENS_SIGMAS)] * 2 + [*[1e-3] * 3, *[1.0] * 3]) ** 2
+    )
+    for seed in range(draws):
+        whole = _matches(MOUNT, np.random.default_rng(seed))
+        check = check_matches(unsure, [PairMatches(0, 1, whole.pixels1[:25], whole.pixels2[:25])])
+        assert check.holds and check.chance > 1e-3
+
+
+def test_what_matches_of_a_part_of_the_image_share_raises_no_alarm() -> None:
+    chances = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        matches = _matches(MOUNT, rng, FINE_MATCH_NOISE_PX)
+        phase, waves = rng.uniform(0.0, 2.0 * np.pi, 3), 2.0 * np.pi * rng.standard_normal((3, 2)) / 500.0
+        shared = 2.0 * FINE_MATCH_NOISE_PX * np.sin(matches.pixels1 @ waves.T + phase).sum(axis=1)
+        pixels2 = matches.pixels2 + shared[:, None] * [0.0, 1.0]
+        chances.append(check_matches(_rig(), [replace(matches, pixels2=pixels2)]).chance)
+    assert np.median(chances) > 0.05 and min(chances) > 1e-3
+
+
+def test_a_step_so_wide_that_nothing_is_seen_ends_no_check(rng: np.random.Generator) -> None:
+    turn = np.radians([0.05, 0.0, 0.0])
+    moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
+    matches, looks = [_matches(moved, rng)], []
+
+    def look(now: Watched) -> FreshEvidence:
+        looks.append(now)
+        if len(looks) == 3:
+            raise DegenerateError("check: the lenses see none of the matches")
+        return matches_say(now, matches)
+
+    check = judge_evidence(_rig(), look)
+    assert len(looks) >= 3 and not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"

@@ -48,6 +48,10 @@ WELSCH_SIGMAS = 2.985
 quarter of them is wrong where things repeat, and not by far."""
 FIT_ROUNDS, FIT_CUT = 15, 1e-5
 """Of the fit of everything to the matches; directions that move them by less beside others are none."""
+MATCHES_OF_DIRECTION = 5
+"""A fit follows one direction for so many matches, those that move them most: what is left of fewer tells no scatter.
+SIMULATED, 6 to 24 directions, none to a quarter of the matches wrong: of 1.5 matches a direction 5 % of the scatters
+found are below a twentieth of what is true, of 3 below two thirds, of 5 none are below half."""
 MIN_FREE_VARIANCE = 1e-3
 """Of the variance of a match, what the fit leaves at least."""
 REACH_SIGMAS = 0.2
@@ -131,7 +135,7 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
     layout = watched.layout
     n = layout.count
     information, scores, variances, disagreements = [], [], [], []
-    squares, left_squares, count, parts = 0.0, 0.0, 0, 0
+    squares, left_squares, count, freedom = 0.0, 0.0, 0, 0.0
     for pair in matches:
         residual, jacobian, good = _linearised(watched, pair)
         if len(residual) == 0:
@@ -143,9 +147,10 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         np.add.at(score, by_part, -(weight * residual)[:, None] * jacobian)
         information.append(own.sum(axis=0))
         scores.append(score.sum(axis=0))
-        disagreements.append(_disagreement(own / sigma**2, score / sigma**2))
-        variances.append(sigma**2 * disagreements[-1])
-        parts += len(np.unique(by_part))
+        disagreement, free = _disagreement(own / sigma**2, score / sigma**2)
+        disagreements.append(disagreement)
+        variances.append(sigma**2 * disagreement)
+        freedom += free
         squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
         left_squares += float((weight * left**2).sum())
     usual = float(np.median(variances))
@@ -159,7 +164,7 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         corners=count,
         left_out=0,
         overdispersion=float(np.sqrt(np.median(disagreements))),
-        freedom=float(max(parts - len(matches), 1)),
+        freedom=max(freedom, 1.0),
     )
 
 
@@ -208,11 +213,12 @@ def _fitted(residual: FloatArray, jacobian: FloatArray, before: FloatArray) -> t
     size = np.linalg.norm(jacobian, axis=0)
     design = jacobian[:, size > 0.0] / size[size > 0.0]
     left, weight, sigma = residual, before, 0.0
+    most = int(before.sum() / MATCHES_OF_DIRECTION)
     for _ in range(FIT_ROUNDS):
         root = np.sqrt(weight)
-        basis, values, _ = np.linalg.svd(design * root[:, None], full_matrices=False)
-        rank = int(np.count_nonzero(values > FIT_CUT * values[0]))
-        step = np.linalg.lstsq(design * root[:, None], residual * root, rcond=FIT_CUT)[0]
+        basis, values, axes = np.linalg.svd(design * root[:, None], full_matrices=False)
+        rank = min(int(np.count_nonzero(values > FIT_CUT * values[0])), most)
+        step = axes[:rank].T @ (basis[:, :rank].T @ (residual * root) / values[:rank])
         left = residual - design @ step
         freedom = max(len(residual) - rank, 1) / len(residual)
         sigma = float(np.median(np.abs(left))) * SIGMA_OF_MEDIAN / np.sqrt(freedom)
@@ -259,9 +265,9 @@ def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:
     return np.asarray(place[:, 1] * PARTS + place[:, 0])
 
 
-def _disagreement(information: FloatArray, score: FloatArray) -> float:
+def _disagreement(information: FloatArray, score: FloatArray) -> tuple[float, float]:
     """Return by how much more the parts (K, T, T), (K, T) of an image scatter than independent matches would, as a
-    ratio of variances, at least 1; what all have in common is left out."""
+    ratio of variances, at least 1, and its degrees of freedom; what all have in common is left out."""
     whole = information.sum(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
@@ -269,7 +275,14 @@ def _disagreement(information: FloatArray, score: FloatArray) -> float:
     root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
     common = root @ (root.T @ score.sum(axis=0))
     left = (score - information @ common) @ root
-    used = np.einsum("kii->k", information) > 0.0
-    # The fit takes one part's share of the scatter away.
-    expected = root.shape[1] * (1.0 - 1.0 / max(int(used.sum()), 2))
-    return float(max(1.0, (left**2).sum() / expected))
+    # What all have in common follows each part by its share: what is left of part k and l has the covariance
+    # (k == l) B_k - B_k B_l with B the shares. The sum of its squares counts as so many values (Satterthwaite), and
+    # parts that err as a whole count once each.
+    shares = root.T @ information @ root
+    squares = shares @ shares
+    common = squares.sum(axis=0)
+    expected = max(root.shape[1] - float(np.trace(common)), MIN_FREE_VARIANCE)
+    spread = float(np.trace(common) - 2.0 * (squares * shares).sum() + (common**2).sum())
+    used = np.count_nonzero(shares.any(axis=(1, 2)))
+    freedom = min(expected**2 / max(spread, MIN_FREE_VARIANCE), used - 1.0)
+    return float(max(1.0, (left**2).sum() / expected)), freedom

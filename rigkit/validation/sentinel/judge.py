@@ -262,7 +262,10 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
         if again is None:
             break
         closer = watched.changed(change.hypothesis.directions @ (amounts + again.amounts))
-        then = look(closer)
+        try:
+            then = look(closer)
+        except DegenerateError:  # A step so wide that the lens sees nothing any more.
+            break
         if then.rms_px > after.rms_px:
             break
         amounts, fixed, after = amounts + again.amounts, closer, then
