@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from rigkit.core.errors import InputError
 from rigkit.io.corner_cache import image_hash
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
@@ -25,13 +27,12 @@ def software_facts(*packages: str) -> dict[str, str]:
 
 def made(session: Path, images: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
     """Return by what, when and from what a calibration's file is made, as it stands in it: the SHA-256 of the session,
-    and one of the images of every camera (""): of what `sha256sum` prints of them; images that are gone have none."""
+    and one of the images of every camera (""): of what `sha256sum` prints of those that can be read."""
     inputs = {} if not session.is_file() else {session.name: hashlib.sha256(session.read_bytes()).hexdigest()}
     for name, paths in images.items():
-        there = [path for path in paths if path.is_file()]
-        if there:
-            label = f"{len(there)} images{f' of {name}' if name else ''}"
-            inputs[label] = _digest_of([(path.name, image_hash(path)) for path in there])
+        pairs = _hashes(paths)
+        if pairs:
+            inputs[f"{len(pairs)} images{f' of {name}' if name else ''}"] = _digest_of(pairs)
     written = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     return {"rigkit": version("rigkit"), "written": written, "inputs": inputs}
 
@@ -48,9 +49,19 @@ def digest_of(source: Path | str | bytes) -> str:
     return hashlib.sha256(source.encode() if isinstance(source, str) else source).hexdigest()
 
 
-def digest_of_many(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return one SHA-256 of several files, given (name, SHA-256) of each, in words that say how to compute it."""
-    return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}"
+def digest_of_images(paths: Sequence[Path]) -> str | None:
+    """Return one SHA-256 of the images that can be read, in words that say how to compute it; None where none can."""
+    pairs = _hashes(paths)
+    return f"{len(pairs)} files; SHA-256 of what `sha256sum` prints of them: {_digest_of(pairs)}" if pairs else None
+
+
+def _hashes(paths: Sequence[Path]) -> list[tuple[str, str]]:
+    """Return name and SHA-256 of the images that can be read: one that is gone or a link to nothing took no part."""
+    pairs = []
+    for path in paths:
+        with suppress(InputError):
+            pairs.append((path.name, image_hash(path)))
+    return pairs
 
 
 def _digest_of(pairs: Sequence[tuple[str, str]]) -> str:

@@ -9,7 +9,6 @@ from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.io.corner_cache import image_hash
 from rigkit.io.images import read_image
 from rigkit.io.rig_session import RigSession
 from rigkit.io.session import Session
@@ -17,7 +16,7 @@ from rigkit.report.calibration_page import CalibrationSection, build_calibration
 from rigkit.validation.check import Check
 from rigkit.workflows.inputs.corners import SessionCorners, named_images
 from rigkit.workflows.next_pictures import next_views
-from rigkit.workflows.provenance import digest_line, digest_of_many, software_facts
+from rigkit.workflows.provenance import digest_line, digest_of_images, software_facts
 
 
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
@@ -88,8 +87,5 @@ def _facts(
     facts = software_facts() | {session.name: digest_line(session)}
     facts |= {path.name: digest_line(text) for path, text in files.items()}
     for name, paths in images.items():
-        if paths:
-            facts[name] = digest_of_many([(p.name, image_hash(p)) for p in paths])
-        else:
-            facts[name] = "gone; the corners kept beside the session were used"
+        facts[name] = digest_of_images(paths) or "gone; the corners kept beside the session were used"
     return facts | dict(corners)

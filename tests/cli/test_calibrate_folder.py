@@ -60,9 +60,20 @@ def test_a_link_to_no_image_is_told(pictures: Path, tmp_path: Path, capsys: pyte
     """A store of data links images that were not fetched to nothing: the others are used, and these are named."""
     folder = of_one_camera(pictures, tmp_path / "photos")
     (folder / "DSC_9999.JPG").symlink_to(tmp_path / "store" / "abc.jpg")
-    command = ["calibrate", str(folder), "--board", "9x6x30", "--model", "brown", "-o", str(tmp_path / "out.json")]
+    command = [
+        "calibrate",
+        str(folder),
+        "--board",
+        "9x6x30",
+        "--model",
+        "brown",
+        "-r",
+        "-o",
+        str(tmp_path / "out.json"),
+    ]
     assert main(command) == 2
     assert load_calibration(tmp_path / "out.json").heldout_rms_px is not None
+    assert f"{FRAMES} files; SHA-256" in (tmp_path / "out.html").read_text()
     assert "image 'DSC_9999.JPG' is left out" in "".join(capsys.readouterr())
 
 
