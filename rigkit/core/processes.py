@@ -8,6 +8,7 @@ import importlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
@@ -20,6 +21,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
 from rigkit.core.errors import InputError
@@ -83,6 +85,18 @@ def _terminal_silent() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def _script_left_alone() -> Iterator[None]:
+    """Let processes that start here not import the caller's script: work of ours needs nothing of it, and without
+    `if __name__ == "__main__"` it would begin again in each of them. So it is in notebooks, which have no file."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
+
+
 class _Pool(ProcessPoolExecutor):
     """A pool that starts its processes silently, all where the first work is submitted.
 
@@ -98,7 +112,7 @@ class _Pool(ProcessPoolExecutor):
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _terminal_silent():
+        with _terminal_silent(), _script_left_alone():
             future = super().submit(fn, *args, **kwargs)
         # What waits is cancelled before the workers end; the pool would then stumble, loudly, over telling it so.
         future.set_exception = functools.partial(_tell, future)  # type: ignore[method-assign]

@@ -21,16 +21,20 @@ from rigkit.core.errors import InputError
 from rigkit.core.processes import worker_pool
 from rigkit.workflows.datasets import _attempt
 
-WORK = """
-import os, sys, time
+TASK = """
+import os, time
 from pathlib import Path
-from rigkit.cli.main import main
-from rigkit.io.files import write_together
-from rigkit.core.processes import worker_pool
 
 def work(path):
     Path(path).write_text(str(os.getpid()))
     time.sleep(600)
+"""
+WORK = """
+import sys
+from pathlib import Path
+from task import work
+from rigkit.cli.main import main
+from rigkit.core.processes import worker_pool
 
 def run(args):
     folder = Path(args.output)
@@ -64,6 +68,7 @@ def _heeds_signals() -> None:
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL], ids=lambda s: s.name)
 @pytest.mark.parametrize("to_all", [True, False], ids=["group", "process"])
 def test_workers_end_with_the_program(tmp_path: Path, how: signal.Signals, to_all: bool) -> None:
+    (tmp_path / "task.py").write_text(TASK)
     (tmp_path / "work.py").write_text(WORK)
     program = subprocess.Popen(
         [sys.executable, str(tmp_path / "work.py"), str(tmp_path)],
@@ -139,6 +144,23 @@ def test_a_worker_that_is_killed_while_another_starts_is_told_in_words(monkeypat
 
 def _twice(number: int) -> int:
     return 2 * number
+
+
+SCRIPT = """
+print("begun")
+from rigkit.core.processes import worker_pool
+with worker_pool(2) as pool:
+    print(*pool.map(abs, [-1, -2]))
+"""
+
+
+@pytest.mark.parametrize("file", ["script.py", "-"])
+def test_a_plain_script_is_not_run_again_by_workers(tmp_path: Path, file: str) -> None:
+    """Nothing in it asks for its name, as in the documentation's examples; - is read from stdin."""
+    (tmp_path / "script.py").write_text(SCRIPT)
+    command = [sys.executable, file]
+    done = subprocess.run(command, input=SCRIPT, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.stdout.split(), done.stderr) == (["begun", "1", "2"], "")
 
 
 def test_a_system_without_these_signals_serves_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
