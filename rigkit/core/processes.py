@@ -48,10 +48,13 @@ def available_cores() -> int:
 
 
 def process_count(jobs: int | None) -> int:
-    """Return how many processes `jobs` are: as many, or None: one a core. Raises InputError for fewer than one."""
+    """Return how many processes `jobs` are: as many, or None: one a core. Raises InputError for fewer than one.
+
+    In a worker of the caller's (of multiprocessing.Pool, of Dask), which may start none, it is one: this one.
+    """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs {jobs}: at least one process is needed")
-    return jobs or available_cores()
+    return 1 if multiprocessing.current_process().daemon else jobs or available_cores()
 
 
 class Here(Executor):
@@ -176,13 +179,14 @@ def over_items(
     """
     if not items:
         return
+    count = min(process_count(jobs), len(items), available_cores())
     if cluster is not None:
         yield from enumerate(_on_cluster(function, items, cluster))
-    elif jobs == 1 or len(items) == 1:
+    elif count == 1:
         for place, item in enumerate(items):
             yield place, function(item)
     else:
-        with worker_pool(min(jobs, len(items), available_cores())) as pool:
+        with worker_pool(count) as pool:
             waiting = {pool.submit(function, item): place for place, item in enumerate(items)}
             for future in as_completed(waiting):
                 yield waiting[future], future.result()

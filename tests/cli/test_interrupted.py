@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -18,7 +19,7 @@ import pytest
 from rigkit.cli import diff
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import over_items, process_count, worker_pool
 from rigkit.workflows.datasets import _attempt
 
 TASK = """
@@ -34,7 +35,7 @@ import sys
 from pathlib import Path
 from task import work
 from rigkit.cli.main import main
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import over_items, process_count, worker_pool
 
 def run(args):
     folder = Path(args.output)
@@ -148,7 +149,7 @@ def _twice(number: int) -> int:
 
 SCRIPT = """
 print("begun")
-from rigkit.core.processes import worker_pool
+from rigkit.core.processes import over_items, process_count, worker_pool
 with worker_pool(2) as pool:
     print(*pool.map(abs, [-1, -2]))
 """
@@ -161,6 +162,16 @@ def test_a_plain_script_is_not_run_again_by_workers(tmp_path: Path, file: str) -
     command = [sys.executable, file]
     done = subprocess.run(command, input=SCRIPT, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
     assert (done.stdout.split(), done.stderr) == (["begun", "1", "2"], "")
+
+
+@pytest.mark.parametrize("jobs", [None, 2])
+def test_a_worker_of_the_callers_works_alone(monkeypatch: pytest.MonkeyPatch, jobs: int | None) -> None:
+    """Those of multiprocessing.Pool may start no processes."""
+    monkeypatch.setitem(multiprocessing.current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    with pytest.raises(AssertionError, match="daemonic"), worker_pool(1) as pool:
+        pool.submit(_twice, 1)
+    assert process_count(jobs) == 1
+    assert list(over_items(lambda k: 2 * k, [1, 2], jobs=2)) == [(0, 2), (1, 4)]
 
 
 def test_a_system_without_these_signals_serves_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
