@@ -236,19 +236,29 @@ EXPORT void fit_tags(
     ARRAY(const double, contrast, count), ARRAY(const double, curvature_sigma, count), const tag_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, most, TAG_BLOCK), RESULT(double, out, count, TAG_OUTCOMES));
 
-/* boards.c */
-
-/* Planes of the picture of a board: the pattern, its slopes along u and v, what lies beyond each of the four sides, how the
- * pattern changes as they go further out. */
-enum { BOARD_PLANES = 11 };
+/* board_places.c */
 
 EXPORT void board_places(
     ARRAY(const double, coefficients, rows + 2, columns + 2, 2), int64_t rows, int64_t columns, int64_t left, int64_t top,
     int64_t width, int64_t height, double around, RESULT(double, places, height, width, 2));
+/* Columns and rows of places on a sheet of `each` samples a square that begins at `first`, before all where there is no
+ * place; and which places are nearest to one of the corners of the first kind, or of the second, and within the reach of
+ * these. */
+EXPORT void sheet_places(
+    ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, ARRAY(const uint8_t, corners, 2, rows, columns),
+    int64_t rows, int64_t columns, ARRAY(const double, first, 2), double each, ARRAY(const double, reach, 2),
+    RESULT(float, on_sheet, height, width, 2), RESULT(truth_t, near, 2, height, width));
+
+/* boards.c */
+
+/* Planes of the picture of a board: the pattern, its slopes along u and v, what lies beyond each of the four sides, how the
+ * pattern changes as they go further out. `board_picture` draws all of them, or the first. */
+enum { BOARD_PLANES = 11 };
+
 EXPORT void board_picture(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, int64_t rows, int64_t columns,
-    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp,
-    RESULT(float, out, BOARD_PLANES, height, width));
+    ARRAY(const double, ends, 2, 2), ARRAY(const double, paper, 4), double sharp, int64_t planes,
+    RESULT(float, out, planes, height, width));
 
 /* board_changes.c */
 

@@ -4,115 +4,12 @@
  * Places on the board, in squares from its first corner, are a cubic spline of the board's corners. The picture is drawn
  * sharp, by the distances to the lines that are near, and blurred as a picture; so are its changes. */
 #include "kernels.h"
+#include "boards.h"
 
-enum { TAPS = 4, ORDERS = 4, NEWTON_STEPS = 8 };
+enum { ORDERS = 4 };
 
 /* Edges of a sharp picture are looked at so far away, standard deviations of its blur. */
 #define NEAR_SIGMAS 6.0
-
-/* So near, in px, is a place to the pixel that it is sought for. */
-#define PLACED_PX 1e-6
-
-/* One beyond another by less than this, in squares, lies in the same square. */
-#define SQUARE_SLACK 1e-9
-
-INLINE void spline(double t, double value[TAPS], double slope[TAPS])
-{
-    const double rest = 1.0 - t;
-    value[0] = rest * rest * rest / 6.0;
-    value[1] = (3.0 * t * t * t - 6.0 * t * t + 4.0) / 6.0;
-    value[2] = (-3.0 * t * t * t + 3.0 * t * t + 3.0 * t + 1.0) / 6.0;
-    value[3] = t * t * t / 6.0;
-    slope[0] = -0.5 * rest * rest;
-    slope[1] = 1.5 * t * t - 2.0 * t;
-    slope[2] = -1.5 * t * t + t + 0.5;
-    slope[3] = 0.5 * t * t;
-}
-
-/* Set `at` to where (x, y) of the square whose coefficients begin at `first` is seen, and `grow` to how that grows. */
-INLINE void seen_at(const double *first, int64_t stride, double x, double y, double at[2], double grow[2][2])
-{
-    double wx[TAPS], dx[TAPS], wy[TAPS], dy[TAPS];
-    spline(x, wx, dx);
-    spline(y, wy, dy);
-    for (int axis = 0; axis < 2; axis++)
-        at[axis] = grow[axis][0] = grow[axis][1] = 0.0;
-    for (int j = 0; j < TAPS; j++)
-        for (int axis = 0; axis < 2; axis++) {
-            double value = 0.0, slope = 0.0;
-            for (int i = 0; i < TAPS; i++) {
-                const double part = first[2 * (j * stride + i) + axis];
-                value += wx[i] * part;
-                slope += dx[i] * part;
-            }
-            at[axis] += wy[j] * value;
-            grow[axis][0] += wy[j] * slope;
-            grow[axis][1] += dy[j] * value;
-        }
-}
-
-/* Set (x, y) to the place in the square that is seen at (u, v); return whether it is in the square. */
-INLINE int place_in_square(const double *first, int64_t stride, double u, double v, double *x, double *y)
-{
-    double at[2], grow[2][2];
-    *x = *y = 0.5;
-    for (int turn = 0; turn < NEWTON_STEPS; turn++) {
-        seen_at(first, stride, *x, *y, at, grow);
-        const double off_u = u - at[0], off_v = v - at[1];
-        if (fabs(off_u) + fabs(off_v) < PLACED_PX)
-            return *x >= -SQUARE_SLACK && *y >= -SQUARE_SLACK && *x <= 1.0 + SQUARE_SLACK && *y <= 1.0 + SQUARE_SLACK;
-        const double area = grow[0][0] * grow[1][1] - grow[0][1] * grow[1][0];
-        if (fabs(area) < 1e-9)
-            return 0;
-        *x += limited((off_u * grow[1][1] - off_v * grow[0][1]) / area, 1.0);
-        *y += limited((off_v * grow[0][0] - off_u * grow[1][0]) / area, 1.0);
-        /* Beyond its square a cubic is another one's. */
-        if (fabs(*x - 0.5) > 1.5 || fabs(*y - 0.5) > 1.5)
-            return 0;
-    }
-    return 0;
-}
-
-void board_places(
-    const double *coefficients, int64_t rows, int64_t columns, int64_t left, int64_t top, int64_t width, int64_t height,
-    double around, double *places)
-{
-    const int64_t stride = columns + 2;
-    for (int64_t k = 0; k < 2 * width * height; k++)
-        places[k] = NAN;
-    for (int64_t j = 0; j + 1 < rows; j++)
-        for (int64_t i = 0; i + 1 < columns; i++) {
-            const double *first = coefficients + 2 * (j * stride + i);
-            double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
-            for (int corner = 0; corner < 4; corner++) {
-                double at[2], grow[2][2];
-                seen_at(first, stride, (double)(corner % 2), (double)(corner / 2), at, grow);
-                for (int axis = 0; axis < 2; axis++) {
-                    low[axis] = at[axis] < low[axis] ? at[axis] : low[axis];
-                    high[axis] = at[axis] > high[axis] ? at[axis] : high[axis];
-                }
-            }
-            /* Its sides may be bent. */
-            const double more_u = around * (high[0] - low[0]), more_v = around * (high[1] - low[1]);
-            double from_u = ceil(low[0] - more_u) - (double)left, to_u = floor(high[0] + more_u) - (double)left;
-            double from_v = ceil(low[1] - more_v) - (double)top, to_v = floor(high[1] + more_v) - (double)top;
-            if (!(from_u <= (double)width && to_u >= 0.0 && from_v <= (double)height && to_v >= 0.0))
-                continue;
-            from_u = from_u > 0.0 ? from_u : 0.0;
-            from_v = from_v > 0.0 ? from_v : 0.0;
-            to_u = to_u < (double)(width - 1) ? to_u : (double)(width - 1);
-            to_v = to_v < (double)(height - 1) ? to_v : (double)(height - 1);
-            for (int64_t v = (int64_t)from_v; v <= (int64_t)to_v; v++)
-                for (int64_t u = (int64_t)from_u; u <= (int64_t)to_u; u++) {
-                    double *place = places + 2 * (v * width + u), x, y;
-                    if (isfinite(place[0])
-                        || !place_in_square(first, stride, (double)(u + left), (double)(v + top), &x, &y))
-                        continue;
-                    place[0] = (double)i + x;
-                    place[1] = (double)j + y;
-                }
-        }
-}
 
 /* How the picture changes along one side of the board: the squares, what lies before the first line and beyond the last,
  * and derivatives along the distance over the blur; the lines where the board ends, per square; the normal, per px. */
@@ -120,10 +17,15 @@ typedef struct {
     double squares[ORDERS], before[ORDERS], beyond[ORDERS], ends[2], normal[2];
 } along_t;
 
+/* How places grow at a pixel: px a square, and how lines are bent and turn. */
+typedef struct {
+    double per, bend, turn;
+} growth_t;
+
 /* Add `part` times the edge at `line` to `into`, and return its density per square. */
-INLINE double add_line(double place, double line, double slope, double bend, double turn, double sharp, double part, double into[ORDERS])
+INLINE double add_line(double place, double line, const growth_t *grow, double sharp, double part, double into[ORDERS])
 {
-    const double straight = (place - line) / slope;
+    const double straight = (place - line) * grow->per;
     if (straight < -NEAR_SIGMAS * sharp)
         return 0.0;
     if (straight > NEAR_SIGMAS * sharp) {
@@ -131,33 +33,50 @@ INLINE double add_line(double place, double line, double slope, double bend, dou
         return 0.0;
     }
     /* The distance from what bends, and is bent; a blurred arc lies inside the arc. */
-    const double away = straight - 0.5 * bend * straight * straight + 0.5 * turn * sharp * sharp;
+    const double away = straight - 0.5 * grow->bend * straight * straight + 0.5 * grow->turn * sharp * sharp;
     float edge[5];
     blurred_edge((float)limited(away / sharp, NEAR_SIGMAS), 0.0f, edge);
     into[0] += part * (0.5 + 0.5 * (double)edge[0]);
     for (int order = 1; order < ORDERS; order++)
         into[order] += part * 0.5 * (double)edge[order];
-    return 0.5 * (double)edge[1] / (slope * sharp);
+    return 0.5 * (double)edge[1] * grow->per / sharp;
 }
 
-/* Set `out` to the picture along one axis at a place whose neighbours are `near` (3 x 3). */
-INLINE void look_along(const double near[3][3], int64_t lines, const double ends[2], double sharp, along_t *out)
+/* Set `out` to the picture along one axis at the place `at`; how far on its neighbours before and after it are, along u and
+ * along v, is in `next`. */
+INLINE void look_along(
+    const double *at, const int64_t next[2][2], int64_t lines, const double ends[2], double sharp, along_t *out)
 {
-    const double place = near[1][1], gu = 0.5 * (near[1][2] - near[1][0]), gv = 0.5 * (near[2][1] - near[0][1]);
-    const double uu = near[1][2] - 2.0 * place + near[1][0], vv = near[2][1] - 2.0 * place + near[0][1];
-    const double uv = 0.25 * (near[2][2] - near[2][0] - near[0][2] + near[0][0]);
-    double slope = hypot(gu, gv);
+    for (int order = 0; order < ORDERS; order++)
+        out->squares[order] = out->before[order] = out->beyond[order] = 0.0;
+    out->ends[0] = out->ends[1] = out->normal[0] = out->normal[1] = 0.0;
+    const double place = at[0], before_u = at[next[0][0]], after_u = at[next[0][1]], before_v = at[next[1][0]];
+    const double after_v = at[next[1][1]], gu = 0.5 * (after_u - before_u), gv = 0.5 * (after_v - before_v);
+    const double last = lines % 2 ? 1.0 : -1.0;
+    double slope = sqrt(gu * gu + gv * gv);
+    const double far = NEAR_SIGMAS * sharp * slope, nearest = nearest_line(place, lines);
+    if (fabs(place - nearest) > far && fabs(place - ends[0]) > far && fabs(place - ends[1]) > far) {
+        /* Most places are far from any line. */
+        const double low = place > ends[0] ? 1.0 : 0.0, high = place > ends[1] ? 1.0 : 0.0;
+        const int64_t passed = (int64_t)nearest + (place > nearest);
+        out->squares[0] = low + last * high - (passed % 2 ? 2.0 : 0.0);
+        out->before[0] = 1.0 - low;
+        out->beyond[0] = high;
+        return;
+    }
+    const double uu = after_u - 2.0 * place + before_u, vv = after_v - 2.0 * place + before_v;
+    const double uv = 0.25 * (at[next[0][1] + next[1][1]] - at[next[0][0] + next[1][1]] - at[next[0][1] + next[1][0]]
+                              + at[next[0][0] + next[1][0]]);
     slope = slope > 1e-6 ? slope : 1e-6;
-    const double nu = gu / slope, nv = gv / slope;
-    const double bend = limited((uu * nu * nu + 2.0 * uv * nu * nv + vv * nv * nv) / slope, 0.5 / sharp);
-    const double turn = limited((uu * nv * nv - 2.0 * uv * nu * nv + vv * nu * nu) / slope, 0.5 / sharp);
-    memset(out, 0, sizeof *out);
+    const double per = 1.0 / slope, nu = gu * per, nv = gv * per;
+    const double bend = limited((uu * nu * nu + 2.0 * uv * nu * nv + vv * nv * nv) * per, 0.5 / sharp);
+    const double turn = limited((uu * nv * nv - 2.0 * uv * nu * nv + vv * nu * nu) * per, 0.5 / sharp);
+    const growth_t grow = {per, bend, turn};
     out->normal[0] = nu;
     out->normal[1] = nv;
     double high[ORDERS] = {0.0}, low[ORDERS] = {0.0};
-    out->ends[0] = add_line(place, ends[0], slope, bend, turn, sharp, 1.0, low);
-    out->ends[1] = add_line(place, ends[1], slope, bend, turn, sharp, 1.0, high);
-    const double last = lines % 2 ? 1.0 : -1.0;
+    out->ends[0] = add_line(place, ends[0], &grow, sharp, 1.0, low);
+    out->ends[1] = add_line(place, ends[1], &grow, sharp, 1.0, high);
     for (int order = 0; order < ORDERS; order++) {
         out->squares[order] = low[order] + last * high[order];
         out->before[order] = (order ? 0.0 : 1.0) - low[order];
@@ -168,7 +87,7 @@ INLINE void look_along(const double near[3][3], int64_t lines, const double ends
     const int64_t first = place > reach ? (int64_t)limited(place - reach, (double)lines) : 0;
     out->squares[0] -= first % 2 ? 2.0 : 0.0;
     for (int64_t line = first; line < lines && (double)line < place + reach; line++)
-        add_line(place, (double)line, slope, bend, turn, sharp, line % 2 ? 2.0 : -2.0, out->squares);
+        add_line(place, (double)line, &grow, sharp, line % 2 ? 2.0 : -2.0, out->squares);
 }
 
 /* The product of both directions, and its derivatives along them: blur along two normals is correlated (edges_model.c). */
@@ -179,32 +98,31 @@ INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho,
     out[2] += part * (a[0] * b[1] + rho * (a[1] * b[2] + 0.5 * rho * a[2] * b[3]));
 }
 
-void board_picture(
+/* As `board_picture`. */
+INLINE void draw(
     const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends,
-    const double *paper, double sharp, float *out)
+    const double *paper, double sharp, const int64_t planes, float *out)
 {
     const int64_t area = width * height;
     const double mean = 0.25 * (paper[0] + paper[1] + paper[2] + paper[3]);
     for (int64_t v = 0; v < height; v++)
         for (int64_t u = 0; u < width; u++) {
             float *to = out + v * width + u;
-            double near[2][3][3], known = 0.0;
-            for (int64_t down = -1; down <= 1; down++)
-                for (int64_t over = -1; over <= 1; over++)
-                    for (int axis = 0; axis < 2; axis++) {
-                        const int64_t row = v + down < 0 ? 0 : v + down < height ? v + down : height - 1;
-                        const int64_t column = u + over < 0 ? 0 : u + over < width ? u + over : width - 1;
-                        known += near[axis][down + 1][over + 1] = places[2 * (row * width + column) + axis];
-                    }
-            for (int plane = 0; plane < BOARD_PLANES; plane++)
+            const double *at = places + 2 * (v * width + u);
+            /* Both places are known, or none. */
+            const int64_t next[2][2] = {{u ? -2 : 0, u + 1 < width ? 2 : 0}, {v ? -2 * width : 0, v + 1 < height ? 2 * width : 0}};
+            double known = at[next[0][0]] + at[0] + at[next[0][1]];
+            for (int side = 0; side < 2; side++)
+                known += at[next[0][0] + next[1][side]] + at[next[1][side]] + at[next[0][1] + next[1][side]];
+            for (int64_t plane = 0; plane < planes; plane++)
                 to[plane * area] = 0.0f;
             if (!isfinite(known)) {
                 to[0] = (float)mean;
                 continue;
             }
             along_t one, two;
-            look_along(near[0], columns, ends, sharp, &one);
-            look_along(near[1], rows, ends + 2, sharp, &two);
+            look_along(at, next, columns, ends, sharp, &one);
+            look_along(at + 1, next, rows, ends + 2, sharp, &two);
             const double rho = one.normal[0] * two.normal[0] + one.normal[1] * two.normal[1];
             /* Where two sides meet, half of what lies beyond is of each. */
             double rest1[ORDERS], rest2[ORDERS];
@@ -218,12 +136,17 @@ void board_picture(
             multiply(one.squares, two.squares, rho, 1.0, all);
             for (int side = 0; side < 4; side++) {
                 double beyond[3] = {0.0};
+                if (planes == 1 && paper[side] == 0.0)
+                    continue;
                 multiply(parts[side][0], parts[side][1], rho, 1.0, beyond);
-                to[(3 + side) * area] = (float)beyond[0];
+                if (planes > 1)
+                    to[(3 + side) * area] = (float)beyond[0];
                 for (int k = 0; k < 3; k++)
                     all[k] += paper[side] * beyond[k];
             }
             to[0] = (float)all[0];
+            if (planes == 1)
+                continue;
             to[area] = (float)((all[1] * one.normal[0] + all[2] * two.normal[0]) / sharp);
             to[2 * area] = (float)((all[1] * one.normal[1] + all[2] * two.normal[1]) / sharp);
             /* An end further out: squares in place of paper. */
@@ -235,4 +158,15 @@ void board_picture(
             to[9 * area] = (float)(two.ends[0] * (one.squares[0] - paper[2] * rest1[0] + aside2));
             to[10 * area] = (float)(two.ends[1] * (last2 * one.squares[0] - paper[3] * rest1[0] + aside2));
         }
+}
+
+FOR_EACH_PROCESSOR
+void board_picture(
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends,
+    const double *paper, double sharp, int64_t planes, float *out)
+{
+    if (planes == 1)
+        draw(places, width, height, rows, columns, ends, paper, sharp, 1, out);
+    else
+        draw(places, width, height, rows, columns, ends, paper, sharp, BOARD_PLANES, out);
 }

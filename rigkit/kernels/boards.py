@@ -1,4 +1,4 @@
-"""The kernels in boards.c and board_changes.c: the picture of a whole board, and how it changes as corners move."""
+"""The kernels in board_places.c, boards.c and board_changes.c: the picture of a whole board, and what moves corners."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.core.arrays import FloatArray, IntArray
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.kernels import kernels
 
 Picture = NDArray[np.float32]
@@ -59,15 +59,25 @@ def board_places(coefficients: FloatArray, box: tuple[int, int, int, int], aroun
 
 
 def board_picture(
-    places: FloatArray, size: tuple[int, int], ends: FloatArray, paper: FloatArray, sharp_px: float
+    places: FloatArray, size: tuple[int, int], ends: FloatArray, paper: FloatArray, sharp_px: float, planes: int = 11
 ) -> Picture:
     """Return the planes (11, H, W) of the picture of a board of R x C corners, `size`, blurred by `sharp_px` (api.h:
-    BOARD_PLANES).
+    BOARD_PLANES); or, of these `planes`, 1, the picture alone.
 
     `ends` (2, 2): where, in squares, it begins and ends along columns and along rows; `paper` (4,) what is beyond each
     of these, where squares are 1 and -1.
     """
-    return np.asarray(kernels().board_picture(places, *size, ends, paper, sharp_px))
+    return np.asarray(kernels().board_picture(places, *size, ends, paper, sharp_px, planes))
+
+
+def sheet_places(
+    places: FloatArray, first: FloatArray, each: int, corners: BoolArray, reach: FloatArray
+) -> tuple[Picture, BoolArray]:
+    """Return columns and rows (H, W, 2) of `places` (H, W, 2) on a sheet of `each` x `each` samples a square that
+    begins at `first` (2,), and (2, H, W) which are nearest to one of the `corners` (2, R, C) and within `reach` (2,) of
+    it along columns and rows."""
+    found: tuple[Picture, BoolArray] = kernels().sheet_places(places, corners, first, each, reach)
+    return found
 
 
 @dataclass(frozen=True, eq=False, slots=True)

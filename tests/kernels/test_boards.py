@@ -8,7 +8,15 @@ from scipy.special import ndtr
 
 from rigkit.detection.subpixel.board_window import extended
 from rigkit.detection.subpixel.whole_board import spline_coefficients
-from rigkit.kernels.boards import Shares, block_products, board_picture, board_places, move_blocks, share_blocks
+from rigkit.kernels.boards import (
+    Shares,
+    block_products,
+    board_picture,
+    board_places,
+    move_blocks,
+    share_blocks,
+    sheet_places,
+)
 
 PLACED = 1e-5
 """Newton's method ends that near, in squares."""
@@ -172,3 +180,24 @@ def test_values_at_nodes_are_told_on_straight_lines() -> None:
     inside = ((places > -0.5) & (places < np.array([4.5, 3.5]))).all(axis=2)
     truth = 3.0 + places[..., 0] - 0.5 * places[..., 1]
     assert np.abs(seen - truth)[inside].max() < 1e-4
+
+
+def test_the_picture_alone_is_that_of_all_planes() -> None:
+    places = places_of()
+    for paper in (PAPER, np.zeros(4)):
+        alone = board_picture(places, SIZE, ENDS, paper, 0.7, planes=1)
+        assert np.array_equal(alone[0], board_picture(places, SIZE, ENDS, paper, 0.7)[0])
+
+
+def test_places_on_a_sheet_and_beside_corners(rng: np.random.Generator) -> None:
+    places, first, each = places_of(), np.array([-2.0, -1.0]), 16
+    corners, reach = rng.random((2, *SIZE)) < 0.7, np.array([0.45, 0.3])
+    found, near = sheet_places(places, first, each, corners, reach)
+    known = np.isfinite(places).all(axis=2)
+    assert np.array_equal(found[known], ((places[known] - first) * each - 0.5).astype(np.float32))
+    assert (found[~known] < -each).all()
+    nearest = np.rint(places[known]).astype(np.int64).clip(0, np.array(SIZE[::-1]) - 1)
+    off = np.abs(places[known] - nearest).max(axis=1)
+    for kind in range(2):
+        assert np.array_equal(near[kind][known], corners[kind][nearest[:, 1], nearest[:, 0]] & (off < reach[kind]))
+        assert not near[kind][~known].any()

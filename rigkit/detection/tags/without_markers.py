@@ -28,7 +28,7 @@ from rigkit.detection.subpixel.whole_board import (
     SHARP_PX,
     spline_coefficients,
 )
-from rigkit.kernels.boards import Picture, board_picture, board_places
+from rigkit.kernels.boards import Picture, board_picture, board_places, sheet_places
 
 DRAWN_PX = 3.0
 """Ink is drawn on the board with so many samples a px of the image, in the largest squares."""
@@ -76,13 +76,20 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     first, ends = np.array([column, row]), np.array([[-1.0, board.columns], [-1.0, board.rows]])
     assert isinstance(board.pattern, Charuco)
     white = -1.0 if board.pattern.first_black(board.rows) == ((row + column) % 2 == 0) else 1.0
-    squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX)[0]
-    squares, marks = (_blurred(plane, rest_blur) for plane in (squares, _ink(board, places + first, square_px)))
-    part = image[top : top + height, left : left + width].astype(np.float32)
-    used, told = _beside(places, known, WINDOW_REACH), cv2.dilate(known.astype(np.uint8), AROUND_CORNER) > 0
-    taken = marks * _contrast(part, white * squares - 2.0 * marks, used, SHADE_SQUARES * square_px)
+    squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX, planes=1)[0]
+    each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
+    around_known = cv2.dilate(known.astype(np.uint8), AROUND_CORNER) > 0
+    corners, reach = np.stack([known, around_known]), np.array([WINDOW_REACH, 1.0])
+    on_sheet, (used, told) = sheet_places(places, -1.0 - first, each, corners, reach)
+    squares, marks = (_blurred(plane, rest_blur) for plane in (squares, _ink(board, on_sheet, each, square_px)))
     out = image.astype(np.float32)
-    out[top : top + height, left : left + width] += 2.0 * np.where(_beside(places, told, 1.0), taken, 0.0)
+    part = out[top : top + height, left : left + width]
+    squares *= white
+    squares -= 2.0 * marks
+    marks *= _contrast(part, squares, used, SHADE_SQUARES * square_px)
+    marks *= told
+    marks *= 2.0
+    part += marks
     return out
 
 
@@ -108,16 +115,6 @@ def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] |
     return (part, known, (spans[0].start, spans[1].start)) if (areas > 0.0).all() else None
 
 
-def _beside(places: FloatArray, corners: BoolArray, reach: float) -> BoolArray:
-    """Return which pixels at `places` (H, W, 2), in squares, are nearest to one of the `corners` (R, C), and within
-    `reach` of it along columns and rows."""
-    last = np.array(corners.shape[::-1]) - 1
-    nearest = np.rint(np.nan_to_num(places, nan=-9.0)).astype(np.int64).clip(0, last)
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(places - nearest) < reach).all(axis=2)
-    return np.asarray(near & corners[nearest[..., 1], nearest[..., 0]])
-
-
 def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int, int, int]:
     """Return the first column and row, width and height of what shows a `lattice` (R, C, 2) and its surroundings."""
     around = lattice[1:-1, 1:-1].reshape(-1, 2)
@@ -128,12 +125,11 @@ def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int
     return left, top, right - left + 1, bottom - top + 1
 
 
-def _ink(board: Board, places: FloatArray, square_px: float) -> Picture:
-    """Return how much of each pixel at `places` (H, W, 2) is ink of markers, blurred by SHARP_PX."""
-    each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
+def _ink(board: Board, on_sheet: Picture, each: int, square_px: float) -> Picture:
+    """Return how much of each pixel is ink of markers, blurred by SHARP_PX: `on_sheet` (H, W, 2) says where on `_sheet`
+    it lies."""
     smooth = _blurred(_sheet(board, each), SHARP_PX * each / square_px)
-    where = np.where(np.isfinite(places), (places + 1.0) * each - 0.5, -2.0 * each).astype(np.float32)
-    return np.asarray(cv2.remap(smooth, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return np.asarray(cv2.remap(smooth, on_sheet, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 @functools.lru_cache(maxsize=8)

@@ -1,0 +1,15 @@
+/* What both files of chessboards' pictures need. */
+#ifndef RIGKIT_BOARDS_H
+#define RIGKIT_BOARDS_H
+
+#include <math.h>
+#include <stdint.h>
+
+/* Return which of `lines`, at 0, 1, ..., is nearest to a place. */
+static inline double nearest_line(double place, int64_t lines)
+{
+    const double last = (double)(lines - 1);
+    return rint(place < 0.0 ? 0.0 : place > last ? last : place);
+}
+
+#endif
