@@ -25,7 +25,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.processes import Here
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.candidates import Reach
-from rigkit.planning.goal import Goal, Left, Wish, projection_goal, px_words, turned_design
+from rigkit.planning.goal import Goal, RemainingError, Requirement, projection_goal, px_words, turned_design
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, Proposal, covariance_of, plan_views
@@ -70,22 +70,24 @@ class GuideOptions:
     measured: Callable[[Sequence[Camera], Sequence[Rigid3]], Sequence[Goal]] | None = None
     reach: Reach = field(default_factory=Reach)
 
-    def wishes(self, camera: Camera) -> tuple[Wish, ...]:
+    def requirements(self, camera: Camera) -> tuple[Requirement, ...]:
         """Return what is to become small of a camera alone: the error of its projection, and what is measured."""
-        projection = Wish(projection_goal(camera, self.reach.field_deg), self.goal_px)
+        projection = Requirement(projection_goal(camera, self.reach.field_deg), self.goal_px)
         return projection, *self.lengths((camera,), (Rigid3.identity(),))
 
-    def lengths(self, cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3]) -> tuple[Wish, ...]:
+    def lengths(self, cameras: Sequence[Camera], cam_from_rig: Sequence[Rigid3]) -> tuple[Requirement, ...]:
         """Return what is measured with cameras, as small as it is wanted; raises DegenerateError where that is nowhere
         in view."""
         if self.goal_mm is None or self.measured is None:
             return ()
-        return tuple(Wish(goal, self.goal_mm) for goal in self.measured(cameras, cam_from_rig))
+        return tuple(Requirement(goal, self.goal_mm) for goal in self.measured(cameras, cam_from_rig))
 
     def stated(self, calibration: Calibration) -> str:
         """Return in words what a calibration says of the goals: errors, and whether they are small enough."""
         known = uncertain_camera(calibration)
-        return stated_words([wish.left(known.covariance) for wish in self.wishes(known.camera)])
+        return stated_words(
+            [requirement.remaining(known.covariance) for requirement in self.requirements(known.camera)]
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -110,7 +112,7 @@ class Advice:
     take: bool
     enough: bool
     waits: bool
-    left: tuple[Left, ...]
+    left: tuple[RemainingError, ...]
     more_percent: float | None
 
     @property
@@ -131,7 +133,7 @@ class CaptureGuide:
         self._stale = False
         self._whole = WholeCalibrations(executor or Here(), whole_calibration)
         self._plan: Plan | None = None
-        self._left_now: tuple[Left, ...] = ()
+        self._left_now: tuple[RemainingError, ...] = ()
         self._map: list[list[float | None]] | None = None
 
     def add(self, view: BoardView, size_px: tuple[int, int]) -> None:
@@ -220,15 +222,18 @@ class CaptureGuide:
         """Return where a board is; None where the lens does not see enough of it."""
         return _pose(self.camera(size_px), view)
 
-    def _left(self, knowledge: Knowledge) -> tuple[Left, ...]:
+    def _left(self, knowledge: Knowledge) -> tuple[RemainingError, ...]:
         """Return what the frames leave of what is to become small: as all of `calibrate` states it for those that it
         has had."""
-        left = [wish.left(covariance_of(knowledge.information)) for wish in self.options.wishes(knowledge.camera)]
+        left = [
+            requirement.remaining(covariance_of(knowledge.information))
+            for requirement in self.options.requirements(knowledge.camera)
+        ]
         whole = self._whole.latest
         if whole is None:
             return tuple(left)
         then, stated = covariance_of(whole.knowledge.information), whole.stated.covariance
-        factors = [float(own.wish.goal.error(stated) / own.wish.goal.error(then)) for own in left]
+        factors = [float(own.requirement.goal.error(stated) / own.requirement.goal.error(then)) for own in left]
         return tuple(replace(own, error=own.error * factor) for own, factor in zip(left, factors, strict=True))
 
     def sigma_map(self) -> list[list[float | None]] | None:
@@ -254,7 +259,7 @@ class CaptureGuide:
         if self._plan is None:
             knowledge, o = self._known(size_px), self.options
             self._left_now = self._left(knowledge)
-            goal = max(self._left_now, key=lambda own: own.share).wish.goal
+            goal = max(self._left_now, key=lambda own: own.share).requirement.goal
             last = _pose(knowledge.camera, self.views[-1]) if self.views else None
             self._plan = plan_views(knowledge, o.boards, goal, 2, reach=o.reach, last=last)
         return self._plan
@@ -303,16 +308,16 @@ def worth_beside(plan: Plan, after: float, *, photo: bool) -> float:
     return max(brings, WORTH_OF_PHOTO / WORTH_GOING_ON * (1.0 - after / plan.error)) if photo else brings
 
 
-def stated_words(left: Sequence[Left]) -> str:
+def stated_words(left: Sequence[RemainingError]) -> str:
     """Return errors in words, and whether they are small enough."""
-    each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.wish.wanted:g}'})" for own in left)
+    each = (f"{own} ({'as wanted' if own.reached else f'wanted {own.requirement.wanted:g}'})" for own in left)
     return f"error {', '.join(each)}"
 
 
-def enough_words(left: Sequence[Left], gain: float, camera: Camera | None = None) -> str:
+def enough_words(left: Sequence[RemainingError], gain: float, camera: Camera | None = None) -> str:
     """Return that there are enough frames, in words; of one `camera` also what an error comes to."""
     said = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
-    missed = [f"{own.wish.wanted:g} {own.wish.goal.unit}" for own in left if not own.reached]
+    missed = [f"{own.requirement.wanted:g} {own.requirement.goal.unit}" for own in left if not own.reached]
     if not missed:
         return f"Enough: {said}; two more pictures would bring {100.0 * gain:.0f} %"
     return f"Enough: {said}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"

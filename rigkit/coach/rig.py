@@ -32,7 +32,7 @@ from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.core.processes import Here
 from rigkit.planning.candidates import held_boards, outline_mm
-from rigkit.planning.goal import Left
+from rigkit.planning.goal import RemainingError
 from rigkit.planning.information import HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.planning.words import placement
@@ -72,7 +72,7 @@ class RigAdvice:
     waits: bool = False
     speaks: int = 0
     targets: tuple[Pixels | None, ...] = ()
-    left: tuple[Left, ...] = ()
+    left: tuple[RemainingError, ...] = ()
     gain: float | None = None
 
     @property

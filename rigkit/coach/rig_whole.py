@@ -22,7 +22,7 @@ from rigkit.coach.guide import GuideOptions, worth_beside
 from rigkit.core.arrays import Pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.planning.goal import Left, Wish, projection_goal
+from rigkit.planning.goal import RemainingError, Requirement, projection_goal
 from rigkit.planning.plan import Plan, covariance_of
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.planning.words import placement
@@ -65,7 +65,7 @@ def whole_rig(
         return None
 
 
-def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[Left, ...]:
+def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingError, ...]:
     """Return what a rig's calibration leaves of what is to become small: the error of each lens alone; that of all
     projections, mounts included, where boards were; and of what is measured.
 
@@ -74,15 +74,15 @@ def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[Left, ...]:
     cameras, covariance = rig.quoted
     mounts = [own.cam_from_rig for own in rig.cameras]
     layout, field_deg = Layout.of_cameras(cameras), options.reach.field_deg
-    wishes = []
+    requirements = []
     for own, camera, at in zip(rig.cameras, cameras, layout.cameras, strict=True):
         goal = projection_goal(camera, field_deg).among(np.r_[at], layout.count)
-        wishes.append(Wish(goal, options.goal_px, own.name))
+        requirements.append(Requirement(goal, options.goal_px, own.name))
     boards = [view.cam_from_board.translation_mm for own in rig.cameras for view in own.calibration.views]
     away_mm = float(np.median(np.linalg.norm(boards, axis=-1)))
-    wishes.append(Wish(rig_goal(cameras, mounts, away_mm, field_deg), options.goal_px, "together"))
-    wishes += options.lengths(cameras, mounts)
-    return tuple(wish.left(covariance) for wish in wishes)
+    requirements.append(Requirement(rig_goal(cameras, mounts, away_mm, field_deg), options.goal_px, "together"))
+    requirements += options.lengths(cameras, mounts)
+    return tuple(requirement.remaining(covariance) for requirement in requirements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class RigKnown:
     """What is known of a rig by its calibration, and what that leaves."""
 
     watched: Watched
-    left: tuple[Left, ...]
+    left: tuple[RemainingError, ...]
     options: GuideOptions
 
     @classmethod
@@ -102,7 +102,9 @@ class RigKnown:
     def plan(self) -> Plan:
         """The next two frames for what is farthest from what is wanted."""
         farthest, boards = max(self.left, key=lambda own: own.share), self.options.boards
-        return Frames.of(self.watched, boards, self.options.reach).plan(self.watched, boards, farthest.wish.goal, 2)
+        return Frames.of(self.watched, boards, self.options.reach).plan(
+            self.watched, boards, farthest.requirement.goal, 2
+        )
 
     @property
     def reached(self) -> bool:

@@ -53,36 +53,36 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Wish:
+class Requirement:
     """How small a goal's error is to become, in its unit, and whose it is: "" where there is but one."""
 
     goal: Goal
     wanted: float
     whose: str = ""
 
-    def left(self, covariance: FloatArray) -> Left:
+    def remaining(self, covariance: FloatArray) -> RemainingError:
         """Return how far it is from that."""
-        return Left(self, float(self.goal.error(covariance)))
+        return RemainingError(self, float(self.goal.error(covariance)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Left:
+class RemainingError:
     """What there is left of a goal's error."""
 
-    wish: Wish
+    requirement: Requirement
     error: float
 
     @property
     def share(self) -> float:
         """As a part of what is wanted: reached at 1."""
-        return self.error / self.wish.wanted
+        return self.error / self.requirement.wanted
 
     @property
     def reached(self) -> bool:
         return self.share <= 1.0
 
     def __str__(self) -> str:
-        return f"{self.wish.whose} {self.error:.2g} {self.wish.goal.unit}".lstrip()
+        return f"{self.requirement.whose} {self.error:.2g} {self.requirement.goal.unit}".lstrip()
 
 
 def projection_goal(camera: Camera, field_deg: float | None = None, pixels: Pixels | None = None) -> Goal:

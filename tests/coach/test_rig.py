@@ -239,7 +239,7 @@ def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator
     advice = coach.guide.advise([glance(held.pose(7), rng, "x")])
     (lens,) = advice.lenses
     in_px, in_mm = lens.left
-    assert in_px.reached and in_mm.wish.goal.unit == "mm"
+    assert in_px.reached and in_mm.requirement.goal.unit == "mm"
     calibration = coach.guide.lenses[0].calibration
     assert calibration is not None
     assert in_mm.error == pytest.approx(length_error_mm(calibration, length), rel=0.005)

@@ -117,7 +117,7 @@ def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
     told(guide, later, rig)
     now = guide.advise(EMPTY)
     assert now.enough and now.words.startswith("Enough: left ") and "together" in now.words
-    assert [own.wish.whose for own in now.left] == ["left", "right", "together"]
+    assert [own.requirement.whose for own in now.left] == ["left", "right", "together"]
     # The rig's own statements: of each lens as its calibration has it, and of all projections together.
     for own, camera in zip(now.left, rig.cameras, strict=False):
         known = uncertain_camera(camera.calibration)
@@ -177,7 +177,7 @@ def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig:
 
     options = GuideOptions(boards=(BOARD,), goal_px=3.0, goal_mm=1.0, measured=measured, reach=REACH)
     in_mm = left_of_rig(rig, options)[-1]
-    assert in_mm.wish.goal.unit == "mm" and in_mm.error > 0.0
+    assert in_mm.requirement.goal.unit == "mm" and in_mm.error > 0.0
     for part, enough in ((2.0, True), (0.5, False)):
         later = Later(rig)
         guide = guide_of(frames, later, goal_mm=part * in_mm.error, measured=measured)
