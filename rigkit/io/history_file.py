@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.core.errors import InputError, printable
+from rigkit.core.printing import brief
 from rigkit.io.files import ensure_writable
 from rigkit.io.json_reader import parse_json, real, whole
 from rigkit.io.reading import MAX_NUMBER, read_text
@@ -52,6 +53,8 @@ class HistoryEntry:
     digest: str = ""
     temperature_c: float | None = None
     amounts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    __repr__ = brief
 
     @property
     def moment(self) -> datetime:

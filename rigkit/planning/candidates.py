@@ -10,6 +10,7 @@ from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.printing import brief
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.planning.information import HeldBoards
 
@@ -41,6 +42,8 @@ class Reach:
     nearest_mm: float = 0.0
     farthest_mm: float = np.inf
     field_deg: float | None = None
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         """Raise InputError for distances, or a field, that there are not."""

@@ -21,6 +21,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.io.calibration_file import (
@@ -84,6 +85,8 @@ class CheckedPictures:
     left_out: tuple[tuple[str, str], ...]
     unreadable: tuple[str, ...]
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def check_pictures(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.errors import InputError, RigkitError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.manifest import Dataset
@@ -69,6 +70,8 @@ class PaperValidation:
     tables: tuple[Table, ...]
     failures: tuple[PairFailure, ...]
     files: Mapping[str, str]
+
+    __repr__ = brief
 
 
 def validate_as_paper(

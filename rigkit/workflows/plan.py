@@ -10,6 +10,7 @@ from rigkit.calibration.views.usable import without_parts
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.calibration_file import load_calibration
@@ -80,6 +81,8 @@ class PlannedSession:
     plan: Plan
     found: tuple[Table, ...]
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
 
 def plan_session(

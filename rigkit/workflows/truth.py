@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigkit.core.errors import InputError
+from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.io.files import ensure_folder_writable, write_atomic
 from rigkit.io.public_set import PublicSet, load_public_set
@@ -40,6 +41,8 @@ class FetchedSet:
     present: tuple[str, ...]
     fetched: tuple[str, ...]
     missing: tuple[str, ...]
+
+    __repr__ = brief
 
     def files(self, pattern: str) -> tuple[Path, ...]:
         """Return the files of the set that match, sorted by name."""
