@@ -28,7 +28,7 @@ from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
-from rigkit.core.arrays import BoolArray, FloatArray, Mat3
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Mat3, Projected
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3, left_jacobian, skew
 from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
@@ -97,7 +97,7 @@ class DisplacedCamera(Camera):
         x, y, z = self._turned @ np.stack([x, y, z])
         return x, y, z
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         u, v, valid = self._own._project(*self._turn(x, y, z))
         du, dv = self._displacement(u, v)
         return u + du, v + dv, valid
@@ -114,17 +114,12 @@ class DisplacedCamera(Camera):
         return x, y, z, valid
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
         count = self.lens.parameters.size
         of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :count]
-        x, y, z = self._turn(x, y, z)
-        u, v, valid = self._own._derivatives(x, y, z, d_pixels_d_point, of_lens)
+        x, y, z = self._turn(*at)
+        u, v, valid = self._own._derivatives((x, y, z), d_pixels_d_point, of_lens)
         of_amounts = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, count:]
         if of_amounts is not None:
             of_amounts[:] = 0.0

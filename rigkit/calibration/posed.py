@@ -22,7 +22,7 @@ from rigkit.calibration.solving.solver import Convergence
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.usable import usable_views
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
@@ -150,18 +150,13 @@ class HeldLens(Camera):
     def max_angle_rad(self) -> float:
         return self.lens.max_angle_rad
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         return self.lens._project(x, y, z)
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         return self.lens._unproject(u, v)
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        return self.lens._derivatives(x, y, z, d_pixels_d_point, None)
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
+        return self.lens._derivatives(at, d_pixels_d_point, None)

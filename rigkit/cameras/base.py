@@ -13,7 +13,17 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays, as_array
+from rigkit.core.arrays import (
+    BoolArray,
+    Coordinates,
+    FloatArray,
+    Pixels,
+    Points,
+    Projected,
+    RayJacobians,
+    Rays,
+    as_array,
+)
 from rigkit.core.errors import InputError
 
 MAX_SIDE_PX = 2**20
@@ -165,7 +175,7 @@ class Camera(ABC):
         """The largest angle from the optical axis that the model sees; at most pi."""
 
     @abstractmethod
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         """Return u, v, valid of flat coordinates; NaN in must give invalid out, values at invalid places are free."""
 
     @abstractmethod
@@ -174,13 +184,8 @@ class Camera(ABC):
 
     @abstractmethod
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
         """Project, fill `d_pixels_d_point` (2, 3, N) and, unless None, `d_pixels_d_parameters` (2, P, N)."""
 
     def project(self, points: Points) -> tuple[Pixels, BoolArray]:
@@ -222,7 +227,7 @@ class Camera(ABC):
         x, y, z = rays.reshape(-1, 3).T
         d_pixels_d_point = np.empty((2, 3, x.size))
         with np.errstate(all="ignore"):
-            self._derivatives(x, y, z, d_pixels_d_point, None)
+            self._derivatives((x, y, z), d_pixels_d_point, None)
             uu, uv, vv = (
                 np.einsum("kn,kn->n", d_pixels_d_point[i], d_pixels_d_point[j], optimize=False)
                 for i, j in ((0, 0), (0, 1), (1, 1))
@@ -246,7 +251,8 @@ class Camera(ABC):
         d_pixels_d_point = np.zeros((2, 3, flat.shape[0]))
         d_pixels_d_parameters = np.zeros((2, self.parameters.size, flat.shape[0]))
         with np.errstate(all="ignore"):
-            u, v, valid = self._derivatives(flat[:, 0], flat[:, 1], flat[:, 2], d_pixels_d_point, d_pixels_d_parameters)
+            at = flat[:, 0], flat[:, 1], flat[:, 2]
+            u, v, valid = self._derivatives(at, d_pixels_d_point, d_pixels_d_parameters)
         pixels = np.stack([u, v], axis=-1)
         if not valid.all():
             _blank(pixels, valid)
@@ -275,7 +281,7 @@ class Camera(ABC):
         zeros.
         """
         with np.errstate(all="ignore"):
-            return self._derivatives(x, y, z, d_pixels_d_point, d_pixels_d_parameters)
+            return self._derivatives((x, y, z), d_pixels_d_point, d_pixels_d_parameters)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
         """Return the same model and size with other parameters.

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.monotone import KNOTS, first_root, horner
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.core.errors import InputError
 from rigkit.kernels.cameras import brown_pixels, brown_places
 
@@ -104,7 +104,7 @@ class Brown(Camera):
             limit = min(limit, math.sqrt(first_root(np.array(bottom), FARTHEST**2)))
         object.__setattr__(self, "_max_r", limit)
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         return brown_pixels((x, y, z), self.parameters, self._max_r)
 
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
@@ -129,14 +129,9 @@ class Brown(Camera):
         return np.asarray(found / np.where(radius > 0.0, radius, 1.0) * m)
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        return brown_pixels((x, y, z), self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
+        return brown_pixels(at, self.parameters, self._max_r, d_pixels_d_point, d_pixels_d_parameters)
 
 
 def _product(a: list[float], b: list[float]) -> list[float]:

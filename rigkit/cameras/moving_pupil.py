@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray, Pixels, Points, RayJacobians, Rays
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Pixels, Points, Projected, RayJacobians, Rays
 
 PUPIL_TERMS = 2
 PUPIL_NAMES = ("pupil_mm_per_rad2", "pupil_mm_per_rad4")
@@ -126,7 +126,7 @@ class NearCamera(Camera):
         valid = (np.abs(step) <= 1e3 * ROUNDING_RAD) & (along > np.abs(slope * sine)) & (theta >= 0.0)
         return across, ahead, theta, slope, valid
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         _, ahead, _, _, near = self._through_pupil(x, y, z)
         u, v, valid = self.lens._project(x, y, ahead)
         return u, v, valid & near
@@ -135,16 +135,12 @@ class NearCamera(Camera):
         return self.lens._unproject(u, v)
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
+        x, y, z = at
         across, ahead, theta, slope, near = self._through_pupil(x, y, z)
         of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :-PUPIL_TERMS]
-        u, v, valid = self.lens._derivatives(x, y, ahead, d_pixels_d_point, of_lens)
+        u, v, valid = self.lens._derivatives((x, y, ahead), d_pixels_d_point, of_lens)
         # With c = (t^2, t^4), g the gradient of the angle at the point before its pupil, and R its distance:
         # ds = s' dt + c de and dt = g dp + rho / R^2 ds give ds = (s' g dp + c de) / (1 - s' rho / R^2).
         distance = across * across + ahead * ahead

@@ -15,7 +15,7 @@ import numpy as np
 
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.fit import nearest_camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.core.errors import InputError
 from rigkit.kernels.cameras import radial_pixels
 from rigkit.optim.damping import Stop
@@ -62,21 +62,16 @@ class CompiledCamera(RadialCamera):
     def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
         """Return the polynomial and the limits that `radial_pixels` asks for."""
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         polynomial, limits = self._shape()
         return radial_pixels(self.model, (x, y, z), polynomial, self._linear(), limits)
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
         memory = d_pixels_d_point, d_pixels_d_parameters
         polynomial, limits = self._shape()
-        return radial_pixels(self.model, (x, y, z), polynomial, self._linear(), limits, *memory)
+        return radial_pixels(self.model, at, polynomial, self._linear(), limits, *memory)
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -91,19 +86,15 @@ class FocalCamera(RadialCamera):
     def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
         """Return s with its derivatives; those by the shape parameters only where asked for."""
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         scale, valid = self._scale(x * x + y * y, z)
         fx, fy, cx, cy = self.parameters[:4].tolist()
         return fx * (scale * x) + cx, fy * (scale * y) + cy, valid
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
+        x, y, z = at
         d = self._scale_derivatives(x * x + y * y, z, d_pixels_d_parameters is not None)
         fx, fy, cx, cy = self.parameters[:4].tolist()
         mx, my = d.scale * x, d.scale * y

@@ -41,6 +41,8 @@ Normals = Annotated[FloatArray, "(..., 3) unit"]
 Affines = Annotated[FloatArray, "(..., 2, 2) image 2 from image 1"]
 RayJacobians = Annotated[FloatArray, "(..., 3, 2) d ray / d pixel"]
 Mat3 = Annotated[FloatArray, "(..., 3, 3)"]
+Coordinates = Annotated[tuple[FloatArray, FloatArray, FloatArray], "x, y, z of points in the camera frame, (N,) each"]
+Projected = Annotated[tuple[FloatArray, FloatArray, BoolArray], "u, v of pixels and where they are valid, (N,) each"]
 
 
 def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, finite: bool = True) -> FloatArray:

@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
-
-Coordinates = tuple[FloatArray, FloatArray, FloatArray]
-"""x, y, z of points in the camera frame, (N,) each."""
 
 
 @structure("brown_points_t")
@@ -30,7 +27,7 @@ def brown_pixels(
     max_r: float,
     d_pixels_d_point: FloatArray | None = None,
     d_pixels_d_parameters: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> Projected:
     """Project points and write those Jacobians that are given as `Camera.derivatives` does; return u, v and valid.
 
     `max_r` is the tangent of the largest angle at which the camera, of 8, 9 or 12 `parameters`, sees anything.
@@ -62,7 +59,7 @@ def radial_pixels(
     limits: tuple[float, float],
     d_pixels_d_point: FloatArray | None = None,
     d_pixels_d_parameters: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> Projected:
     """As `brown_pixels`, for the radial camera `model`: "kannala_brandt" or "scaramuzza".
 
     Parameters
@@ -85,14 +82,14 @@ def _written(
     d_pixels_d_point: FloatArray | None,
     d_pixels_d_parameters: FloatArray | None,
     camera: dict[str, Any],
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> Projected:
     """Call the kernel for the points and the `camera`, members of the structure, and return u, v and valid."""
     count = len(points[0])
     x, y, z = points
     wanted = d_pixels_d_point, d_pixels_d_parameters
     written = [_memory(out, count) for out in wanted]
     at = struct.of(x=x, y=y, z=z, axes=written[0].shape[1], rows=written[1].shape[1], **camera)
-    projected: tuple[FloatArray, FloatArray, BoolArray] = kernel(at, *written)
+    projected: Projected = kernel(at, *written)
     for out, memory in zip(wanted, written, strict=True):
         if out is not None and out is not memory:
             out[...] = memory

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.core.arrays import BoolArray, FloatArray
+from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -44,7 +44,7 @@ class Panorama(Camera):
     def _elevation(w: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return sine and cosine of the elevation, and valid."""
 
-    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         a, b = (y, x) if self.horizontal_axis else (x, y)
         h = np.sqrt(a * a + z * z)
         across, along = np.arctan2(a, z), self._rise(b, h)[0]
@@ -62,13 +62,9 @@ class Panorama(Camera):
         return x, y, z, valid & (np.abs(across) <= np.pi)
 
     def _derivatives(
-        self,
-        x: FloatArray,
-        y: FloatArray,
-        z: FloatArray,
-        d_pixels_d_point: FloatArray,
-        d_pixels_d_parameters: FloatArray | None,
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        self, at: Coordinates, d_pixels_d_point: FloatArray, d_pixels_d_parameters: FloatArray | None
+    ) -> Projected:
+        x, y, z = at
         i, j = (1, 0) if self.horizontal_axis else (0, 1)
         a, b = (y, x) if self.horizontal_axis else (x, y)
         h = np.sqrt(a * a + z * z)
