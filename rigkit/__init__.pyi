@@ -115,6 +115,8 @@ from rigkit.workflows.history import show_history as show_history
 from rigkit.workflows.inputs.camera_files import import_camera as import_camera
 from rigkit.workflows.inputs.camera_files import import_rig as import_rig
 from rigkit.workflows.inputs.corners import Cache as Cache
+from rigkit.workflows.inputs.identify_board import IdentifiedBoard as IdentifiedBoard
+from rigkit.workflows.inputs.identify_board import identify_board as identify_board
 from rigkit.workflows.mesh import MeshOptions as MeshOptions
 from rigkit.workflows.mesh import mesh_cloud as mesh_cloud
 from rigkit.workflows.paper import PaperOptions as PaperOptions
@@ -153,6 +155,8 @@ from rigkit.workflows.truth import public_sets as public_sets
 from rigkit.workflows.validate import DatasetValidation as DatasetValidation
 from rigkit.workflows.validate import ValidateOptions as ValidateOptions
 from rigkit.workflows.validate import validate_dataset as validate_dataset
+from rigkit.workflows.validate_many import ManyValidation as ManyValidation
+from rigkit.workflows.validate_many import validate_datasets as validate_datasets
 
 __all__: list[str]
 __version__: str

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import numpy as np
 from helpers.data import REPOSITORY
 
 import rigkit
+from rigkit.cli.main import VERBS
 
 CAMERA = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images" / "fisheye-standard"
@@ -70,6 +72,16 @@ def test_names_for_type_checkers_are_those_that_are_imported_on_first_use() -> N
     }
     assert declared == vars(rigkit)["_homes"]()
     assert sorted(declared) == rigkit.__all__ == sorted(set(dir(rigkit)) - {"__all__", "__version__"})
+
+
+def test_every_verb_has_its_functions_on_the_page_of_python() -> None:
+    rows = re.findall(
+        r"^\| (`\w+`.*) \| (.*) \|$", (REPOSITORY / "docs/pages/python.md").read_text("utf-8"), re.MULTILINE
+    )
+    verbs = {verb for told, _ in rows for verb in re.findall(r"`(\w+)`", told)}
+    assert verbs == set(VERBS) - {"init", "schema"}
+    functions = {name for _, told in rows for name in re.findall(r"`(\w+)`", told)}
+    assert functions <= set(rigkit.__all__)
 
 
 def test_the_version_is_the_installed_ones() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from rigkit.core.errors import DegenerateError, ExitCode, InputError, RigkitError
+from rigkit.core.printing import brief
 from rigkit.core.processes import over_items
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Table, cells, columns
@@ -52,6 +53,8 @@ class ManyValidation:
     outcomes: tuple[SetOutcome, ...]
     table: Table
     written: tuple[Path, ...]
+
+    __repr__ = brief
 
     @property
     def code(self) -> int:

@@ -31,6 +31,8 @@ rigkit.add_to_history(Path("register.jsonl"), Path("calibration.json"))  # type:
 rigkit.run_coach(Path("session"), print)  # type: ignore[arg-type]
 rigkit.validate_as_paper("lab-a", rigkit.DatasetOptions())  # type: ignore[arg-type]
 rigkit.reconstruct_rig_views("rig.json")  # type: ignore[arg-type]
+rigkit.validate_datasets(["lab-a"], 2)  # type: ignore[arg-type]
+rigkit.identify_board(Path("photos"))  # type: ignore[arg-type]
 rigkit.fetch_public_set("caliper-board")  # type: ignore[arg-type]
 
 # What comes back is known as well.

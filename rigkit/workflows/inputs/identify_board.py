@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed, DegenerateError, InputError
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.core.printing import counted
+from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
@@ -59,6 +59,8 @@ class IdentifiedBoard:
     alike: tuple[str, ...] = ()
     elsewhere: tuple[str, tuple[str, ...]] | None = None
     either_pattern: bool = False
+
+    __repr__ = brief
 
 
 def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) -> IdentifiedBoard:
