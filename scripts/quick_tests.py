@@ -7,10 +7,10 @@ quick run can do without a test where its other tests reach every line and every
 out are the dearest of these, until the rest takes --total seconds of processor time. A limit on a test's time falls
 until that is so. Of the tests that take longer, the quick run keeps those that together reach what the shorter ones do
 not. They are chosen one after the other by what they add a second (Chvatal, Mathematics of Operations Research 4,
-1979), but for those that others chosen later make needless. It also keeps a short one of every file, `KEPT`, tests that
-fail under coverage, and those that start programs which are not Python's: what these reach is not seen. With --further
-only the quick tests of now run, in half the time, and more of them are left out. Prints seconds, lines and branches of
-both.
+1979), but for those that others chosen later make needless. Files of `WHOLE` are left out. It also keeps a short one
+of every file, `KEPT`, tests that fail under coverage, and those that start programs which are not Python's: what these
+reach is not seen. With --further only the quick tests of now run, in half the time, and more of them are left out.
+Prints seconds, lines and branches of both.
 """
 
 from __future__ import annotations
@@ -46,6 +46,9 @@ KEPT = (
 )
 MAY_BE_MISSING = ("tests/real/", "test_own_readers.py", "_in_browser.py", "test_accessible.py")
 """Tests that are skipped where captures, a browser or another program are missing: others have to reach their lines."""
+WHOLE = ("tests/contracts/test_round_trips.py",)
+"""Files left out as a whole, which the quick run need not even import: before its first test Hypothesis reads the numbers
+in all modules, 3 s of each process in a fresh clone. Others have to reach their lines, too."""
 HEAD = """\
 # The tests that the quick run leaves out: scripts/quick_tests.py chose them, ./scripts/test --thorough runs them too.
 # The quick tests reach every line and branch of rigkit that these reach.
@@ -251,10 +254,11 @@ class Reach:
     def left_out(self, limit_s: float) -> NDArray[np.bool_]:
         """Return the mask of the tests, of those that take more than `limit_s` with their share of what they use, that
         the others make needless."""
-        missing = np.array([any(part in test for part in MAY_BE_MISSING) for test in self.tests])
+        whole = np.array([test.startswith(WHOLE) for test in self.tests])
+        missing = whole | np.array([any(part in test for part in MAY_BE_MISSING) for test in self.tests])
         fixed = np.array([test.startswith(KEPT) for test in self.tests]) | (self.seconds[:, 1] > MAX_STARTED_S)
         each_s = self.seconds[:, 0] + self.uses @ (self.shared / np.maximum(self.uses.sum(axis=0), 1))
-        out = (each_s > limit_s) & ~fixed
+        out = whole | (each_s > limit_s) & ~fixed
         wanted = self.parts.any(axis=0) & ~self.parts[~out & ~missing].any(axis=0)
         open_tests = np.flatnonzero(out & ~missing)
         while wanted.any() and len(open_tests):
@@ -274,7 +278,7 @@ class Reach:
                 times -= self.parts[test]
         # Of every file at least one stays, if it is short: what it is about is looked at.
         files = np.array([test.partition("::")[0] for test in self.tests])
-        for file in set(files) - set(files[~out]):
+        for file in set(files) - set(files[~out]) - set(WHOLE):
             own = np.flatnonzero(files == file)
             shortest = own[each_s[own].argmin()]
             out[shortest] = each_s[shortest] > MAX_OF_FILE_S
@@ -309,7 +313,8 @@ def main() -> None:
         out = reach.left_out(limit)
         if reach.total_s(~out) <= args.total:
             break
-    left = {test for test, is_out in zip(reach.tests, out, strict=True) if is_out}
+    left = {test for test, is_out in zip(reach.tests, out, strict=True) if is_out and not test.startswith(WHOLE)}
+    left |= set(WHOLE)
     if args.further:
         before = {line for line in CHOSEN.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
         left |= before - set(reach.tests)

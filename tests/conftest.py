@@ -2,25 +2,46 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
+import importlib
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
 THOROUGH = Path(__file__).with_name("thorough.txt")
+LEFT_OUT = {line for line in THOROUGH.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
+"""Names of tests, or of files: of all their tests."""
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """The quick run does not import a file of which it leaves out all."""
+    quick = "not thorough" in config.getoption("markexpr") and collection_path.is_relative_to(ROOT)
+    return True if quick and collection_path.relative_to(ROOT).as_posix() in LEFT_OUT else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the tests of thorough.txt, which `./scripts/test` leaves out."""
-    names = {line for line in THOROUGH.read_text(encoding="utf-8").splitlines() if not line.startswith("#")}
     for item in items:
-        if item.nodeid in names:
+        if not LEFT_OUT.isdisjoint((item.nodeid, item.nodeid.partition("::")[0])):
             item.add_marker("thorough")
-    if config.args_source is config.ArgsSource.TESTPATHS and (gone := names - {item.nodeid for item in items}):
+    there = {item.nodeid for item in items} | {name for name in LEFT_OUT if (ROOT / name).is_file()}
+    if config.args_source is config.ArgsSource.TESTPATHS and (gone := LEFT_OUT - there):
         words = f"{THOROUGH.name} names tests that are not there: {', '.join(sorted(gone))}"
         config.issue_config_time_warning(pytest.PytestWarning(words), stacklevel=2)
+
+
+def pytest_collection(session: pytest.Session) -> None:
+    """The second of two processes imports the last file first: what one has compiled, the other need not compile."""
+    if getattr(session.config, "workerinput", {}).get("workerid") == "gw1":
+        files = (file.resolve() for name in session.config.args for file in Path(name).rglob("test_*.py"))
+        for file in sorted(files, reverse=True):
+            if pytest_ignore_collect(file, session.config) is None:
+                with contextlib.suppress(Exception, pytest.skip.Exception):
+                    importlib.import_module(".".join(file.relative_to(ROOT).with_suffix("").parts))
 
 
 def pytest_configure() -> None:
