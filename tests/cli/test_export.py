@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from rigkit.io.calibration_file import camera_to_json, load_calibration, load_ca
 from rigkit.io.ply import read_ply
 from rigkit.workflows.export_camera import foreign_files
 from rigkit.workflows.inputs.camera_files import import_rig
+from rigkit.workflows.pairs import find_boards
 
 CAMERAS = REPOSITORY / "calib" / "cameras"
 CALIBRATION = CAMERAS / "mvca020_fe185" / "calibration.json"
@@ -85,7 +87,18 @@ def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize("planes", ["free", "lattice"])
-def test_a_cloud_is_the_same_by_export_and_reconstruct(planes: str, tmp_path: Path) -> None:
+def test_a_cloud_is_the_same_by_export_and_reconstruct(
+    planes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Every command looks at the same two images through the same lens.
+    found: list[Any] = []
+
+    def find_once(*asked: Any) -> Any:
+        if not found:
+            found.append(find_boards(*asked))
+        return found[0]
+
+    monkeypatch.setattr("rigkit.workflows.pairs.find_boards", find_once)
     shutil.copytree(REPOSITORY / "calib", tmp_path / "calib")
     shutil.copytree(LAB, lab := tmp_path / "datasets" / "lab-a")
     manifest = lab / "dataset.toml"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ BASELINE_MM = (99.81, 0.25)
 BOUGUET_FX = 533.5
 
 
+@cache
 def detected(folder: Path, pattern: str, board: Board) -> tuple[list[BoardView], tuple[int, int]]:
     views: list[BoardView] = []
     size = (0, 0)

@@ -72,15 +72,18 @@ def page(calibration: Calibration) -> str:
 
 
 @pytest.fixture(scope="module")
-def told(calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def text(calibration: Calibration) -> str:
+    return page(calibration)
+
+
+@pytest.fixture(scope="module")
+def told(text: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What the page is in a browser, which starts once for all: five things of `PROBE`, five of `SORT_PROBE`."""
     probes = PROBE.replace("</body>", SORT_PROBE)
-    text = page(calibration).replace("</body>", probes).replace('loading="lazy"', "")
-    return probed(text, tmp_path_factory.mktemp("page"))
+    return probed(text.replace("</body>", probes).replace('loading="lazy"', ""), tmp_path_factory.mktemp("page"))
 
 
-def test_works_without_network(calibration: Calibration, told: list[str]) -> None:
-    text = page(calibration)
+def test_works_without_network(text: str, told: list[str]) -> None:
     assert not re.search(r"""(src|href)=["']?https?:""", text)
     assert len(text) < MAX_BYTES
     assert "&lt;b&gt;.jpg" in text and "<b>.jpg" not in text

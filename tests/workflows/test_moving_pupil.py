@@ -176,7 +176,7 @@ def test_a_pupil_that_is_not_known_well_alarms_nobody(saved: Path) -> None:
     unsure = watched.covariance.copy()
     unsure[p - 2, p - 2] += sigma**2
     off = near.with_parameters(near.parameters + np.where(np.arange(p) == p - 2, 1.5 * sigma, 0.0))
-    views = random_views(off, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
+    views = random_views(off, 6, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
     seen = [FreshView(f"{k}", 0, view) for k, view in enumerate(views)]
     assert not check_views(watched, seen).holds
     assert check_views(replace(watched, covariance=unsure), seen).holds

@@ -73,12 +73,12 @@ def test_boards_alike_are_named_where_a_rig_comes_to_nothing(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Two boards with the same marks are seen at once: either camera takes one of them, not always the same one."""
-    large = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))[:3]]
+    large = [np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in sorted(folder.glob("*.png"))[:2]]
     pictures = [cv2.resize(one, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for one in large]
     for name in ("left", "right"):
         (tmp_path / name).mkdir()
         for k, own in enumerate(pictures):
-            beside = pictures[k - 1 if name == "left" else k - 2]
+            beside = pictures[k - 1 if name == "left" else k]
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), np.hstack([own, beside]))
     words = "charuco:7x7x30,dictionary=DICT_4X4_100,marker_mm=22.5"
     folders = [str(tmp_path / "left"), str(tmp_path / "right")]
