@@ -47,8 +47,8 @@ KEPT = (
 MAY_BE_MISSING = ("tests/real/", "test_own_readers.py", "_in_browser.py", "test_accessible.py")
 """Tests that are skipped where captures, a browser or another program are missing: others have to reach their lines."""
 WHOLE = ("tests/contracts/test_round_trips.py",)
-"""Files left out as a whole, which the quick run need not even import: before its first test Hypothesis reads the numbers
-in all modules, 3 s of each process in a fresh clone. Others have to reach their lines, too."""
+"""Files left out as a whole, which the quick run need not even import: before its first test Hypothesis reads the
+numbers in all modules, 3 s of each process in a fresh clone. Others have to reach their lines, too."""
 HEAD = """\
 # The tests that the quick run leaves out: scripts/quick_tests.py chose them, ./scripts/test --thorough runs them too.
 # The quick tests reach every line and branch of rigkit that these reach.
