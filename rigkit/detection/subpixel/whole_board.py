@@ -302,9 +302,7 @@ def spline_coefficients(nodes: FloatArray) -> FloatArray:
     At the ends the third derivative goes on: "not a knot".
     """
     down, along = (_collocation(count) for count in nodes.shape[:2])
-    return np.asarray(
-        np.moveaxis(along @ (down @ nodes.transpose(2, 0, 1)).transpose(0, 2, 1), 0, 2).transpose(1, 0, 2)
-    )
+    return np.ascontiguousarray(np.moveaxis(down @ np.moveaxis(nodes, 2, 0) @ along.T, 0, 2))
 
 
 @functools.cache

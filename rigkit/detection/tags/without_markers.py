@@ -8,6 +8,7 @@ squares around: without it the image is that of a chessboard.
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -52,7 +53,16 @@ MIN_MARKER_CONTRAST = 1e-3
 """Of pixels weighted, the least variance of the board's picture (1 and -1) in which black and white are told apart."""
 
 
-def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blur: float) -> GreyImage | None:
+class WithoutMarkers(NamedTuple):
+    """A picture without markers, and how much light their ink took from it (H, W), where it is known."""
+
+    picture: GreyImage
+    light: Picture
+
+
+def without_markers(
+    image: GreyImage, refined: RefinedLattice, board: Board, blur: float, light: Picture | None = None
+) -> WithoutMarkers | None:
     """Return `image` as if the squares of a ChArUco `board` were empty; None where too little of it is seen.
 
     Parameters
@@ -60,6 +70,7 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     image : grey.
     refined : the corners, on the grid of the board; those unknown are foretold by the others.
     blur : s of the edges, px.
+    light : how much ink takes, from corners hardly elsewhere; without, it is asked of the image.
     """
     # What is half covered is foretold by the others rather than believed.
     seen = _seen(np.where(unsure(refined.sigma_px)[..., None], np.nan, refined.lattice.pixels))
@@ -76,21 +87,19 @@ def without_markers(image: GreyImage, refined: RefinedLattice, board: Board, blu
     first, ends = np.array([column, row]), np.array([[-1.0, board.columns], [-1.0, board.rows]])
     assert isinstance(board.pattern, Charuco)
     white = -1.0 if board.pattern.first_black(board.rows) == ((row + column) % 2 == 0) else 1.0
-    squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX, planes=1)[0]
     each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
     around_known = cv2.dilate(known.astype(np.uint8), AROUND_CORNER) > 0
     corners, reach = np.stack([known, around_known]), np.array([WINDOW_REACH, 1.0])
     on_sheet, (used, told) = sheet_places(places, -1.0 - first, each, corners, reach)
-    squares, marks = (_blurred(plane, rest_blur) for plane in (squares, _ink(board, on_sheet, each, square_px)))
-    out = image.astype(np.float32)
-    part = out[top : top + height, left : left + width]
-    squares *= white
-    squares -= 2.0 * marks
-    marks *= _contrast(part, squares, used, SHADE_SQUARES * square_px)
-    marks *= told
-    marks *= 2.0
-    part += marks
-    return out
+    marks = _blurred(_ink(board, on_sheet, each, square_px), rest_blur)
+    out, here = image.astype(np.float32), (slice(top, top + height), slice(left, left + width))
+    if light is None:
+        squares = board_picture(places, known.shape, ends - first[:, None], np.zeros(4), SHARP_PX, planes=1)[0]
+        squares = white * _blurred(squares, rest_blur) - 2.0 * marks
+        light = np.zeros(out.shape, np.float32)
+        light[here] = 2.0 * _contrast(out[here], squares, used, SHADE_SQUARES * square_px)
+    out[here] += marks * light[here] * told
+    return WithoutMarkers(out, light)
 
 
 def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] | None:

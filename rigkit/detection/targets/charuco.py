@@ -37,6 +37,7 @@ from rigkit.detection.tags.codes import transferred
 from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
+from rigkit.kernels.boards import Picture
 from rigkit.kernels.surface import maps_of_quads
 
 SAME_CELLS = 0.2
@@ -289,27 +290,28 @@ def _wiped(image: GreyImage, told: RefinedLattice, sure: BoolArray, board: Board
     """Return the corners `told` fitted anew in the picture without the markers, but for those that are not `sure` (R,
     C) and fit badly there; None where markers cannot be wiped out."""
     empty, some_more = replace(board, pattern=Chessboard()), bool((told.lattice.known & ~sure).any())
-    picture, before, after, narrow = image, blur, blur, told
+    picture, before, after, narrow, light = image, blur, blur, told, None
     # The places of those that were added are rough.
     for turn in range(WIPES + some_more):
-        wiped = without_markers(image, narrow, board, after)
+        # Of corners without ink it is known how much light that takes.
+        wiped = without_markers(image, narrow, board, after, light if turn >= WIPES else None)
         if wiped is None:
             return None
-        picture, told, before = wiped, narrow, after
-        fitted = _fitted(wiped, told, empty, before)
+        (picture, light), told, before = wiped, narrow, after
+        fitted = _fitted(picture, told, empty, before)
         if turn > 0 and some_more:
             fitted = fitted.without(_too_unlike(fitted, sure))
-        narrow = placed_together(wiped, fitted)
+        narrow = placed_together(picture, fitted)
         after = float(np.median(narrow.blur_px[narrow.lattice.known]))
     # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
-    alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, told, narrow, board, before))
+    alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, light, told, narrow, board, before))
     every = (slice(0, sure.shape[0]), slice(0, sure.shape[1]))
     scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
     return _MarkedBoard(replace(narrow, sigma_px=scatter * alone, scatter=scatter), board, picture, empty)
 
 
 def _drawn_by_markers(
-    image: GreyImage, told: RefinedLattice, found: RefinedLattice, board: Board, blur: float
+    image: GreyImage, light: Picture | None, told: RefinedLattice, found: RefinedLattice, board: Board, blur: float
 ) -> float:
     """Return how far corners go back, in parts of the shift, where their markers are wiped out a little beside.
 
@@ -321,11 +323,13 @@ def _drawn_by_markers(
     """
     off = MOVED_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
     aside = replace(told, lattice=replace(told.lattice, pixels=told.lattice.pixels + off))
-    wiped = without_markers(image, aside, board, blur)
+    wiped = without_markers(image, aside, board, blur, light)
     if wiped is None:
         return 0.0
     empty = replace(board, pattern=Chessboard())
-    moved = placed_together(wiped, _fitted(wiped, told, empty, blur)).lattice.pixels - found.lattice.pixels
+    moved = (
+        placed_together(wiped.picture, _fitted(wiped.picture, told, empty, blur)).lattice.pixels - found.lattice.pixels
+    )
     back = -(moved / off)[np.isfinite(moved)]
     return max(float(np.median(back)), MIN_DRAWN) if len(back) >= MIN_MOVED else 0.0
 
