@@ -290,8 +290,9 @@ EXPORT void block_products(
 /* circles.c */
 
 /* What comes out of a circle: u, v, the map (4), covariance of (u, v) at noise of variance 1 (uu, uv, vv), blur, brightness
- * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8). */
-enum { CIRCLE_OUTCOMES = 26, SPOT = 3, BESIDE = 6 };
+ * outside, brightness inside less that, RMS residual, pixels, whether it settled, harmonics 3 to 6 of the edge (8), what residuals say of
+ * a blur that differs with the direction (2) and the normal equations of that (uu, uv, vv). */
+enum { CIRCLE_OUTCOMES = 31, SPOT = 3, BESIDE = 6 };
 
 /* The constants of detection.circles.fit, under their names there. */
 typedef struct {
@@ -302,8 +303,8 @@ typedef struct {
 
 EXPORT void fit_circles(
     IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, maps, count, 2, 2),
-    ARRAY(const double, curvatures, count, 2, 3), ARRAY(const double, blur, count), ARRAY(const double, reach, count),
-    ARRAY(const int64_t, beside, count, BESIDE), const circle_rules_t *rules, int64_t most,
+    ARRAY(const double, curvatures, count, 2, 3), ARRAY(const double, blur, count), ARRAY(const double, uneven, count, 2),
+    ARRAY(const double, reach, count), ARRAY(const int64_t, beside, count, BESIDE), const circle_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, SPOT, most), RESULT(double, out, count, CIRCLE_OUTCOMES));
 
 /* light.c */

@@ -16,8 +16,9 @@ static const double PLACE_ERROR = 1e-5;
 enum { BLOCK = 32 };
 /* The normal equations and, as the last of their columns, the residuals. */
 enum { OFF = PARAMETERS, COLUMNS };
-/* Beside them, what the circle's own growth changes: that of the circles beside it is in E1 to S, too. */
-enum { OWN = COLUMNS, ROWS };
+/* Beside them, what the circle's own growth changes (that of the circles beside it is in E1 to S, too), and what a blur that
+ * differs with the direction changes. */
+enum { OWN = COLUMNS, Q1, Q2, ROWS };
 /* Further from an edge than this, in blurs, it is all one brightness. */
 static const float FAR = 12.0f;
 /* Nearer to the centre than this, in px, the way to the edge turns round with the centre, and fits do not settle. */
@@ -32,7 +33,7 @@ typedef struct {
 } spots_t;
 
 typedef struct {
-    double c[2], M[4], inverse[4], H[6], s, a, b, g[2], size;
+    double c[2], M[4], inverse[4], H[6], s, q[2], a, b, g[2], size;
     int inversions;
 } circle_t;
 
@@ -105,6 +106,27 @@ INLINE void shares(const double z[BLOCK], double share[BLOCK], double slope[BLOC
     }
 }
 
+/* The blur towards the edges of a block: its variance is s^2 + q . (cos, sin) of twice the angle of the edge's normal, as that
+ * of motion is; and its derivatives by s and q. */
+typedef struct {
+    double s[BLOCK], per_s[BLOCK], by_s[BLOCK], by_q[2][BLOCK];
+} blurs_t;
+
+INLINE void towards(const double q[2], double s, const places_t *places, blurs_t *out)
+{
+    const double least = 0.01 * s * s;
+#pragma omp simd
+    for (int k = 0; k < BLOCK; k++) {
+        const double c = places->nu[k] * places->nu[k] - places->nv[k] * places->nv[k], d = 2.0 * places->nu[k] * places->nv[k];
+        const double squared = s * s + q[0] * c + q[1] * d, here = sqrt(squared > least ? squared : least), per_here = 1.0 / here;
+        out->s[k] = here;
+        out->per_s[k] = per_here;
+        out->by_s[k] = s * per_here;
+        out->by_q[0][k] = 0.5 * c * per_here;
+        out->by_q[1][k] = 0.5 * d * per_here;
+    }
+}
+
 /* Return how many pixels of a block there are from `first` on, and where they are from the circle's centre; what is beyond
  * the last pixel is at the centre. */
 INLINE int64_t offsets(const circle_t *at, const spots_t *spots, int64_t first, double du[BLOCK], double dv[BLOCK])
@@ -133,34 +155,39 @@ INLINE int inverted(circle_t *at)
 /* Add the light of a circle beside it to the block's share of discs and, for growth and blur, to its rows: derivatives of the
  * share. */
 INLINE void add_beside(
-    const circle_t *at, const double *from, double blur, const double du[BLOCK], const double dv[BLOCK], double total[BLOCK],
+    const circle_t *at, const circle_t *from, const double du[BLOCK], const double dv[BLOCK], double total[BLOCK],
     double rows[ROWS][BLOCK])
 {
     double u[BLOCK], v[BLOCK], z[BLOCK], share[BLOCK], slope[BLOCK];
     places_t places;
-    const double off_u = from[0] - at->c[0], off_v = from[1] - at->c[1], per_blur = 1.0 / blur;
+    blurs_t blur;
+    const double off_u = from->c[0] - at->c[0], off_v = from->c[1] - at->c[1];
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         u[k] = du[k] + off_u;
         v[k] = dv[k] + off_v;
     }
     place(at, u, v, &places);
+    towards(from->q, from->s, &places, &blur);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double x = at->inverse[0] * u[k] + at->inverse[1] * v[k], y = at->inverse[2] * u[k] + at->inverse[3] * v[k];
-        const double inside = -places.d[k] * per_blur - 0.5 * places.curvature[k] * blur;
+        const double inside = -places.d[k] * blur.per_s[k] - 0.5 * places.curvature[k] * blur.s[k];
         z[k] = x * x + y * y < NO_LIGHT * NO_LIGHT ? inside : -(double)FAR;
     }
     shares(z, share, slope);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double per_r = 1.0 / (places.r[k] > 1e-9 ? places.r[k] : 1e-9), c = places.x[k] * per_r, s = places.y[k] * per_r;
-        const double grown = slope[k] * per_blur * places.per_radius[k], bent = 0.5 * slope[k] * places.curvature[k] * blur;
+        const double grown = slope[k] * blur.per_s[k] * places.per_radius[k], bent = 0.5 * slope[k] * places.curvature[k] * blur.s[k];
+        const double wider = slope[k] * (places.d[k] * blur.per_s[k] * blur.per_s[k] - 0.5 * places.curvature[k]);
         total[k] += share[k];
         rows[E1][k] += grown + bent;
         rows[E2][k] += (grown - 3.0 * bent) * (c * c - s * s);
         rows[E3][k] += (grown - 3.0 * bent) * 2.0 * c * s;
-        rows[S][k] += slope[k] * (places.d[k] * per_blur * per_blur - 0.5 * places.curvature[k]);
+        rows[S][k] += wider * blur.by_s[k];
+        rows[Q1][k] += wider * blur.by_q[0][k];
+        rows[Q2][k] += wider * blur.by_q[1][k];
     }
 }
 
@@ -171,18 +198,21 @@ INLINE void differentiate(
 {
     const circle_t *at = &group->own;
     double z[BLOCK], share[BLOCK], slope[BLOCK], total[BLOCK];
-    const double per_blur = 1.0 / at->s, per_size = 1.0 / at->size;
+    const double per_size = 1.0 / at->size;
+    blurs_t blur;
     place(at, du, dv, places);
+    towards(at->q, at->s, places, &blur);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++)
-        z[k] = -places->d[k] * per_blur - 0.5 * places->curvature[k] * at->s;
+        z[k] = -places->d[k] * blur.per_s[k] - 0.5 * places->curvature[k] * blur.s[k];
     shares(z, share, slope);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double per_r = 1.0 / (places->r[k] > 1e-9 ? places->r[k] : 1e-9), c = places->x[k] * per_r, s = places->y[k] * per_r;
-        const double edge = slope[k] * per_blur, grown = edge * places->per_radius[k];
+        const double edge = slope[k] * blur.per_s[k], grown = edge * places->per_radius[k];
         /* A larger circle is less curved; a slanted one where it is longer is more so, three times as much. */
-        const double bent = 0.5 * slope[k] * places->curvature[k] * at->s;
+        const double bent = 0.5 * slope[k] * places->curvature[k] * blur.s[k];
+        const double wider = slope[k] * (places->d[k] * blur.per_s[k] * blur.per_s[k] - 0.5 * places->curvature[k]);
         total[k] = share[k];
         rows[X][k] = edge * places->nu[k];
         rows[Y][k] = edge * places->nv[k];
@@ -190,17 +220,20 @@ INLINE void differentiate(
         rows[E1][k] = grown + bent;
         rows[E2][k] = (grown - 3.0 * bent) * (c * c - s * s);
         rows[E3][k] = (grown - 3.0 * bent) * 2.0 * c * s;
-        rows[S][k] = slope[k] * (places->d[k] * per_blur * per_blur - 0.5 * places->curvature[k]);
+        rows[S][k] = wider * blur.by_s[k];
+        rows[Q1][k] = wider * blur.by_q[0][k];
+        rows[Q2][k] = wider * blur.by_q[1][k];
     }
     for (int j = 0; j < group->count; j++)
-        add_beside(group->beside + j, at->c, at->s, du, dv, total, rows);
+        add_beside(group->beside + j, at, du, dv, total, rows);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double x = du[k] * per_size, y = dv[k] * per_size, light = 1.0 + at->g[0] * x + at->g[1] * y;
         const double level = at->a + at->b * total[k], steep = light * at->b;
         for (int i = X; i <= S; i++)
             rows[i][k] *= steep;
-        rows[OWN][k] *= steep;
+        for (int i = OWN; i <= Q2; i++)
+            rows[i][k] *= steep;
         rows[A][k] = light;
         rows[B][k] = light * total[k];
         rows[GX][k] = level * x;

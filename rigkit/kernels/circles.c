@@ -161,10 +161,45 @@ INLINE void harmonics(const group_t *at, const spots_t *spots, double out[8])
         out[n] *= 2.0 / (weight > 1e-12 ? weight : 1e-12);
 }
 
-/* Return the circle as its guess has it, with as many inversions of its map as a pixel's place needs. */
-static circle_t guessed(const double *pixel, const double *map, const double *bend, double blur)
+/* Write what residuals say of a blur that differs with the direction: their products with its two columns, and the normal
+ * equations of these (3) once all else is solved for, from the factor `N` of those of the rest. */
+static void unevenness(const group_t *at, const spots_t *spots, const double *N, double out[5])
 {
-    circle_t at = {.s = blur};
+    double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK], with[2][PARAMETERS] = {{0.0}}, solved[2][PARAMETERS];
+    places_t places;
+    memset(out, 0, 5 * sizeof(double));
+    for (int64_t first = 0; first < spots->count; first += BLOCK) {
+        const int64_t here = offsets(&at->own, spots, first, du, dv);
+        for (int64_t k = 0; k < BLOCK; k++)
+            value[k] = spots->value[first + (k < here ? k : 0)];
+        differentiate(at, du, dv, value, &places, rows);
+        for (int64_t k = 0; k < here; k++) {
+            const double one = rows[Q1][k], two = rows[Q2][k];
+            out[0] += one * rows[OFF][k];
+            out[1] += two * rows[OFF][k];
+            out[2] += one * one;
+            out[3] += one * two;
+            out[4] += two * two;
+            for (int i = 0; i < PARAMETERS; i++) {
+                with[0][i] += one * rows[i][k];
+                with[1][i] += two * rows[i][k];
+            }
+        }
+    }
+    memcpy(solved, with, sizeof solved);
+    cholesky_solve(N, PARAMETERS, solved[0]);
+    cholesky_solve(N, PARAMETERS, solved[1]);
+    for (int i = 0; i < PARAMETERS; i++) {
+        out[2] -= with[0][i] * solved[0][i];
+        out[3] -= with[0][i] * solved[1][i];
+        out[4] -= with[1][i] * solved[1][i];
+    }
+}
+
+/* Return the circle as its guess has it, with as many inversions of its map as a pixel's place needs. */
+static circle_t guessed(const double *pixel, const double *map, const double *bend, double blur, const double q[2])
+{
+    circle_t at = {.s = blur, .q = {q[0], q[1]}};
     memcpy(at.c, pixel, sizeof at.c);
     memcpy(at.M, map, sizeof at.M);
     memcpy(at.H, bend, sizeof at.H);
@@ -230,15 +265,15 @@ static void write_circle(const circle_t *at, const double *N, double squares, in
 
 /* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
 static group_t grouped(
-    int64_t n, const double *pixels, const double *maps, const double *curvatures, const double *blur, const int64_t *beside,
-    const circle_rules_t *rules)
+    int64_t n, const double *pixels, const double *maps, const double *curvatures, const double *blur, const double *uneven,
+    const int64_t *beside, const circle_rules_t *rules)
 {
-    group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, curvatures + 6 * n, blur[n])};
+    group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, curvatures + 6 * n, blur[n], uneven + 2 * n)};
     for (int k = 0; k < BESIDE; k++) {
         const int64_t j = beside[BESIDE * n + k];
         if (j < 0)
             continue;
-        circle_t other = guessed(pixels + 2 * j, maps + 4 * j, curvatures + 6 * j, blur[n]);
+        circle_t other = guessed(pixels + 2 * j, maps + 4 * j, curvatures + 6 * j, blur[n], uneven + 2 * n);
         /* Both are as wide as the larger of their sides on the way from one to the other; half of what is left is its own. */
         const double u = other.c[0] - group.own.c[0], v = other.c[1] - group.own.c[1], apart = hypot(u, v);
         const double *M = other.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
@@ -251,14 +286,14 @@ static group_t grouped(
 FOR_EACH_PROCESSOR
 void fit_circles(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *maps,
-    const double *curvatures, const double *blur, const double *reach, const int64_t *beside, const circle_rules_t *rules, int64_t capacity,
+    const double *curvatures, const double *blur, const double *uneven, const double *reach, const int64_t *beside, const circle_rules_t *rules, int64_t capacity,
     double *scratch, double *out)
 {
     spots_t spots = {.u = scratch, .v = scratch + capacity, .value = scratch + 2 * capacity};
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * CIRCLE_OUTCOMES;
         memset(result, 0, CIRCLE_OUTCOMES * sizeof(double));
-        group_t group = grouped(n, pixels, maps, curvatures, blur, beside, rules);
+        group_t group = grouped(n, pixels, maps, curvatures, blur, uneven, beside, rules);
         circle_t *at = &group.own;
         const double band = rules->near_sigmas * at->s + rules->near_px;
         if (!inverted(at))
@@ -306,5 +341,6 @@ void fit_circles(
             continue;
         write_circle(at, N, squares, spots.count, still, result);
         harmonics(&group, &spots, result + 18);
+        unevenness(&group, &spots, N, result + 26);
     }
 }

@@ -23,11 +23,12 @@ def fit_circles(
     maps: FloatArray,
     curvatures: FloatArray,
     blur: FloatArray,
+    uneven: FloatArray,
     reach: FloatArray,
     beside: IntArray,
     capacity: int,
     rules: CircleRules,
 ) -> FloatArray:
-    """Return the outcomes of N circles, (N, 26). Arguments as `detection.circles.fit.fit_circles`; `capacity` is how
+    """Return the outcomes of N circles, (N, 31). Arguments as `detection.circles.fit.fit_circles`; `capacity` is how
     many pixels the largest window has."""
-    return np.asarray(kernels().fit_circles(image, pixels, maps, curvatures, blur, reach, beside, rules, capacity))
+    return np.asarray(kernels().fit_circles(image, pixels, maps, curvatures, blur, uneven, reach, beside, rules, capacity))

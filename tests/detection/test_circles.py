@@ -42,8 +42,8 @@ MAX_BOUND = 1.15
 whole board tells it (1.09 of twelve; by a perspective and a polynomial alone 1.23, by neighbours 1.35)."""
 SINGLE_PX = 0.12
 """A rim circle of a grid seen by a fisheye at 60 degrees from near by: its neighbours lie on one side."""
-MOVED_PX = 0.3
-"""Of circles that motion of 5 px joins, whose edges the model does not know."""
+MOVED_PX = 0.015
+"""Of circles that motion of 6 px joins: measured 0.007 to 0.010, and 0.14 with one blur for all directions."""
 QUICK_PX = 0.3
 """What a quick look may be off, by the maps of blobs: measured 0.07 px."""
 
@@ -183,15 +183,17 @@ def test_edges_that_too_much_light_leaves_without_blur_are_edges(board: Board) -
     assert len(found.grid) == board.rows * board.columns
 
 
-def test_circles_whose_light_a_motion_mixes_are_fitted_to_the_end() -> None:
-    """Plain steps creep: after fifteen of them 11 of 108 had not settled, and were dropped."""
+def test_circles_whose_light_a_motion_mixes_are_where_they_are() -> None:
+    """With one blur for all directions four of 108 fitted no more, and the others were off by 2 of their sigmas."""
     rng = np.random.default_rng(1)
     board = replace(HEXAGONAL, pattern=Circles("hexagonal", diameter_mm=16.7))
     scene = one_board(rng, board=board)
     clear = np.asarray(scene.render(optics=Optics(0.5), photometry=NOISY, rng=rng), np.uint8)
-    (found,) = detect_boards(degraded("motion", 5.0, clear, rng)[0], [board])
+    (found,) = detect_boards(degraded("motion", 6.0, clear, rng)[0], [board])
     assert found.complete
-    assert np.sqrt((errors_by_place(found, scene.truth()[0]) ** 2).mean()) < MOVED_PX
+    error = errors_by_place(found, scene.truth()[0])
+    assert np.sqrt((error**2).mean()) < MOVED_PX
+    assert HONEST[0] < np.sqrt(((error / found.sigma_px[:, None]) ** 2).mean()) < HONEST[1]
 
 
 def test_circles_that_something_covers_are_left_out() -> None:

@@ -10,6 +10,10 @@ from rigkit.detection.circles.fit import fit_circles
 
 SERIES_PX = 1e-3
 """The kernel's distance from the edge is a series to the second order: so far do fits depart from the definition."""
+WIDE_SERIES_PX = 5e-3
+"""The same at a blur of 1.7 px, where pixels farther from the edge count."""
+UNEVEN_PX2 = 0.12
+"""Of a narrow ellipse, whose slant and blur look nearly alike, by that series."""
 CIRCLES = {
     "round": ([[12.0, 0.0], [0.0, 12.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]),
     "slanted": ([[14.0, 3.0], [-2.0, 7.0]], [[0.3, 0.05, 0.1], [0.05, 0.15, 0.1]]),
@@ -31,6 +35,21 @@ def test_a_picture_of_the_model_gives_its_numbers_back(name: str) -> None:
     # Size and slant without the turn that no circle shows.
     assert fit.maps[0] @ fit.maps[0].T == pytest.approx(matrix @ matrix.T, rel=2e-3, abs=0.05)
     assert fit.sigma_px[0] < 0.01
+
+
+@pytest.mark.parametrize("name", CIRCLES)
+def test_a_blur_that_differs_with_the_direction_comes_from_what_fits_leave(name: str) -> None:
+    matrix, bend = (np.array(part) for part in CIRCLES[name])
+    centre, uneven = np.array([31.3, 29.8]), np.array([0.9, -0.5])
+    image = picture((64, 60), centre, matrix, bend, 1.4, 200.0, -170.0, np.zeros(2), (0.9, -0.5)).astype(np.float32)
+    told = np.zeros(2)
+    for _ in range(5):
+        args = (image, centre[None], matrix[None], bend[None], np.array([1.2]), np.array([1.7]))
+        fit = fit_circles(*args, uneven_px2=told)
+        one, two, xx, xy, yy = fit.uneven[0]
+        told = told + np.linalg.solve([[xx, xy], [xy, yy]], [one, two])
+    assert told == pytest.approx(uneven, abs=UNEVEN_PX2)
+    assert fit.valid.all() and np.abs(fit.pixels[0] - centre).max() < WIDE_SERIES_PX
 
 
 def test_the_middle_of_the_ellipse_is_not_the_centre() -> None:

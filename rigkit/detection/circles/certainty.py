@@ -49,7 +49,7 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     odd = _beside_smooth(fit.growth, label) ** 2
     more = _beside_white((odd / usual)[:, 1:])
     misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * usual.sum(axis=1), 0.0)
-    wavy = ((fit.harmonics - np.median(fit.harmonics, axis=0)) ** 2).mean(axis=(1, 2))
+    wavy = (_beside_smooth(fit.harmonics.reshape(len(label), -1), label) ** 2).mean(axis=1)
     uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
     return np.asarray(np.sqrt(more * fit.sigma_px**2 + ((MAP_ERROR * radius) ** 2 * misshapen + uneven) * size_px**2))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
-from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, fit_circles
+from rigkit.detection.circles.evidence import GridEvidence
+from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_curvatures
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels.circles import BESIDE
@@ -38,26 +39,22 @@ MIN_TYPICAL_CIRCLE = 0.03
 """Residuals over contrast below this are small anyway."""
 SUPPORT = 5
 """Neighbours that must foretell a circle which no blob shows."""
-RIM_SIGMAS = 4.0
-"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: with
-2.5 the error there is a quarter over the bound, with 4 a tenth."""
 MAX_GAIN = 10.0
 """How much less certain than a circle a place may be that neighbours foretell: a corner of the grid, by its neighbours
 on one side, is five times."""
 SURE_GAIN = 1.5
 """Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
-ROUNDS_BESIDE = 2
+BLUR_ROUNDS = 3
 """The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
-blur 3 px)."""
+blur 3 px); the third, where the blur
+differs with the direction, has that from what the neighbours' light leaves, and circles that this light had hidden."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
+MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
+"""Of the variance of the blur. Below the first the centres of circles that lie apart are the same. The second is a blur
+four times as wide in one direction as across it."""
 MAX_NEW_RINGS = 40
 """Rings of circles that a grid may grow by."""
-UNEXPLAINED, MISSHAPEN, DISPLACED, CORNERED, MAX_STRANGE = 0.17, 0.08, 0.04, 0.03, 1.6
-"""Scales of `GridEvidence`, and how large the sum of squares in these may be for a grid. Those of two REAL boards reach
-0.150 (sharpened), 0.055, 0.029 (motion of 6 px), 0.023 (ink that spreads by 2 px) and a sum of 1.2, in eleven kinds of
-worse images. Of 625 pictures without one (REAL photographs, RENDERED patterns; sharp, sharpened, blurred, moved) the
-nearest, solar panels, cloth and a trellis under motion, have 2.0, 2.4 and 3.1."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -74,6 +71,7 @@ class CircleGrid:
     radius : of the circles, in distances of neighbours.
     blur_px, contrast, share : typical blur of an edge, how far circles differ from their ground in grey levels, and how
         far in parts of the brighter of both.
+    uneven_px2 : (2,) by how much the blur differs with the direction (`fit_circles`).
     empty : (K, 2) places beside these circles that the image shows, and no circle there.
     evidence : what speaks for a grid.
     """
@@ -88,39 +86,12 @@ class CircleGrid:
     blur_px: float
     contrast: float
     share: float
+    uneven_px2: FloatArray
     empty: IntArray
     evidence: GridEvidence
 
     def __len__(self) -> int:
         return len(self.label)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GridEvidence:
-    """How well a lattice is one of circles in a plane; medians over its circles.
-
-    Attributes
-    ----------
-    unexplained : RMS residual over contrast.
-    misshapen : how far size and slant differ from those that neighbours foretell, in radii.
-    displaced : distance from the place that neighbours foretell, in distances of neighbours.
-    corners : amplitude in radii of the edge's harmonics 3 to 6, the mean over all circles: squares have 0.15.
-    """
-
-    unexplained: float
-    misshapen: float
-    displaced: float
-    corners: float
-
-    @property
-    def strange(self) -> float:
-        """Return how little this is like a grid of circles: what speaks against one, weighed together."""
-        off = (self.unexplained / UNEXPLAINED, self.misshapen / MISSHAPEN, self.displaced / DISPLACED)
-        return sum(part * part for part in (*off, self.corners / CORNERED))
-
-    @property
-    def convincing(self) -> bool:
-        return self.strange < MAX_STRANGE
 
 
 def find_grids(grey: GreyImage, min_circles: int = MIN_CIRCLES, *, quick: bool = False) -> list[CircleGrid]:
@@ -149,7 +120,7 @@ def _wide(label: IntArray) -> bool:
     return bool((np.ptp(label, axis=0) >= MIN_SIDE - 1).all())
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Draft:
     """A grid in the making."""
 
@@ -159,6 +130,7 @@ class _Draft:
     radius: float
     hexagonal: bool
     bright: bool
+    uneven_px2: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     def chosen(self, which: BoolArray) -> _Draft:
         return replace(self, label=self.label[which], fit=rows_of(self.fit, which), around=rows_of(self.around, which))
@@ -169,8 +141,9 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
     around = local_maps(found.label, own.pixels, found.label, hexagonal=found.hexagonal, sigma_px=FIRST_SIGMA_PX)
     radius = _radius(own.shape, around.first)
     bright = bool(own.sign[0] > 0)
-    fit = _fitted(grey, own.pixels, around, radius, np.full(len(own), FIRST_EDGE_BLUR))
-    draft = _judged(_Draft(found.label, fit, around, radius, found.hexagonal, bright), FIRST_LENIENCE)
+    fit = _fitted(grey, own.pixels, around, radius, np.full(len(own), FIRST_EDGE_BLUR), np.zeros(2))
+    draft = _Draft(label=found.label, fit=fit, around=around, radius=radius, hexagonal=found.hexagonal, bright=bright)
+    draft = _judged(draft, FIRST_LENIENCE)
     for step in () if quick else (_again, _with_all, _again):
         if _enough(draft):
             draft = step(grey, draft)
@@ -178,14 +151,14 @@ def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) 
         return None
     evidence = _evidence(draft)
     if evidence.convincing and not quick:
-        draft = _beside_others(grey, draft)
+        draft = _through_its_blur(grey, draft)
     return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))
 
 
-def _with_all(grey: GreyImage, draft: _Draft) -> _Draft:
-    """Return the draft grown by rings of circles that no blob shows."""
+def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
+    """Return the draft grown by rings of circles that no blob shows; `beside`: with the light of neighbours."""
     for _ in range(MAX_NEW_RINGS):
-        grown = _larger(grey, draft) if _enough(draft) else None
+        grown = _larger(grey, draft, beside=beside) if _enough(draft) else None
         if grown is None:
             break
         draft = grown
@@ -209,26 +182,21 @@ def _fitted(
     around: PlaneMap,
     radius: float,
     blur_px: FloatArray,
+    uneven_px2: FloatArray,
     beside: IntArray | None = None,
+    known: int = 0,
 ) -> CircleFit:
+    """Return the circles of maps, fitted but for the first `known`, which only shine on those beside them."""
     maps = radius * around.first
     reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded)
-    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach, beside)
+    reach[:known] = 0.0
+    return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach, beside, uneven_px2)
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
     """Return which circles (N,) have about the usual `contrast`, or the usual `share` of the brightness."""
     parts = np.stack([np.abs(fit.contrast) / contrast, fit.share / share])
     return np.asarray(((parts > MIN_CIRCLE_CONTRAST) & (parts < MAX_CIRCLE_CONTRAST)).any(axis=0))
-
-
-def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
-    """Return to how many radii (N,) pixels are a circle's own.
-
-    That is half the way to the next circle; where there is none, the sheet may end there.
-    """
-    narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
-    return np.where(surrounded, half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
 
 
 def _sigma(fit: CircleFit) -> float:
@@ -284,23 +252,43 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     around = with_smooth_curvatures(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
     others = _beside_each(draft.label, draft.hexagonal) if beside else None
-    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px, others)
+    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px, draft.uneven_px2, others)
     return _judged(replace(draft, fit=fresh, around=around, radius=radius))
 
 
-def _beside_others(grey: GreyImage, draft: _Draft) -> _Draft:
-    """Return the draft fitted with the light that blur brings from neighbours, where it does.
+def _uneven(draft: _Draft) -> FloatArray:
+    """Return by how much the blur of all circles differs with the direction (2,), px^2, from what their residuals say.
+
+    One circle cannot tell it from its slant where it is small; that slants are those of a plane, all of them can.
+    """
+    first, second, *normal = draft.fit.uneven.sum(axis=0)
+    more = np.linalg.solve(
+        np.array([[normal[0], normal[1]], [normal[1], normal[2]]]) + 1e-12 * np.eye(2), [first, second]
+    )
+    uneven = draft.uneven_px2 + more
+    most = MAX_UNEVEN * float(np.median(draft.fit.blur_px)) ** 2
+    return np.asarray(uneven * min(1.0, most / max(float(np.linalg.norm(uneven)), 1e-12)))
+
+
+def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
+    """Return the draft fitted with the light that blur brings from neighbours, and with a blur that differs with the
+    direction, where there are such; and circles that are seen only so.
 
     Only what is a grid is: large circles with much blur overlap to what looks like a chessboard.
     """
-    for _ in range(ROUNDS_BESIDE):
+    grown = False
+    for done in range(BLUR_ROUNDS):
         half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
-        if not (half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any():
+        beside = bool((half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any())
+        uneven = _uneven(draft)
+        even = bool(np.linalg.norm(uneven) < MIN_UNEVEN * np.median(draft.fit.blur_px) ** 2)
+        if even and (not beside or (done == BLUR_ROUNDS - 1 and not grown)):
             break
-        fitted = _again(grey, draft, beside=True)
+        fitted = _again(grey, replace(draft, uneven_px2=uneven), beside=beside)
         if not _enough(fitted):
             break
-        draft = fitted
+        draft = _with_all(grey, fitted, beside=beside) if done else fitted
+        grown = len(draft.label) > len(fitted.label)
     return draft
 
 
@@ -318,14 +306,13 @@ def _steps(hexagonal: bool) -> IntArray:
     return np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if hexagonal else [])])
 
 
-def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
+def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
     """Return the draft with circles found beside its own, or None if there are none."""
     fit = draft.fit
     places, around = _beside(draft, (grey.shape[1], grey.shape[0]))
     if not len(places):
         return None
-    blur = np.full(len(places), float(np.median(fit.blur_px)))
-    tried = _fitted(grey, around.pixels, around, draft.radius, blur)
+    tried = _tried(grey, draft, places, around, beside=beside)
     near = np.linalg.norm(tried.pixels - around.pixels, axis=1) < OFF_PLACE * _spacing(around)
     joined = replace(
         draft,
@@ -335,6 +322,18 @@ def _larger(grey: GreyImage, draft: _Draft) -> _Draft | None:
     )
     judged = _judged(joined)
     return judged if len(judged.label) > len(draft.label) else None
+
+
+def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *, beside: bool) -> CircleFit:
+    """Return the circles fitted at places beside those of the draft."""
+    pixels, blur = around.pixels, np.full(len(places), float(np.median(draft.fit.blur_px)))
+    if not beside:
+        return _fitted(grey, pixels, around, draft.radius, blur, draft.uneven_px2)
+    others = _beside_each(np.concatenate([draft.label, places]), draft.hexagonal)
+    pixels, blur = np.concatenate([draft.fit.pixels, pixels]), np.concatenate([draft.fit.blur_px, blur])
+    every, known = _joined(draft.around, around), len(draft.label)
+    fit = _fitted(grey, pixels, every, draft.radius, blur, draft.uneven_px2, others, known)
+    return rows_of(fit, np.arange(len(pixels)) >= known)
 
 
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
@@ -380,6 +379,7 @@ def _finished(draft: _Draft, evidence: GridEvidence, size_px: tuple[int, int]) -
         blur_px=float(np.median(fit.blur_px)),
         contrast=float(np.median(np.abs(fit.contrast))),
         share=float(np.median(fit.share)),
+        uneven_px2=draft.uneven_px2,
         empty=empty,
         evidence=evidence,
     )

@@ -35,6 +35,9 @@ RULES = kernel.CircleRules.of(
 )
 """Fits of the model's own edges settle in five steps; those of others (sharpened, moved) take up to thirty, the later
 ones relaxed. They end where steps are as small as MODEL_SIGMA_PX, or a twentieth of what the circle is known to."""
+RIM_SIGMAS = 4.0
+"""A circle without a neighbour on some side is fitted to the pixels up to so many sigmas of blur outside of it: with
+2.5 the error there is a quarter over the bound, with 4 a tenth."""
 MODEL_SIGMA_PX = 5e-4
 """What a centre is off without noise, by how the edge model departs from rendered circles: 0.0003 to 0.0007 px."""
 
@@ -53,6 +56,8 @@ class CircleFit:
         more, RMS residual in grey levels.
     count : (N,) pixels.
     harmonics : (N, 4, 2) cosine and sine of harmonics 3 to 6 of the edge, in radii.
+    uneven : (N, 5) what residuals say of `uneven_px2` beyond what was given: products with its two columns, and its
+        normal equations (xx, xy, yy), both over the variance of the residuals.
     valid : (N,)
     """
 
@@ -67,6 +72,7 @@ class CircleFit:
     residual: FloatArray
     count: FloatArray
     harmonics: FloatArray
+    uneven: FloatArray
     valid: BoolArray
 
     @property
@@ -81,6 +87,15 @@ class CircleFit:
         return np.asarray(np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)))
 
 
+def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
+    """Return to how many radii (N,) pixels are a circle's own.
+
+    That is half the way to the next circle; where there is none, the sheet may end there.
+    """
+    narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
+    return np.where(surrounded, half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
+
+
 def fit_circles(
     grey: GreyImage,
     pixels: FloatArray,
@@ -89,6 +104,7 @@ def fit_circles(
     blur_px: FloatArray,
     reach: FloatArray,
     beside: IntArray | None = None,
+    uneven_px2: FloatArray | None = None,
 ) -> CircleFit:
     """Fit circles to their pixels.
 
@@ -100,6 +116,8 @@ def fit_circles(
     blur_px : (N,) where to start.
     reach : (N,) radii to which pixels are the circle's own: half the way to its neighbours.
     beside : (N, BESIDE) neighbours, whose light blur brings into a circle's pixels; -1 for none.
+    uneven_px2 : (2,) half of what the variance of the blur is more along x than along y, and along the diagonal between
+        them than across it: with motion it is.
     """
     extent = np.sqrt((maps**2).sum(axis=2)).max(axis=1, initial=1.0)
     margin = np.abs(curvatures).sum(axis=(1, 2)) + 1.0
@@ -108,25 +126,16 @@ def fit_circles(
     capacity = int((2.0 * float(finite.max(initial=1.0)) + 2.0) ** 2)
     capacity = min(capacity, grey.size)
     beside = np.full((len(pixels), kernel.BESIDE), -1) if beside is None else beside
-    rows = kernel.fit_circles(grey, pixels, maps, curvatures, blur_px, reach, beside, capacity, RULES)
+    uneven = np.zeros((len(pixels), 2)) if uneven_px2 is None else np.tile(uneven_px2, (len(pixels), 1))
+    rows = kernel.fit_circles(grey, pixels, maps, curvatures, blur_px, uneven, reach, beside, capacity, RULES)
     found = rows[:, 2:6].reshape(-1, 2, 2)
-    with np.errstate(all="ignore"):
-        relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)
-    growth = np.stack(
-        [
-            0.5 * (relative[:, 0, 0] + relative[:, 1, 1]) - 1.0,
-            0.5 * (relative[:, 0, 0] - relative[:, 1, 1]),
-            0.5 * (relative[:, 0, 1] + relative[:, 1, 0]),
-        ],
-        axis=1,
-    )
     covariance = rows[:, [6, 7, 7, 8]].reshape(-1, 2, 2) * (rows[:, 12] ** 2)[:, None, None]
     covariance = covariance + MODEL_SIGMA_PX**2 * np.eye(2)
     valid = (rows[:, 14] > 0.5) & np.isfinite(rows).all(axis=1)
     return CircleFit(
         pixels=rows[:, :2],
         maps=found,
-        growth=growth,
+        growth=_growth(maps, found),
         covariance=covariance,
         blur_px=rows[:, 9],
         brightness=rows[:, 10],
@@ -134,6 +143,21 @@ def fit_circles(
         residual=rows[:, 12],
         count=rows[:, 13],
         growth_variance=rows[:, 15:18] * (rows[:, 12] ** 2)[:, None],
-        harmonics=rows[:, 18:].reshape(-1, 4, 2),
+        harmonics=rows[:, 18:26].reshape(-1, 4, 2),
+        uneven=rows[:, 26:] / np.maximum(rows[:, 12:13], 1e-6) ** 2,
         valid=valid,
+    )
+
+
+def _growth(maps: FloatArray, found: FloatArray) -> FloatArray:
+    """Return the symmetric part (N, 3) of how the maps `found` differ from those given."""
+    with np.errstate(all="ignore"):
+        relative = np.linalg.solve(np.where(np.isfinite(maps), maps, 1.0) + 1e-9 * np.eye(2), found)
+    return np.stack(
+        [
+            0.5 * (relative[:, 0, 0] + relative[:, 1, 1]) - 1.0,
+            0.5 * (relative[:, 0, 0] - relative[:, 1, 1]),
+            0.5 * (relative[:, 0, 1] + relative[:, 1, 0]),
+        ],
+        axis=1,
     )

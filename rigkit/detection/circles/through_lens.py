@@ -21,11 +21,10 @@ from rigkit.detection.circles.find import (
     MIN_TYPICAL_CIRCLE,
     OFF_PLACE,
     CircleGrid,
-    edge_reach,
     like_contrast,
     rows_of,
 )
-from rigkit.detection.circles.fit import CircleFit, fit_circles
+from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.local_map import NEXT
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.geometry.board_pose import board_pose
@@ -70,7 +69,7 @@ def seen_through(
     reach = edge_reach(maps[tried], 0.5 * nearest_mm / radius_mm, blur, surrounded)
     first = np.argsort(~near, axis=1, kind="stable")[:, :BESIDE]
     beside = np.where(np.take_along_axis(near, first, axis=1), first, -1)
-    fit = fit_circles(grey, pixels[tried], maps[tried], curvatures[tried], blur, reach, beside)
+    fit = fit_circles(grey, pixels[tried], maps[tried], curvatures[tried], blur, reach, beside, found.uneven_px2)
     off = np.linalg.norm(fit.pixels - pixels[tried], axis=1) / spacing[tried]
     good = _sound(fit, found) & (off < OFF_PLACE)
     sigma = np.full(len(grid), np.nan)

@@ -18,10 +18,12 @@ def picture(
     outside: float,
     contrast: float,
     slope: FloatArray,
+    uneven_px2: tuple[float, float] = (0.0, 0.0),
 ) -> FloatArray:
     """Return the brightness (height, width) of a circle whose edge is centre + M w + H(w, w) / 2 over |w| = 1.
 
     The distance from the edge is that to the nearest of many points on it; `slope` : of the light, per px.
+    `uneven_px2` : what the blur's variance has more, times cosine and sine of twice the angle of the edge's normal.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 4001)[:-1]
     w = np.stack([np.cos(angle), np.sin(angle)])
@@ -38,6 +40,9 @@ def picture(
     first, second = 0.5 * tangent, after - 2.0 * edge[at] + before
     turn = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     curvature = np.abs(turn) / np.linalg.norm(first, axis=1) ** 3
-    share = ndtr(-distance / blur_px - 0.5 * curvature * blur_px)
+    blur = np.sqrt(
+        blur_px**2 + uneven_px2[0] * (normal[:, 0] ** 2 - normal[:, 1] ** 2) + uneven_px2[1] * 2.0 * normal.prod(axis=1)
+    )
+    share = ndtr(-distance / blur - 0.5 * curvature * blur)
     light = 1.0 + (pixels - centre) @ slope
     return (light * (outside + contrast * share)).reshape(size_px[1], size_px[0])
