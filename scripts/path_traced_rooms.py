@@ -1,6 +1,6 @@
 """Pairs of images of textured rooms by an independent path tracer, with the exact surface behind every pixel.
 
-python scripts/path_traced_rooms.py rooms fisheye:1 perspective:2      in a Python that has `pip install bpy`
+python scripts/path_traced_rooms.py rooms fisheye:1 perspective:2      in a Python that has `pip install bpy` (5)
 python scripts/bench_clouds.py rooms                                   with rigkit
 
 Blender's Cycles draws a room of boxes, balls, cylinders, posts and boards in painted textures, one wall nearly plain,
@@ -152,7 +152,7 @@ def lens_of(kind: str) -> Any:
 def draw(path: Path, seed: int) -> None:
     """Draw what the scene's camera sees."""
     scene = bpy.context.scene
-    scene.use_nodes = False
+    scene.compositing_node_group = None
     scene.cycles.samples, scene.cycles.filter_width, scene.cycles.seed = SAMPLES, SMOOTHED, seed
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGB"
     scene.render.filepath = str(path)
@@ -163,21 +163,18 @@ def surface(folder: Path) -> dict[str, np.ndarray]:
     """Return positions and normals (H, W, 3) in the world behind the middles of pixels; normals 0 where nothing is."""
     scene = bpy.context.scene
     scene.cycles.samples, scene.cycles.filter_width = 1, 0.01
-    scene.use_nodes = True
-    tree = scene.node_tree
-    tree.nodes.clear()
+    scene.compositing_node_group = tree = bpy.data.node_groups.new("passes", "CompositorNodeTree")
     layers, out = tree.nodes.new("CompositorNodeRLayers"), tree.nodes.new("CompositorNodeOutputFile")
-    out.base_path = str(folder)
+    out.directory, out.format.media_type = str(folder), "IMAGE"
     out.format.file_format, out.format.color_depth, out.format.color_mode = "OPEN_EXR", "32", "RGB"
-    out.file_slots.clear()
     for name in ("Position", "Normal"):
-        out.file_slots.new(name)
+        out.file_output_items.new("VECTOR", name)
         tree.links.new(layers.outputs[name], out.inputs[name])
     scene.render.filepath = str(folder / "unused.png")
     bpy.ops.render.render()
     read = {}
     for name in ("Position", "Normal"):
-        image = bpy.data.images.load(str(next(folder.glob(f"{name}*.exr"))))
+        image = bpy.data.images.load(str(next(folder.glob(f"*{name}*.exr"))))
         image.colorspace_settings.name = "Non-Color"
         values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
         image.pixels.foreach_get(values)
