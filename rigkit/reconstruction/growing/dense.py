@@ -23,6 +23,7 @@ from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
 from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
+from rigkit.reconstruction.growing.propagate import kept, propagated
 from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.growing.systematic import SystematicPose, pose_with_lens_errors
@@ -141,10 +142,9 @@ def grow_scene(
     measured = rays.measured(pose)
     surface = fit_surface(measured, step, even.pose.misfit_px)
     if sweep is not None:
-        at = surface.valid
-        keep = at.copy()
-        keep[at] = sweep.distinct(grown.pixels1[at], surface.plane[at], measured.slope[at], surface.support[at])
-        surface = surface.where(keep)
+        surface = surface.where(kept(surface, grown, measured.slope, sweep, view1))
+        surface, grown = propagated(surface, grown, measured.slope, sweep, view1, view2, pose)
+        rays = PairRays.of(grown, r.camera1, r.camera2)
     by_pose = _moved_planes(rays, pose, covariance)
     moves = _moves(even, r, moved, pose_is_known=pose_is_known)
     covariance = covariance + sum((np.outer(m.change, m.change) for m in moves), np.zeros((6, 6)))

@@ -28,8 +28,9 @@ from rigkit.reconstruction.growing.surface import NodeMeasurements
 SAMPLES_A_NODE = 2
 """From node to node, along either axis."""
 MAX_SWEEP_LEVELS = 160
-MARGIN_OF_RANGES = 0.1
-"""Of the range of inverse ranges that grew, to either side."""
+FARTHER, NEARER = 0.1, 0.5
+"""Of the range of inverse ranges that grew, to either side: what is before all of it, with too little texture to grow,
+seems to be anywhere else where its texture repeats."""
 BEND_COST = CENSUS_BITS // 6
 """Of a step to the next level, in bits of the census."""
 JUMP_COST = 2 * CENSUS_BITS
@@ -41,9 +42,15 @@ SMOOTHED = 0.4
 TABLE_SPACING = 8
 """Samples between those that are projected; in between the places are interpolated."""
 SMALLEST = 60
-"""Samples of a surface that patches agree with; smaller ones are chance."""
-SMALLEST_UNSEEN = 120
-"""The same where no patch agrees, as beside many edges of depth."""
+"""Samples of a surface; smaller ones are chance."""
+LARGE = 1000
+"""Samples of a surface that is no chance, though no patch agrees with it. Of 820 surfaces through two images that have
+nothing in common the largest has 976 (SIMULATED: 30 to 150 levels, noise and textures of falling spectra)."""
+MAX_OF_SHIFTED = 0.4
+"""Costs of a smaller one over those of the same surface at any other ranges. Three of those 820 have less, most 0.5 to
+0.6: the cheapest of all surfaces is half as dear as others by choice alone."""
+SHIFTED_LEVELS = 3
+"""From which on a range is another one: blurred detail is alike over two levels."""
 MAX_MISFIT_LEVELS = 1.0
 """By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
 UNLIT_LEVELS = 8.0
@@ -77,7 +84,7 @@ class Sweep:
     pixels1, rays1, samples1 : (R, C, 2), (R, C, 3), (R, C) samples of image 1 with their rays and brightness; NaN where
         there is none.
     costs : (R, C, K or more) bits of the census.
-    winners : (R, C) levels of the surface of least cost.
+    winners : (R, C) levels of the surface of least cost; seen : where image 2 sees it, and nothing before it.
     """
 
     inverse: FloatArray
@@ -87,6 +94,7 @@ class Sweep:
     samples1: NDArray[np.float32]
     costs: NDArray[np.uint8]
     winners: FloatArray
+    seen: BoolArray
 
     def nearest(self, pixels1: Pixels) -> tuple[IntArray, IntArray]:
         """Return row and column (...) of the samples nearest to pixels (..., 2) that have one below and one beside."""
@@ -107,6 +115,13 @@ class Sweep:
 
         `slope` (N,) is by how many px along the epipolar line a place moves with the inverse range, `support` (N,) the
         share of the nodes around that lie in the plane. Where the sweep cannot tell, another is taken for as good.
+        """
+        return np.asarray(self.of_rivals(pixels1, plane, slope) < MAX_OF_RIVAL * support)
+
+    def of_rivals(self, pixels1: Pixels, plane: FloatArray, slope: FloatArray) -> FloatArray:
+        """Return the costs (N,) of planes over those of any other of the same slant; arguments as of `distinct`.
+
+        Infinite for planes away from the sweep's own surface; 1 where the sweep cannot tell.
 
         Notes
         -----
@@ -124,18 +139,19 @@ class Sweep:
         # The census tells no surfaces apart that are less than a sample apart.
         apart = np.maximum(self.step_px / (slope * spacing), 1.0)
         surfaces = np.stack([level, below - level, right - level, apart], axis=1)
+        out, beside = np.full(len(plane), np.inf), self.beside_winner(level, at, slope)
         own, other = swept_rivals(
             self.costs,
             len(self.inverse),
             self.samples1,
-            np.stack(at, axis=1),
-            surfaces,
+            np.stack(at, axis=1)[beside],
+            surfaces[beside],
             radius=RIVAL_RADIUS,
             alike=ALIKE_LEVELS,
         ).T
         with np.errstate(divide="ignore", invalid="ignore"):
-            of_rival = np.nan_to_num(own / other, nan=1.0)
-        return np.asarray((of_rival < MAX_OF_RIVAL * support) & self.beside_winner(level, at, slope))
+            out[beside] = np.nan_to_num(own / other, nan=1.0)
+        return out
 
 
 class FilledPairs(NamedTuple):
@@ -161,13 +177,13 @@ def filled(
         sweep.costs, len(sweep.inverse), sweep.samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
     )
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
-    sweep = replace(sweep, winners=level)
-    good &= (_at(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST) & (_at(_lit(view1), sweep.pixels1) == 1.0)
+    sweep = replace(sweep, winners=level, seen=good)
+    good = good & (_at(_contrast(view1), sweep.pixels1) > MIN_SWEPT_CONTRAST) & (_at(_lit(view1), sweep.pixels1) == 1.0)
     spacing = sweep.inverse[1] - sweep.inverse[0]
     at_nodes = (measured.z[..., 0] - sweep.inverse[0]) / spacing
     of_grown = np.full(level.shape, np.nan)
     of_grown[::SAMPLES_A_NODE, ::SAMPLES_A_NODE] = at_nodes
-    good = _believed(level, good, of_grown)
+    good = _believed(sweep, good, of_grown)
     off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
     misfit = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
     if not misfit < MAX_MISFIT_LEVELS:
@@ -185,8 +201,8 @@ def _swept(
     low, high = np.nanquantile(inverse, [0.001, 0.999])
     pixel = 1.0 / float(np.nanquantile(measured.slope, 0.9))
     # A wall that faces the camera is all at one range.
-    margin = max(MARGIN_OF_RANGES * (high - low), 2.0 * pixel)
-    low, high = max(low - margin, 0.0), high + margin
+    farther, nearer = (max(share * (high - low), 2.0 * pixel) for share in (FARTHER, NEARER))
+    low, high = max(low - farther, 0.0), high + nearer
     count = int(np.clip(np.ceil((high - low) / pixel) + 1, 3, MAX_SWEEP_LEVELS))
     levels = np.linspace(low, high, count)
     step = grown.step / SAMPLES_A_NODE
@@ -208,6 +224,7 @@ def _swept(
         samples1=samples1,
         costs=swept_costs(_smooth(view2, step), samples1, table, TABLE_SPACING),
         winners=np.full(shape, np.nan),
+        seen=np.zeros(shape, dtype=bool),
     )
 
 
@@ -268,14 +285,16 @@ def _winners(
     return level, good
 
 
-def _believed(level: FloatArray, good: BoolArray, grown: FloatArray) -> BoolArray:
-    """Return which samples (R, C) are on surfaces that are large enough to be no chance.
+def _believed(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
+    """Return which `good` samples (R, C) are on surfaces that are no chance.
 
-    A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches.
+    A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches. One
+    that no patch agrees with, as beside many edges of depth, is to be large, or cheap beside itself at other ranges.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    level = sweep.winners
     number = np.arange(level.size).reshape(level.shape)
     links = []
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
@@ -286,8 +305,33 @@ def _believed(level: FloatArray, good: BoolArray, grown: FloatArray) -> BoolArra
     _, label = connected_components(graph, directed=False)
     with np.errstate(invalid="ignore"):
         agrees = good & (np.abs(level - grown) <= 1.0)
-    least = np.where(np.bincount(label, weights=agrees.ravel()) > 0.0, SMALLEST, SMALLEST_UNSEEN)
-    return np.asarray(good & (np.bincount(label) >= least)[label].reshape(level.shape))
+    size, agreed = np.bincount(label), np.bincount(label, weights=agrees.ravel()) > 0.0
+    believed = size >= SMALLEST
+    alone = np.flatnonzero((believed & ~agreed & (size < LARGE))[label])
+    believed &= agreed | (size >= LARGE) | (_of_shifted(sweep, alone, label[alone], len(size)) < MAX_OF_SHIFTED)
+    return np.asarray(good & believed[label].reshape(level.shape))
+
+
+def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) -> FloatArray:
+    """Return the costs of surfaces over the least that they have at other ranges, (count,); NaN of those not asked for.
+
+    `samples` (M,) are theirs, `label` (M,) says of which. Ranges at which half of one is beyond the sweep do not count.
+    """
+    levels = len(sweep.inverse)
+    at = np.rint(sweep.winners.ravel()[samples]).astype(np.int64)
+    costs = sweep.costs.reshape(-1, sweep.costs.shape[-1])[samples]
+    size = np.bincount(label, minlength=count)
+
+    def mean(shift: int) -> FloatArray:
+        inside = (at + shift >= 0) & (at + shift < levels)
+        of = label[inside]
+        known = np.bincount(of, minlength=count)
+        total = np.bincount(of, weights=costs[inside, at[inside] + shift], minlength=count)
+        return np.where(2 * known > size, total / np.maximum(known, 1), np.inf)
+
+    others = [shift for shift in range(-levels, levels) if abs(shift) >= SHIFTED_LEVELS]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(mean(0) / np.min([mean(shift) for shift in others], axis=0), np.float64)
 
 
 def _foremost(
@@ -313,17 +357,38 @@ def _with(
 ) -> GrownPatches:
     """Return the pairs, at nodes without one with those of the inverse ranges (R, C; NaN: unknown) instead."""
     at = np.isfinite(inverse) & (inverse > 0.0) & ~grown.valid
-    pixels1 = view1.nodes(grown.step)[at]
+    # The surface that faces the camera.
+    z = np.pad(inverse[at][:, None], ((0, 0), (0, 2)))
+    return with_pairs(grown, at, z, np.full(len(z), sigma), view1, view2, cam2_from_cam1)
+
+
+def with_pairs(
+    grown: GrownPatches,
+    at: BoolArray,
+    z: FloatArray,
+    sigma: FloatArray,
+    view1: GrowingView,
+    view2: GrowingView,
+    cam2_from_cam1: Rigid3,
+) -> GrownPatches:
+    """Return the pairs, at the nodes `at` (R, C) with those of N inverse ranges and their gradients z (N, 3) instead.
+
+    `sigma` (N,) is of the inverse ranges. No pair is where image 2 does not see the surface.
+    """
+    pixels1, inverse = view1.nodes(grown.step)[at], z[:, 0]
     rays, _ = view1.camera.unproject(pixels1)
-    points = rays / inverse[at][:, None]
+    points = rays / inverse[:, None]
     pixels2, seen = view2.camera.project(cam2_from_cam1.apply(points))
     rays2, seen2 = view2.camera.unproject(pixels2)
     B1, B2 = view1.camera.ray_jacobian(pixels1), view2.camera.ray_jacobian(pixels2)
     J1, J2 = pair_projection_jacobians(points, rays, B1, rays2, B2, cam2_from_cam1)
-    # The surface that faces the camera.
-    A21, by_range, _ = linear_gauge(J1, J2)
-    sigma_px = sigma * np.linalg.norm(by_range, axis=1) / inverse[at] ** 2
+    G, by_range, _ = linear_gauge(J1, J2)
+    by_inverse = by_range / (inverse**2)[:, None]
+    A21 = G - by_inverse[:, :, None] * z[:, None, 1:]
+    sigma_px = sigma * np.linalg.norm(by_inverse, axis=1)
     good = seen & seen2 & np.isfinite(A21).all(axis=(1, 2))
+    grown = grown.where(~at)
+    at = at.copy()
     at[at] = good
     out = {name: getattr(grown, name).copy() for name in ("pixels1", "pixels2", "A21", "correlation", "coarser")}
     new = {"pixels1": pixels1[good], "pixels2": pixels2[good], "A21": A21[good], "correlation": 0.0, "coarser": 0.0}
