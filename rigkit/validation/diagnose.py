@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -33,6 +33,7 @@ UNITS = {"m": 1000.0, "cm": 10.0, "inches": 25.4}
 UNIT_RATIO = 0.05
 """A length that is off by the factor of a unit, to five percent, was written in that unit."""
 MIN_CORNERS_TO_DIAGNOSE = 12
+MEASURE_SIDES, OR_ASPECT = "measure square_x_mm and square_y_mm", ", or look at the calibration's aspect"
 
 
 def camera_fit(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> float:
@@ -100,11 +101,29 @@ def diagnose_cameras(
                 f"'{name}' ({fit[name]:.2f} px): the calibration of another lens?"
             )
         elif fit[name] > MISFIT_PX:
+            aspect, left = _best_stretch(cameras[name], detections[number - 1], boards)
+            cause = "; was the lens changed or refocused since?"
+            if left * CLEARLY_BETTER < fit[name]:
+                cause = f", {left:.2f} px with squares {_stretch(aspect)}; {MEASURE_SIDES}{OR_ASPECT}"
             out.append(
                 f"pair '{pair_id}': image {number} does not fit the calibration of '{name}': the boards' own shapes "
-                f"leave {fit[name]:.2f} px; was the lens changed or refocused since?"
+                f"leave {fit[name]:.2f} px{cause}"
             )
     return tuple(out)
+
+
+def _best_stretch(camera: Camera, detections: Sequence[BoardDetection], boards: Sequence[Board]) -> tuple[float, float]:
+    """Return which width over height, against what is declared, squares of all boards have best, and the misfit then,
+    px."""
+    # Imported here: only where an image does not fit.
+    from scipy.optimize import minimize_scalar
+
+    def misfit(log_aspect: float) -> float:
+        narrower = float(np.exp(-log_aspect))
+        return camera_fit(camera, detections, [replace(b, square_y_mm=b.square_y_mm * narrower) for b in boards])
+
+    found = minimize_scalar(misfit, bounds=(-NO_BOARD, NO_BOARD), method="bounded", options={"xatol": 1e-4})
+    return float(np.exp(found.x)), float(found.fun)
 
 
 def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
@@ -208,9 +227,7 @@ def _diagnose_boards(reports: Sequence[ValidationReport]) -> list[str]:
     ]
     aspects = [squares.aspect for squares in found.values() if squares.stretched]
     all_alike = len(aspects) == len(found) and np.ptp(aspects) < ODD_BOARD
-    measure_sides = "measure square_x_mm and square_y_mm" + (
-        ", or look at the calibration's aspect" if all_alike else ""
-    )
+    measure_sides = f"{MEASURE_SIDES}{OR_ASPECT}" if all_alike else MEASURE_SIDES
     if all_alike and len(found) > 1:
         names = ", ".join(f"'{name}'" for name in found)
         words = f"boards {names}: their squares come out {_stretch(float(np.median(aspects)))}"

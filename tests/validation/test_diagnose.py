@@ -205,6 +205,22 @@ def test_the_other_lens_is_named(rng: np.random.Generator, true: str) -> None:
     assert "does not fit the calibration" in alone[0]
 
 
+@pytest.mark.parametrize("stretch", [1.04, 0.96])
+def test_stretched_boards_are_named_before_a_changed_lens(rng: np.random.Generator, stretch: float) -> None:
+    one, two = detected(rng, CAMERAS["regular"])
+    declared = [replace(board, square_y_mm=board.square_y_mm / stretch) for board in BOARDS]
+    found = diagnose_cameras("p", ("regular", "regular"), (one, two), declared, {"regular": CAMERAS["regular"]})
+    assert len(found) == 2
+    off = max(stretch, 1.0 / stretch) - 1.0
+    for words in found:
+        assert f"squares {100.0 * off:.1f} % {'higher than wide' if stretch > 1.0 else 'wider than high'}" in words
+        assert "refocused" not in words
+    # A lens that was zoomed in is no board.
+    zoomed = [replace(d, pixels=d.pixels * 1.2) for d in one]
+    (words,) = diagnose_cameras("p", ("regular", "regular"), (zoomed, two), BOARDS, {"regular": CAMERAS["regular"]})
+    assert "refocused" in words
+
+
 def test_swapped_images_or_cameras_are_named(rng: np.random.Generator) -> None:
     one, two = detected(rng, CAMERAS["regular"])[0], detected(rng, CAMERAS["fisheye"])[1]
     assert diagnose_cameras("p", ("regular", "fisheye"), (one, two), BOARDS, CAMERAS) == ()
