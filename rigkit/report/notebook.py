@@ -14,6 +14,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Finding, Severity, gravest_first, worst
+from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.reconstruct import Reconstruction
@@ -42,7 +43,8 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
     words = (
         f"Reconstruction of '{result.pair_id}', {result.pose_type}, {result.affine_method}: {len(result.cloud)} "
-        f"points, {len(result.boards)} boards, baseline {baseline} mm, Sampson rms {result.sampson_rms_px:.3f} px"
+        f"points, {counted(len(result.boards), 'board')}, baseline {baseline} mm, Sampson rms "
+        f"{result.sampson_rms_px:.3f} px"
     )
     return _shown(words, (), scene_of(result))
 

@@ -9,6 +9,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.findings import Severity
+from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.page import PairSection
@@ -96,7 +97,7 @@ def pair_section(
     """
     shown = next(r for r in reports if r.affine_method == reconstruction.affine_method)
     lead = (
-        f"{shown.pose_type} motion, {shown.count} points, {len(shown.boards)} boards; "
+        f"{shown.pose_type} motion, {shown.count} points, {counted(len(shown.boards), 'board')}; "
         f"shown: {shown.affine_method}; baseline "
         f"{measured_words(shown.baseline_mm, shown.baseline_sigma_mm, 2)} mm; "
         f"Sampson rms {shown.sampson_rms_px:.3f} px"
