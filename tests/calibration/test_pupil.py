@@ -13,6 +13,7 @@ from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.judging.changing import changing
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
 from rigkit.calibration.judging.verdicts import judge
+from rigkit.calibration.judging.view_evidence import view_evidence
 from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
@@ -232,3 +233,18 @@ def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
     assert len(central.dropped) == 2 and central.pupil is None
     assert not moving.dropped and len(moving.views) == len(views)
     assert moving.pupil is not None and moving.rms_px < 1.5 * np.sqrt(2.0) * NOISE_PX
+
+
+def test_it_does_not_matter_of_how_many_corners_rows_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = session(NEAR, MM_PER_RAD2, 0)
+
+    def told() -> FloatArray:
+        pupil, evidence = MovingPupil.of(found), view_evidence(found)
+        assert pupil is not None
+        assert evidence is not None
+        return np.array([pupil.mm_per_rad2, pupil.sigma_mm_per_rad2, evidence.total, *evidence.along.ravel()])
+
+    whole = told()
+    # Two of the views, of 54 corners each, at once.
+    monkeypatch.setattr("rigkit.calibration.judging.view_evidence.CORNERS_AT_ONCE", 120)
+    np.testing.assert_array_equal(told(), whole)

@@ -18,6 +18,7 @@ moving entrance pupil (the E terms of CAHVORE).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,11 +32,12 @@ from rigkit.calibration.judging.view_evidence import (
     MIN_TELLING_VIEWS,
     columns_of,
     points_of,
+    products_of,
     rows_of,
     without_pose,
 )
 from rigkit.calibration.neighbours import neighbour_correlation
-from rigkit.calibration.result import Calibration
+from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
@@ -133,9 +135,18 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | No
     views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
     if len(views) < MIN_TELLING_VIEWS:
         return None
+    products = products_of(views, lambda some: _rows(calibration, some))
+    if not np.isfinite(products).all():
+        return None
+    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
+    image = np.unique([view.image for view in views], return_inverse=True)[1]
+    return without_pose(products, length)[:, 6:, 6:], image, calibration.camera.parameters.size
+
+
+def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
+    """Return the rows (2, K, N) of `_products`, those of the pose first, and how many corners each view has."""
     rows, count = rows_of(calibration, views)
     p, bows = calibration.camera.parameters.size, columns_of(rows.shape[1])["bend"]
-    corners = np.concatenate([view.pixels[view.kept] for view in views])
     poses = [view.cam_from_board for view in views]
     points = np.split(points_of(calibration, views), np.cumsum(count)[:-1])
     x, y, z = np.concatenate(
@@ -143,15 +154,9 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | No
     ).T
     # Boards that come nearer by as much as the pupil moves forward: the third of the rows of a pose's shift.
     pupil = -(np.arctan2(np.hypot(x, y), z) ** 2) * rows[:, 5]
-    moved = displacements(corners, calibration.camera.size_px)
-    rows = np.concatenate([rows[:, : 6 + p], moved, rows[:, bows], pupil[:, None], rows[:, -1:]], axis=1)
-    if not np.isfinite(rows).all():
-        return None
-    each = np.split(rows, np.cumsum(count)[:-1], axis=-1)
-    products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
-    length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
-    image = np.unique([view.image for view in views], return_inverse=True)[1]
-    return without_pose(products, length)[:, 6:, 6:], image, p
+    moved = displacements(np.concatenate([view.pixels[view.kept] for view in views]), calibration.camera.size_px)
+    parts = [rows[:, : 6 + p], moved, rows[:, bows], pupil[:, None], rows[:, -1:]]
+    return np.concatenate(parts, axis=1), count
 
 
 def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:

@@ -5,7 +5,7 @@ At first order, after each image's own pose, and with all that the images have i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ from rigkit.core.arrays import FloatArray, IntArray, Points
 MIN_TELLING_CORNERS = 20
 """A view with fewer corners says too little of its own after its pose."""
 MIN_TELLING_VIEWS = 6
+CORNERS_AT_ONCE = 20_000
+"""Of which rows are held: 1.6 kB each, in `judging.pupil` as many again."""
 MIN_OWN_PART = 1e-6
 """A kind of change that the pose, or the kinds before, follow but for this part of it is none of its own."""
 MIN_COMMON_PART = 1e-6
@@ -131,14 +133,13 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         telling = [k for k in telling if images[k] == first[int(clusters[k])]]
     if len(telling) < MIN_TELLING_VIEWS:
         return None
-    rows, count = rows_of(calibration, [calibration.views[k] for k in telling])
+    products = products_of([calibration.views[k] for k in telling], lambda views: rows_of(calibration, views))
     # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
-    told = np.logical_and.reduceat(np.isfinite(rows).all(axis=(0, 1)), np.cumsum(count) - count)
+    told = np.isfinite(products).all(axis=(1, 2))
     if np.count_nonzero(told) < MIN_TELLING_VIEWS:
         return None
-    stops = np.cumsum(count)
-    each = [rows[..., stop - n : stop] for n, stop in zip(count[told], stops[told], strict=True)]
-    products = np.array([part[0] @ part[0].T + part[1] @ part[1].T for part in each])
+    products = products[told]
+    count = np.array([np.count_nonzero(calibration.views[k].kept) for k in telling])
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
     own = without_pose(products, length)
     residual = -1
@@ -161,6 +162,21 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         total=total,
         freedom=sum(2 * n - 6 for n in count[told].tolist()) - len(step),
     )
+
+
+def products_of(
+    views: Sequence[ViewResult], rows_of_some: Callable[[Sequence[ViewResult]], tuple[FloatArray, IntArray]]
+) -> FloatArray:
+    """Return of every view the products (V, K, K) of its rows, those of u and of v summed; `rows_of_some` returns the
+    rows (2, K, N) of some of the views and how many corners each has. Rows of all views at once are never held."""
+    corners = np.cumsum([np.count_nonzero(view.kept) for view in views])
+    batch = (corners - 1) // CORNERS_AT_ONCE
+    out = []
+    for own in np.split(np.arange(len(views)), np.flatnonzero(np.diff(batch)) + 1):
+        rows, count = rows_of_some([views[k] for k in own])
+        with np.errstate(invalid="ignore"):
+            out += [u @ u.T + v @ v.T for u, v in np.split(rows, np.cumsum(count)[:-1], axis=-1)]
+    return np.array(out)
 
 
 def columns_of(count: int) -> dict[str, slice]:
