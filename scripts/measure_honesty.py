@@ -7,7 +7,7 @@ pairs are reconstructed. Each angle, baseline and normal is then held against th
 and 95 % of them should lie within one and two.
 
     python scripts/measure_honesty.py [--labs 0:20] [--json FILE] [--model MODEL] [--views 14]
-    python scripts/measure_honesty.py --sessions 20 [--images 3,4,5,7,10,20]
+    python scripts/measure_honesty.py --sessions 20 [--moving] [--images 3,4,5,7,10,20]
 
 One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not made again: run it in pieces, the
 table is of all. --sessions has no images: simulated corners of sessions from three images on, so many of a kind.
@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from honesty.moving import moving_sessions
 from honesty.sessions import IMAGES, sessions
 
 from rigkit.calibration.calibrate import calibrate
@@ -209,13 +210,16 @@ def table(rows: list[tuple[str, str, str, float]]) -> str:
     return "\n".join(lines)
 
 
-def print_sessions(seeds: int, images: list[int]) -> None:
+def print_sessions(seeds: int, images: list[int], moving: bool) -> None:
     """Print how many errors of small sessions lie within one and two stated sigmas."""
-    print("| images | boards seen | quantity | count | within 1 sigma | within 2 |\n|--:|:--|:--|--:|--:|--:|")
+    print(
+        "| images | boards seen | quantity | count | within 1 sigma | within 2 | rms |\n|--:|:--|:--|--:|--:|--:|--:|"
+    )
     for count in images:
-        for (what, seen), errors in sessions(count, seeds).items():
+        for (what, seen), errors in (moving_sessions if moving else sessions)(count, seeds).items():
             shares = " | ".join(f"{100 * np.mean(errors < k):.0f} %" for k in (1, 2))
-            print(f"| {count} | {seen} | {what} | {len(errors)} | {shares} |", flush=True)
+            rms = np.sqrt(np.mean(errors**2))
+            print(f"| {count} | {seen} | {what} | {len(errors)} | {shares} | {rms:.2f} |", flush=True)
 
 
 def main() -> None:
@@ -225,10 +229,11 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=14, help="images of the board that a lens is calibrated from")
     parser.add_argument("--json", type=Path, help="results so far; new laboratories are added")
     parser.add_argument("--sessions", type=int, metavar="SEEDS", help="instead, small simulated sessions")
+    parser.add_argument("--moving", action="store_true", help="of boards that move before cameras without a trigger")
     parser.add_argument("--images", default=",".join(map(str, IMAGES)), help="of these sessions")
     args = parser.parse_args()
     if args.sessions:
-        print_sessions(args.sessions, [int(n) for n in args.images.split(",")])
+        print_sessions(args.sessions, [int(n) for n in args.images.split(",")], args.moving)
         return
     known = json.loads(args.json.read_text()) if args.json and args.json.is_file() else {}
     for seed in range(*map(int, args.labs.split(":"))):

@@ -44,6 +44,10 @@ NULL_DRAWS = 4000
 """Draws of a null distribution: a chance is then known to 0.002 near 0.01."""
 QUOTED = 2.0
 """So many quoted standard deviations hold what as many of a normal distribution do: 95.4 %."""
+SERIAL_LAGS, SERIAL_POWER = 4.0, 2.0 / 9.0
+"""Among N clusters in order up to 4 (N / 100)^(2/9) neighbours are looked at (Newey and West)."""
+SERIAL_SIGMAS = 3.0
+"""Neighbours agree where their products exceed those of an order by chance by so many standard deviations."""
 LARGE_FREEDOM = 1e6
 """As good as infinite, which the F distribution does not take."""
 RANK = 1e-12
@@ -104,7 +108,13 @@ def reduced_by_cluster(
 
 
 def clustered_covariance(
-    unit: FloatArray, information: FloatArray, score: FloatArray, prior: FloatArray, sigma_px: float
+    unit: FloatArray,
+    information: FloatArray,
+    score: FloatArray,
+    prior: FloatArray,
+    sigma_px: float,
+    *,
+    in_order: bool = False,
 ) -> Clustered:
     """Return the covariance of n shared unknowns from N clusters.
 
@@ -115,6 +125,7 @@ def clustered_covariance(
         many, mostly their priors hold them, and what they add to `unit` is scaled as a whole.
     prior : (n, n) information of the priors.
     sigma_px : standard deviation of a corner, from all residuals.
+    in_order : whether the clusters follow each other in time, so that neighbours may err alike.
     """
     if len(score) < MIN_CLUSTERS or not sigma_px > 0.0:
         return Clustered(unit * sigma_px**2, 1.0, float("inf"))
@@ -130,7 +141,9 @@ def clustered_covariance(
     # Images of much leverage count for several.
     share = np.einsum("vii->v", leverage)
     freedom = max(float(share.sum() ** 2 / (share**2).sum()) - 1.0, 1.0)
-    found = _shrunk(pull.T @ pull, expected, freedom)
+    moments, alike = _serial_moments(pull) if in_order else (pull.T @ pull, 1.0)
+    freedom = max((freedom + 1.0) / alike - 1.0, 1.0)
+    found = _shrunk(moments, expected, freedom)
     factor = float(np.trace(found) / np.trace(expected))
     covariance = root @ (found + np.eye(len(found)) - expected) @ root.T
     covariance += factor * (unit - root @ root.T)
@@ -158,6 +171,32 @@ def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
         along = np.swapaxes(axes, -1, -2) @ pull[~small, :, None]
         out[~small] = (axes @ (along / np.sqrt(np.maximum(left, MIN_LEFT))[..., None]))[..., 0]
     return out
+
+
+def _serial_moments(pull: FloatArray) -> tuple[FloatArray, float]:
+    """Return the second moments of the sum of pulls z (N, n) in order, and by how much more that is than the sum of
+    theirs: 1 unless neighbours agree by more than chance.
+
+    A board that moves before cameras without a common trigger moves the same way for a while, and the frames then err
+    alike. Newey and West's weights, which fall with the distance, leave no negative variance.
+    """
+    count, own = len(pull), pull.T @ pull
+    lags = min(int(SERIAL_LAGS * (count / 100.0) ** SERIAL_POWER), count - 2)
+    if lags < 1:
+        return own, 1.0
+    weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
+    products = sum(w * (pull[:-k].T @ pull[k:]) for k, w in enumerate(weights, 1))
+    # Of an order by chance: the pairs z_i . z_j are any of all.
+    squares = (pull**2).sum(axis=1)
+    pairs = count * (count - 1.0)
+    mean = (float((pull.sum(axis=0) ** 2).sum()) - float(squares.sum())) / pairs
+    variance = (float((own**2).sum()) - float((squares**2).sum())) / pairs - mean**2
+    number = count - np.arange(1, lags + 1)
+    sigma = np.sqrt(max(variance, 0.0) * float((weights**2 * number).sum()))
+    if float(np.trace(products)) - mean * float((weights * number).sum()) <= SERIAL_SIGMAS * sigma:
+        return own, 1.0
+    moments = own + products + products.T
+    return moments, float(np.trace(moments) / np.trace(own))
 
 
 def _shrunk(moments: FloatArray, expected: FloatArray, freedom: float) -> FloatArray:

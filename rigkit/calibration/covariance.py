@@ -57,15 +57,23 @@ class GlobalCovariance:
 
     @classmethod
     def of(
-        cls, normal: NormalEquations, products: FloatArray, prior: FloatArray, cluster: IntArray, sigma_px: float
+        cls,
+        normal: NormalEquations,
+        products: FloatArray,
+        prior: FloatArray,
+        cluster: IntArray,
+        sigma_px: float,
+        *,
+        in_order: bool = False,
     ) -> GlobalCovariance:
         """Return it from the `products` (F, n + 7, n + 7) of every pose, as `reduced_by_cluster` has them, the
         information (n, n) of the priors, the number of the cluster of every pose, (F,), and the standard deviation of a
-        corner from all residuals."""
+        corner from all residuals; `in_order` as for `clustered_covariance`."""
         unit, _, own = normal.covariance
         n = len(prior)
         information, score = reduced_by_cluster(products, n, cluster, own)
-        return cls(normal, sigma_px, clustered_covariance(unit[:n, :n], information, score, prior, sigma_px))
+        clustered = clustered_covariance(unit[:n, :n], information, score, prior, sigma_px, in_order=in_order)
+        return cls(normal, sigma_px, clustered)
 
     @property
     def covariance(self) -> FloatArray:

@@ -18,6 +18,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
+from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 
 RUNS, VIEWS = 40, 15
@@ -149,3 +150,29 @@ def test_little_leverage_has_the_covariance_of_all_eigenvalues(
     assert by_series.overdispersion == pytest.approx(by_eigenvalues.overdispersion, rel=1e-10)
     scale = np.abs(by_eigenvalues.covariance).max()
     assert by_series.covariance == pytest.approx(by_eigenvalues.covariance, abs=1e-10 * scale)
+
+
+def in_order(alike: float, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return the errors (count, 2) of frames, each `alike` the one before to this part."""
+    errors = rng.normal(size=(count, 2))
+    for k in range(1, count):
+        errors[k] = alike * errors[k - 1] + np.sqrt(1.0 - alike**2) * errors[k]
+    return errors
+
+
+@pytest.mark.parametrize(("alike", "low", "high"), [(0.0, 0.9, 1.1), (0.6, 1.35, 2.0)])
+def test_frames_that_err_like_their_neighbours_count_for_fewer(alike: float, low: float, high: float) -> None:
+    """The mean of frames scatters by 1 and by 2 (first order: sqrt((1 + .6) / (1 - .6))) times 1 / sqrt(N)."""
+    rng, count = np.random.default_rng(5), 60
+    information = np.tile(np.eye(2), (count, 1, 1))
+    unit, stated, freedom = np.eye(2) / count, [], []
+    for _ in range(40):
+        score = in_order(alike, count, rng)
+        own = clustered_covariance(unit, information, score - score.mean(axis=0), np.zeros((2, 2)), 1.0, in_order=True)
+        stated.append(np.trace(own.covariance) * count / 2.0)
+        freedom.append(own.freedom)
+    assert low < np.sqrt(np.mean(stated)) < high
+    # Which frames are neighbours tells nothing where nobody says that they are in order.
+    own = clustered_covariance(unit, information, score - score.mean(axis=0), np.zeros((2, 2)), 1.0)
+    assert own.freedom == pytest.approx(count - 1.0)
+    assert (np.median(freedom) < 0.7 * own.freedom) == (alike > 0.0)

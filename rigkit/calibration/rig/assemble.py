@@ -16,6 +16,7 @@ from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
 from rigkit.calibration.rig.joint import JointRig
+from rigkit.calibration.rig.lags import lag_error
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.pose_jacobians import pose_jacobians, pose_products
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
@@ -40,11 +41,15 @@ def assemble_rig(
     observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
     layout = state.layout(observations)
     sigma = residual_sigma(joint)
-    known = _global_covariance(joint, sigma)
+    prior = _prior(joint, sigma)
+    known = _global_covariance(joint, prior, sigma)
     overdispersion = known.clustered.overdispersion
     beside = _error_of_held(joint, layout, normal.covariance[0])
-    off = shape_error(observations, state, sigma * overdispersion)
-    beside[: len(off), : len(off)] += np.outer(off, off)
+    for off in (
+        shape_error(observations, state, sigma * overdispersion),
+        lag_error(observations, state, normal.products, prior, sigma * overdispersion),
+    ):
+        beside[: len(off), : len(off)] += np.outer(off, off)
     covariance = known.covariance
     beside += between_rig_models(joint, np.sqrt(np.diag(covariance + beside)))
     covariance += beside
@@ -99,14 +104,19 @@ def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, told: IntAr
     return out
 
 
-def _global_covariance(joint: JointRig, sigma_px: float) -> GlobalCovariance:
+def _prior(joint: JointRig, sigma_px: float) -> FloatArray:
+    """Return the information (n, n) of the priors of the globals but for released corners, px^2."""
+    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
+    n = state.layout(observations).shape.start + observations.shape.basis.shape[-1]
+    nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
+    return with_rig_priors(nothing, observations, state, sigma_px).gg[:n, :n]
+
+
+def _global_covariance(joint: JointRig, prior: FloatArray, sigma_px: float) -> GlobalCovariance:
     """Return how sure the solution is, with the frames as what repeats."""
     observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
     products = pose_products(observations, state, normal.products)
-    n = products.shape[-1] - 7
-    nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
-    prior = with_rig_priors(nothing, observations, state, sigma_px).gg[:n, :n]
-    return GlobalCovariance.of(normal, products, prior, joint.frames, sigma_px)
+    return GlobalCovariance.of(normal, products, prior, joint.frames, sigma_px, in_order=True)
 
 
 def _cameras(

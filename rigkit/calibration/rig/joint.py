@@ -36,6 +36,7 @@ from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
+from rigkit.core.identifiers import natural_key
 from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
@@ -83,8 +84,8 @@ class JointRig:
 
     @cached_property
     def frames(self) -> IntArray:
-        """Number of the frame of every pose, (F,); frames in which all cameras see what they saw in an earlier one
-        have its number."""
+        """Number of the frame of every pose, (F,), in the natural order of their names; frames in which all cameras see
+        what they saw in an earlier one have its number."""
         frame = {entry.key: entry.frame for own in self.views.seen for entry in own.values()}
         names = [frame[key] for key in self.observations.keys]
         shown = [
@@ -92,7 +93,7 @@ class JointRig:
             for c, (own, of_views) in enumerate(zip(self.observations.cameras, self.observations.frame, strict=True))
             for view, f in zip(own.views, of_views.tolist(), strict=True)
         ]
-        frames, boards, pixels = zip(*sorted(shown, key=lambda of: of[0]), strict=True)
+        frames, boards, pixels = zip(*sorted(shown, key=lambda of: natural_key(of[0])), strict=True)
         number = dict(zip(frames, cluster_numbers(frames, boards, pixels).tolist(), strict=True))
         return np.array([number[name] for name in names], dtype=np.int64)
 

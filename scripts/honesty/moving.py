@@ -1,0 +1,89 @@
+"""Boards that move before cameras without a common trigger: how far off is the rig, in stated sigmas?
+
+Neighbouring frames err alike, as the board goes on the same way for a while: each camera lags by a time of its own, and
+by a little more in every frame.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from itertools import combinations
+
+import numpy as np
+
+from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.core.arrays import FloatArray
+from rigkit.core.detections import BoardView
+from rigkit.core.errors import RigkitError
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+
+from .sessions import BOARD, CORNERS_PX, MOUNT, SECOND_CENTRE, SIZE, lens
+
+FRAMES_PER_S = 6.0
+LAG_S, JITTER_S = 0.012, 0.003
+"""Up to how much a camera lags (either way), and what its frames scatter by."""
+PERIODS_S = (1.5, 6.0)
+"""Of the swings that a motion is made of."""
+SWINGS = 3
+MIDDLE, REACH = np.array([0.0, 0.0, 600.0, 0.0, 0.0, 0.0]), np.array([60.0, 45.0, 90.0, 0.3, 0.3, 0.6])
+"""Of a board's middle (mm) and of its turns (rad), and how far each swings."""
+BELOW = Rigid3(exp_so3(np.array([0.15, 0.02, -0.01])), [5.0, -110.0, 12.0])
+THIRD_CENTRE = np.array([815.0, 610.0])
+CAMERAS = {
+    "left": (lens("reg"), Rigid3.identity()),
+    "right": (lens("reg", SECOND_CENTRE), MOUNT),
+    "below": (lens("reg", THIRD_CENTRE), BELOW),
+}
+
+
+class Motion:
+    """A board's pose in the first camera as a function of time."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rate = 2.0 * np.pi / rng.uniform(*PERIODS_S, (SWINGS, 6))
+        self.phase = rng.uniform(0.0, 2.0 * np.pi, (SWINGS, 6))
+
+    def at(self, time_s: float) -> Rigid3:
+        place = MIDDLE + REACH * np.sin(self.rate * time_s + self.phase).sum(axis=0)
+        turn = exp_so3(place[3:])
+        return Rigid3(turn, place[:3] - turn @ BOARD.points().mean(axis=0))
+
+
+def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[str, list[float]]:
+    """Return the errors of the baselines of a rig of so many cameras, in stated sigmas."""
+    chosen = dict(list(CAMERAS.items())[:cameras])
+    motion, views = Motion(rng), dict[str, list[tuple[str, BoardView]]]()
+    lag = {name: rng.uniform(-LAG_S, LAG_S) for name in chosen}
+    for k in range(frames):
+        for name, (camera, mount) in chosen.items():
+            pose = motion.at(k / FRAMES_PER_S + lag[name] + JITTER_S * rng.normal())
+            pixels, valid = camera.project((mount @ pose).apply(BOARD.points()))
+            seen = valid & camera.on_image(pixels)
+            exact = pixels[seen] + CORNERS_PX * rng.normal(size=(int(seen.sum()), 2))
+            pixels = np.clip(exact, -0.5, np.array(SIZE) - 0.5)
+            view = BoardView(f"{name}{k}.png", BOARD, BOARD.grid()[seen], pixels, np.full(len(pixels), CORNERS_PX))
+            if len(pixels) >= BOARD.corner_count / 2:
+                views.setdefault(name, []).append((f"{k:03d}", view))
+    rig = calibrate_rig(views, dict.fromkeys(chosen, SIZE), model=lens("reg").model, folds=0)
+    off = []
+    for a, b in combinations(chosen, 2):
+        length, sigma = rig.baseline_mm(a, b)
+        between = chosen[b][1].inverse().translation_mm - chosen[a][1].inverse().translation_mm
+        off.append((length - float(np.linalg.norm(between))) / sigma)
+    return {"baselines": off}
+
+
+def moving_sessions(frames: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
+    """Return the errors in stated sigmas of rigs of two and three cameras with so many frames, by quantity."""
+    errors: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for cameras in (2, 3):
+        for seed in range(seeds):
+            try:
+                found = moving_session(frames, cameras, np.random.default_rng([seed, frames, cameras]))
+            except RigkitError as error:
+                print(f"{frames} frames, {cameras} cameras: {error}", flush=True)
+                continue
+            for what, own in found.items():
+                errors[what, f"by {cameras} cameras"] += own
+    return {key: np.abs(own) for key, own in errors.items()}
