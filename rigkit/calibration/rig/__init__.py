@@ -5,7 +5,7 @@
 - a start: `frames`
 - one least squares: `layout`, `state`, `carried` (how views follow from targets, mounts and places), `shape`, `known`,
   `solver`; what does not fit in it left out: `disagree`, `joint`
-- how sure that is: `heldout`, `flatness`, `between_models`, `displaced`, `uncertainty`
+- how sure that is: `heldout`, `flatness`, `lags`, `between_models`, `displaced`, `uncertainty`
 - what to think of it: `verdicts`
 - what comes out: `assemble`, `result`, `board_rig`
 
