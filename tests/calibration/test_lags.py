@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.lags import lag_error
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
@@ -44,15 +47,13 @@ def rig_of(lag: float, seed: int) -> RigCalibration:
 @pytest.fixture
 def moved(monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:
     """Return what `lag_error` has returned so far."""
-    from rigkit.calibration.rig import assemble
+    out = list[FloatArray]()
 
-    out, real = list[FloatArray](), assemble.lag_error
-
-    def recorded(*given: object) -> FloatArray:
-        out.append(real(*given))  # type: ignore[arg-type]
+    def recorded(*given: Any) -> FloatArray:
+        out.append(lag_error(*given))
         return out[-1]
 
-    monkeypatch.setattr(assemble, "lag_error", recorded)
+    monkeypatch.setattr("rigkit.calibration.rig.assemble.lag_error", recorded)
     return out
 
 

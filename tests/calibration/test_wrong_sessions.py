@@ -126,6 +126,10 @@ def test_repeated_frames(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 10, rng, reach_deg=33.0, noise_px=NOISE_PX)
     again = [replace(v, image=f"again {v.image}", pixels=v.pixels + 0.01 * rng.normal(size=(54, 2))) for v in views]
     assert "show the board where another one does" in first(calibrate([*views, *again], SIZE, model="brown"))
+    # One of eleven is told, and is nothing to distrust the others for.
+    alone = calibrate([*views, again[0]], SIZE, model="brown", board="flat")
+    assert "where another one does" not in first(alone)
+    assert any("shows the board where another one does" in str(verdict) for verdict in alone.verdicts)
     few = calibrate([*views[:4], *again[:4]], SIZE, model="brown", board="flat")
     assert "where another one does" in first(few)
     assert any("8 images show the boards at 4 different places only" in str(verdict) for verdict in few.verdicts)

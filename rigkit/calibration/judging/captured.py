@@ -78,12 +78,23 @@ def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
-        *_repeated(images, number),
+        *(_repeated(images, number) if _hardly_any(images, number) else []),
         *_too_few(images, number),
         *_tilts(calibration),
         *_parallel(calibration),
         *_distances(calibration),
     ]
+
+
+def few_repeated(calibration: Calibration, clusters: IntArray) -> list[Finding]:
+    """Return which images repeat others where enough are left: they count as one, and nothing is wrong with the rest."""
+    images, number = [view.image for view in calibration.views], clusters.tolist()
+    return [] if _hardly_any(images, number) else _repeated(images, number)
+
+
+def _hardly_any(images: Sequence[str], number: Sequence[int]) -> bool:
+    """Say whether few images are left, or no more than half, where those that repeat others count as these."""
+    return len(set(number)) < FEW_IMAGES or 2 * len(set(number)) <= len(set(images))
 
 
 def _axes(c: Calibration, axis: int) -> FloatArray:

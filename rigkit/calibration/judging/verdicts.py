@@ -18,6 +18,7 @@ from rigkit.calibration.judging.captured import (
     SMALL_PX,
     Extent,
     extrapolated,
+    few_repeated,
     judge_capture,
     same_way_up,
 )
@@ -48,7 +49,9 @@ UNLIKE = 3.5
 """One with more is so unlike the others that nobody knows how good these are. It does not tell whose image that is: in 15
 real captures images of the camera itself have up to 3.9 (bouguet's left08), one of another camera put among those of
 bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
-WHY_UNLIKE = "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
+WHY_UNLIKE = (
+    "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
+)
 RINGS = 4
 """What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
 MAX_OUTLIER_SHARE = 0.2
@@ -124,6 +127,7 @@ def judge(
     found = [
         *(finding for finding in also if finding.severity is not Severity.BAD),
         *_left_out(calibration.dropped, calibration.views),
+        *few_repeated(calibration, clusters),
         *_coverage(calibration),
     ]
     if not mixed:
