@@ -87,7 +87,7 @@ def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]
 
 
 def few_repeated(calibration: Calibration, clusters: IntArray) -> list[Finding]:
-    """Return which images repeat others where enough are left: they count as one, and nothing is wrong with the rest."""
+    """Return which images repeat others where enough are left: they count as one, and the rest is none the worse."""
     images, number = [view.image for view in calibration.views], clusters.tolist()
     return [] if _hardly_any(images, number) else _repeated(images, number)
 

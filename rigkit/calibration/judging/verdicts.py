@@ -46,9 +46,9 @@ CELL_CORNERS = 5
 MAX_RATIO_OF_MEDIANS = 2.5
 """A view whose median residual is this many times the usual one, there in the image."""
 UNLIKE = 3.5
-"""One with more is so unlike the others that nobody knows how good these are. It does not tell whose image that is: in 15
-real captures images of the camera itself have up to 3.9 (bouguet's left08), one of another camera put among those of
-bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
+"""One with more is so unlike the others that nobody knows how good these are. Whose image that is it does not tell: in
+15 real captures images of the camera itself have up to 3.9 (bouguet's left08), one of another camera put among those
+of bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
 WHY_UNLIKE = (
     "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
 )
