@@ -122,7 +122,7 @@ def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, mo
         guide.add(now)
         if k == 0:
             assert all(target is not None for target in guide.advise(empty).targets), "outlines in both images"
-    assert advice.enough and k >= 5 * (SHARED_FRAMES - 1)
+    assert advice.enough and k >= 5 * SHARED_FRAMES
     assert advice.mount_px is not None and advice.mount_px < 0.3
     assert advice.words.startswith("Enough: ")
     state = guide.state(now, advice)
