@@ -46,7 +46,7 @@ from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera, with_pupils
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.camera_files import camera_format, camera_text, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.next_pictures import length_goals
 from rigkit.workflows.provenance import digest_line, digest_of, software_facts
@@ -102,6 +102,11 @@ def check_pictures(
     exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
+    if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
+        raise InputError(
+            f"'{source}': another program's file does not say how sure it is, so that nobody can tell a change from its "
+            "own error; `rigkit calibrate` pictures of the time when it held, and check what that writes"
+        )
     watched, known = load_watched(source)
     warn_if_bad(source)
     frames = _frames(watched, [Path(image) for image in images])

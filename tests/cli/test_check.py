@@ -265,6 +265,15 @@ def test_what_is_refused(command: list[str], words: str, home: Path, capsys: pyt
     assert words in capsys.readouterr().err
 
 
+def test_another_program_says_not_how_sure_it_is(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = str(tmp_path / "camchain.yaml")
+    assert main(["export", str(home / "cam.json"), "-o", there, "--to", "kalibr"]) == 0
+    assert main(["check", there, str(home / "same")]) == 2
+    assert "pictures of the time when it held" in capsys.readouterr().err
+
+
 def test_folders_of_a_rig_are_its_cameras_by_their_names_or_in_its_order(tmp_path: Path) -> None:
     rig = cast(Watched, SimpleNamespace(cameras=(CAMERA, CAMERA), names=("left", "right")))
     folders = [tmp_path / name for name in ("right", "left", "day")]
