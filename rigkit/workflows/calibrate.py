@@ -31,12 +31,13 @@ from rigkit.workflows.inputs.corners import (
 from rigkit.workflows.inputs.folder_session import Known
 from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.interlaced import interlaced
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.provenance import made
 from rigkit.workflows.session_page import session_page
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CalibrateOptions:
+class CalibrateOptions(NamesFiles):
     """Where the results of a calibration go."""
 
     output: Path | None = None

@@ -28,12 +28,13 @@ from rigkit.workflows.inputs.frames import (
     timestamps_beside,
     with_frames,
 )
+from rigkit.workflows.inputs.paths import NamesFiles
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FolderOptions:
+class FolderOptions(NamesFiles):
     """What is needed besides the folders of images."""
 
     boards: tuple[str, ...] = ()

@@ -20,11 +20,12 @@ from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.inputs.camera_files import called_bad
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.provenance import digest_line, software_facts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CertifyOptions:
+class CertifyOptions(NamesFiles):
     """The limit that a certificate is compared with, and where to write it."""
 
     limit: float | None = None

@@ -41,6 +41,7 @@ from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_to_come
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_beside
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.next_pictures import length_goals
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
@@ -52,7 +53,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CoachOptions:
+class CoachOptions(NamesFiles):
     """Where the session goes, what is shown, and where frames come from."""
 
     folder: Path

@@ -30,6 +30,7 @@ from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.io.reading import about
 from rigkit.workflows.calibrate_rig import calibrate_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
@@ -41,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetOptions:
+class DatasetOptions(NamesFiles):
     """What every workflow on a data set takes."""
 
     pairs: tuple[str, ...] = ()

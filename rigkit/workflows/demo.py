@@ -18,13 +18,14 @@ from rigkit.io.reading import usable_path
 from rigkit.synthetic.demo import build_demo
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DemoOptions:
+class DemoOptions(NamesFiles):
     """Where the demo goes."""
 
     output: Path = Path("rigkit-demo")

@@ -32,10 +32,11 @@ from rigkit.report.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_video
 from rigkit.workflows.inputs.identify_board import explained, suggestion
+from rigkit.workflows.inputs.paths import NamesFiles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DetectOptions:
+class DetectOptions(NamesFiles):
     """What may be in the images, and where the results go."""
 
     boards: tuple[Path, ...] = ()

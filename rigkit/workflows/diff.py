@@ -17,12 +17,13 @@ from rigkit.io.reading import about
 from rigkit.io.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.report.figures import difference_png
 from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
+from rigkit.workflows.inputs.paths import NamesFiles
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DiffOptions:
+class DiffOptions(NamesFiles):
     """Where the map of the difference of two cameras goes."""
 
     output: Path | None = None

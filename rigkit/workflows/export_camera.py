@@ -22,6 +22,7 @@ from rigkit.io.reading import about
 from rigkit.io.rig_file import is_rig_file, load_saved_rig
 from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
+from rigkit.workflows.inputs.paths import NamesFiles
 
 RIG_ENDINGS = {"colmap": ".json"}
 """Where the file of a rig ends otherwise than that of a camera."""
@@ -30,7 +31,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExportCameraOptions:
+class ExportCameraOptions(NamesFiles):
     """The format of an exported camera, and where to write it."""
 
     output: Path

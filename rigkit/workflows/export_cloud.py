@@ -21,6 +21,7 @@ from rigkit.io.manifest import Dataset, load_dataset
 from rigkit.io.ply import ply_bytes, ply_unit, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
 from rigkit.workflows.results import write_results
 
@@ -28,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ExportCloudOptions:
+class ExportCloudOptions(NamesFiles):
     """Which cloud to export, in which format, and where to write it."""
 
     output: Path

@@ -32,6 +32,7 @@ from rigkit.io.robot_poses import read_robot_poses
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import explained
+from rigkit.workflows.inputs.paths import NamesFiles
 
 HAND_EYE_SCHEMA = "rigkit.hand_eye/1"
 POSE_NAMES = (("cam_from_hand", "base_from_board"), ("cam_from_base", "hand_from_board"))
@@ -41,7 +42,7 @@ PLANAR_AMBIGUITY = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HandEyeOptions:
+class HandEyeOptions(NamesFiles):
     """What is needed besides the images and the robot's poses."""
 
     camera: Path

@@ -12,13 +12,14 @@ from rigkit.io.files import ensure_writable, write_atomic
 from rigkit.io.ply import mesh_bytes, read_ply
 from rigkit.io.reading import about
 from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
+from rigkit.workflows.inputs.paths import NamesFiles
 
 MAX_OCTREE_DEPTH = 12
 """Each level more takes four times the memory: of this one, several GB."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeshOptions:
+class MeshOptions(NamesFiles):
     """How a cloud becomes a mesh."""
 
     output: Path

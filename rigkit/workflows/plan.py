@@ -33,6 +33,7 @@ from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, sess
 from rigkit.workflows.check import load_watched
 from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
 from rigkit.workflows.provenance import digest_line, software_facts
 
@@ -43,7 +44,7 @@ count like 15)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlanOptions:
+class PlanOptions(NamesFiles):
     """What is wanted, and where it goes."""
 
     count: int = NEXT_VIEWS

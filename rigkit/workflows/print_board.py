@@ -12,6 +12,7 @@ from rigkit.io.board_file import board_text, load_layout
 from rigkit.io.files import write_atomic, write_together
 from rigkit.io.reading import about
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
+from rigkit.workflows.inputs.paths import NamesFiles
 
 MAX_UNEVEN = 1.05
 """Ratio of the stretches along and across a sheet: printers are a per cent apart, misread rulers more."""
@@ -22,7 +23,7 @@ ENDINGS = (".pdf", ".svg", ".toml")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PrintOptions:
+class PrintOptions(NamesFiles):
     """Where a board to print goes."""
 
     output: Path

@@ -43,6 +43,7 @@ from rigkit.workflows.inputs.camera_files import (
     own_calibration,
     saved_rig,
 )
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.provenance import software_facts
 from rigkit.workflows.results import require_folder, write_results
 
@@ -56,7 +57,7 @@ Images: TypeAlias = tuple[NDArray[Any], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CloudOptions:
+class CloudOptions(NamesFiles):
     """Where a cloud goes, and how it is written."""
 
     output: Path | None = None

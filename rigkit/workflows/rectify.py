@@ -29,6 +29,7 @@ from rigkit.rectification.targets import target_camera
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_camera, import_pair
 from rigkit.workflows.inputs.folder_session import cameras_in
+from rigkit.workflows.inputs.paths import NamesFiles
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -54,7 +55,7 @@ EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".webp")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RectifyOptions:
+class RectifyOptions(NamesFiles):
     """The view, and where to write it. A stereo pair's baseline decides its view, all but the projection."""
 
     output: Path

@@ -29,13 +29,14 @@ from rigkit.report.study_page import cell_table, study_page, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
+from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.provenance import software_facts
 
 Errors = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StudyOptions:
+class StudyOptions(NamesFiles):
     """How to run studies, and where their tables and figures go."""
 
     output: Path | None = None
