@@ -43,11 +43,17 @@ class BoardInView:
     outline_px: Pixels
 
     def __str__(self) -> str:
-        far = f"{self.distance_mm / 10.0:.0f} cm" if self.distance_mm < 1500.0 else f"{self.distance_mm / 1000.0:.1f} m"
         tilt = (
             f"tilted {5.0 * round(self.tilt_deg / 5.0):.0f} degrees, {self.nearer} nearer" if self.nearer else "facing"
         )
-        return f"{self.place}, {far} away, {tilt}{', turned upright' if self.upright else ''}"
+        return f"{self.place}, {_length(self.distance_mm)} away, {tilt}{', turned upright' if self.upright else ''}"
+
+
+def _length(mm: float) -> str:
+    """Return a length as a person says it, to a few per cent; boards under a microscope are near."""
+    if mm < 50.0:
+        return f"{mm:.2g} mm"
+    return f"{mm / 10.0:.0f} cm" if mm < 1500.0 else f"{mm / 1000.0:.1f} m"
 
 
 def placement(camera: Camera, board: Board, cam_from_board: Rigid3) -> BoardInView:

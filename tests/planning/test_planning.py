@@ -167,6 +167,7 @@ def test_a_guessed_lens_sees_what_was_said(hfov: float, model: str) -> None:
         ((0.0, 0.0, 400.0), (30.0, 0.0, 0.0), "middle, 40 cm away, tilted 30 degrees, upper side nearer"),
         ((0.0, 0.0, 400.0), (-30.0, 0.0, 0.0), "middle, 40 cm away, tilted 30 degrees, lower side nearer"),
         ((0.0, 0.0, 400.0), (0.0, 0.0, 90.0), "middle, 40 cm away, facing, turned upright"),
+        ((0.0, 0.0, 4.4), (0.0, 0.0, 0.0), "middle, 4.4 mm away, facing"),
     ],
 )
 def test_words(at: tuple[float, ...], turn_deg: tuple[float, ...], words: str) -> None:
