@@ -41,6 +41,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")
         return run_scene(args)
     from rigkit.io.manifest import load_dataset
+    from rigkit.report.tables import measured_words
     from rigkit.workflows.reconstruct import ReconstructOptions, reconstruct_dataset
 
     dataset = load_dataset(args.dataset)
@@ -59,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
         for r in results:
             print(
                 f"{common['output'] / r['ply']}: {r['points']} points, {len(r['boards'])} boards, baseline "
-                f"{r['baseline_mm']:.3f} ± {r['baseline_sigma_mm']:.3f} mm, Sampson rms {r['sampson_rms_px']:.3f} px, "
-                f"{r['pose_type']}"
+                f"{measured_words(r['baseline_mm'], r['baseline_sigma_mm'], 3)} mm, "
+                f"Sampson rms {r['sampson_rms_px']:.3f} px, {r['pose_type']}"
             )
     return exit_code_of(done.failures, ExitCode.WELL)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigkit.cli import calibration_words
 from rigkit.core.findings import gravest_first
+from rigkit.core.printing import length_words
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
@@ -82,6 +83,7 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
     import numpy as np
 
     from rigkit.geometry.rotation import log_so3
+    from rigkit.report.tables import measured_words
 
     held = "held-out RMS not available" if rig.heldout_rms_px is None else f"held-out RMS {rig.heldout_rms_px:.4f} px"
     count = len(rig.cameras)
@@ -91,18 +93,18 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
     ]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         held = "not available" if alone.heldout_rms_px is None else f"{alone.heldout_rms_px:.4f} px"
-        x, y, z = camera.cam_from_rig.inverse().translation_mm
+        where = length_words(*camera.cam_from_rig.inverse().translation_mm.tolist(), decimals=2)
         turned = np.degrees(np.linalg.norm(log_so3(camera.cam_from_rig.rotation)))
         lines.append(
             f"{camera.name}: {camera.camera.model}, alone held-out RMS {held}, training RMS {alone.rms_px:.4f}; in the "
-            f"rig {camera.rms_px:.4f} px; at ({x:.2f}, {y:.2f}, {z:.2f}) mm, turned by {turned:.3f} deg"
+            f"rig {camera.rms_px:.4f} px; at ({where}) mm, turned by {turned:.3f} deg"
         )
-    lines += [f"baseline {a} to {b}: {value:.3f} +- {sigma:.3f} mm" for a, b, value, sigma in baselines(rig)]
+    lines += [f"baseline {a} to {b}: {measured_words(value, sigma, 3)} mm" for a, b, value, sigma in baselines(rig)]
     lines += [
         f"a point seen by {a} appears in {b} within {middle:.3f} px (one standard deviation; {worst:.3f} at worst)"
         for a, b, middle, worst in transfers(rig)
     ]
-    lines += [f"angle {a} to {b}: {value:.3f} +- {sigma:.3f} deg" for a, b, value, sigma in angles(rig)]
+    lines += [f"angle {a} to {b}: {measured_words(value, sigma, 3)} deg" for a, b, value, sigma in angles(rig)]
     for c in checks:
         verdict = "as measured" if c.passed else "NOT as measured"
         lines.append(

@@ -18,6 +18,8 @@ MAX_TOGETHER = 440
 """Letters of all values: under five lines of a hundred."""
 MAX_LISTED = 3
 """A collection of more is counted."""
+MAX_DECIMALS = 6
+"""Of a value with its sigma, and of lengths: nanometres."""
 
 
 def brief(self: Any) -> str:
@@ -57,6 +59,20 @@ def _value(value: Any) -> str:
 def digits(value: float) -> str:
     """Return a number with two digits that count, and no exponent where it is large: 520, 5.2, 0.052."""
     return f"{float(f'{value:.2g}'):.12g}"
+
+
+def length_words(*mm: float, decimals: int) -> str:
+    """Return lengths with so many decimals, or more (nanometres at most) where these would leave the largest fewer than
+    two digits that count: rigs under a microscope are small.
+
+    >>> length_words(99.934, -0.00412, decimals=2), length_words(0.00412, decimals=2), length_words(0.0, decimals=2)
+    ('99.93, -0.00', '0.0041', '0.00')
+    """
+    largest = max(map(abs, mm))
+    if largest > 10.0**-MAX_DECIMALS:
+        while decimals < MAX_DECIMALS and largest < 10.0 ** (1 - decimals):
+            decimals += 1
+    return ", ".join(f"{one:.{decimals}f}" for one in mm)
 
 
 def counted(count: int, noun: str) -> str:

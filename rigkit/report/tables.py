@@ -13,11 +13,9 @@ import numpy as np
 
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, without_nan
+from rigkit.core.printing import MAX_DECIMALS
 from rigkit.core.tables import Cell, Column, Table
 from rigkit.io.reading import is_number
-
-MAX_DECIMALS = 6
-"""Of a value with its sigma: nanometres."""
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the beginning of a formula."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from rigkit.calibration.compare import CameraVerdict
 from rigkit.calibration.rig.compare import RigDifference
+from rigkit.core.printing import length_words
 from rigkit.core.tables import Table, cells, columns
 from rigkit.io.files import write_atomic
 from rigkit.report.figures import difference_png
@@ -169,7 +170,7 @@ def _boards_in_words(pair: BoardsPair) -> list[str]:
 
 def _mounts_in_words(difference: RigDifference) -> list[str]:
     return [
-        f"{m.name}: sits {m.shift_mm:.3f} mm and {m.rotation_deg:.4f} deg from where it sat"
+        f"{m.name}: sits {length_words(m.shift_mm, decimals=3)} mm and {m.rotation_deg:.4f} deg from where it sat"
         + ("" if m.chance is None else f" (chance {m.chance:.3g})")
         for m in difference.mounts
     ]

@@ -16,7 +16,7 @@ import rigkit
 from rigkit.calibration.calibrate import calibrate
 from rigkit.cameras.compare import compare_cameras
 from rigkit.core.findings import Finding, Severity
-from rigkit.core.printing import brief, digits
+from rigkit.core.printing import brief, digits, length_words
 from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.metric import MetricPose
 from rigkit.relative_pose.refinement.refine import RefinedPose
@@ -98,6 +98,13 @@ def test_it_prints_in_a_few_lines(name: str) -> None:
 def test_values_are_shown_where_they_are_short() -> None:
     found = rigkit.BoardDetection("a", 3, 2, np.array([[0, 0], [1, 0]]), np.zeros((2, 2)), np.full(2, 0.1))
     assert repr(found) == "BoardDetection(board_id='a', columns=3, rows=2, grid=<2x2>, pixels=<2x2>, sigma_px=<2>)"
+
+
+def test_small_lengths_are_not_shown_as_nothing() -> None:
+    """Of a rig under a microscope; what is nothing is no rest of rounding."""
+    lengths = ((99.934, -0.00412), (-0.00412, 0.0), (0.0,), (1e-9,), (0.000004,))
+    words = [length_words(*each, decimals=2) for each in lengths]
+    assert words == ["99.93, -0.00", "-0.0041, 0.0000", "0.00", "0.00", "0.000004"]
 
 
 def test_large_numbers_have_no_exponent() -> None:
