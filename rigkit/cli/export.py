@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--from", dest="source_format", choices=READ_FORMATS, help="of a camera file (default: told by its content)"
     )
     parser.add_argument("--names", nargs="+", metavar="CAMERA", help="of a rig, in this order (default: all)")
-    parser.add_argument("--size", metavar="WxH", help="of the images, px, where a file (py-OCamCalib) does not say it")
+    parser.add_argument("--size", metavar="WxH", help="of the images, px, where a file does not say it")
     parser.add_argument("-p", "--pair", help="pair of the data set whose cloud is exported")
     parser.add_argument("--method", default="3SDIR", help="affine estimator of the normals (default 3SDIR)")
     add_planes_argument(parser, "points and normals of a pair")

@@ -85,7 +85,7 @@ FOREIGN_FORMATS: dict[str, CameraFormat] = {
         lambda c, outline: write_kalibr([c], outlines=[outline]).cameras[0],
     ),
     "matlab": CameraFormat(MAT_SIGN, read_matlab),
-    "opencv": CameraFormat(STORAGE, lambda text, name, _: read_opencv(text, name), write_opencv),
+    "opencv": CameraFormat(STORAGE, read_opencv, write_opencv),
     "ros": CameraFormat(
         re.compile(rf"^distortion_model\s*:|{OST.pattern}", re.MULTILINE),
         lambda text, name, _: read_camera_info(text, name),

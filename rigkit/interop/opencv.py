@@ -37,6 +37,9 @@ from rigkit.interop.opencv_storage import parse_storage
 OPENCV_ACCEPTS = (*PERSPECTIVE, Accepted("kannala_brandt"), Accepted("ucm"))
 FAMILIES = (PERSPECTIVE, (Accepted("kannala_brandt"),))
 """The models that one call of OpenCV takes together: of calib3d, and of fisheye."""
+MATRIX = ("camera_matrix", "cameraMatrix", "mtx")
+DISTORTION = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "dist")
+"""How OpenCV's samples, its functions and its tutorials call both. K is cv2.fisheye's, whose four terms are others."""
 KEYS = ("M1", "D1", "M2", "D2", "R", "T")
 
 
@@ -58,16 +61,23 @@ def write_opencv(camera: Camera, outline: Pixels | None = None) -> Written:
     return replace(chosen, text=text)
 
 
-def read_opencv(text: str, name: str = "OpenCV YAML") -> Camera:
+def read_opencv(text: str, name: str = "OpenCV YAML", size_px: tuple[int, int] | None = None) -> Camera:
     """Return the camera of OpenCV's YAML, XML or JSON; `name` is how errors call the file.
 
+    `size_px` is that of the images where the file does not say it: only OpenCV's own samples write it.
     Raises InputError for a file without the keys, or terms that no model here has (thin prism, tilt, skew, distortion
     on top of omnidir's sphere).
     """
     data = parse_storage(text, name)
-    size = written_size(data, name)
-    K = read_opencv_matrix(data, "camera_matrix", name)
-    key = next((k for k in ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D") if k in data), None)
+    if "image_width" in data:
+        size = written_size(data, name)
+    elif size_px is not None:
+        size = size_px
+    else:
+        remedy = "add image_width and image_height, or use `rigkit export --size`"
+        raise InputError(f"'{name}': it does not say the images' size; {remedy}")
+    K = read_opencv_matrix(data, next((k for k in MATRIX if k in data), MATRIX[0]), name)
+    key = next((k for k in DISTORTION if k in data), None)
     d = np.zeros(0) if key is None else read_opencv_matrix(data, key, name)
     if "xi" in data:
         xi = float(numbers(data["xi"]["data"] if _is_matrix(data["xi"]) else data["xi"], name, "xi", 1)[0])

@@ -137,6 +137,22 @@ def test_we_read_what_opencv_writes(ending: str, keys: tuple[str, str], tmp_path
     assert np.allclose(again.parameters, p, rtol=1e-14)
 
 
+@pytest.mark.parametrize("keys", [("cameraMatrix", "distCoeffs"), ("mtx", "dist")])
+def test_what_scripts_write_with_opencv_is_read(keys: tuple[str, str], tmp_path: Path) -> None:
+    """Under the names of its parameters and its tutorials, and without the images' size, which is then told."""
+    camera = CAMERAS["brown"]
+    p = camera.parameters
+    path = tmp_path / "camera.yml"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write(keys[0], np.array([[p[0], 0.0, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]]))
+    storage.write(keys[1], p[4:].reshape(1, 5))
+    storage.release()
+    again = import_camera(path, size_px=camera.size_px)
+    assert again.model == "brown" and again.size_px == camera.size_px and np.allclose(again.parameters, p, rtol=1e-14)
+    with pytest.raises(InputError, match=r"image_width.*--size"):
+        import_camera(path)
+
+
 @pytest.mark.parametrize("ending", ["yml", "xml", "json"])
 def test_a_pair_in_every_form_of_opencv_is_a_rig(ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"stereo.{ending}"
