@@ -31,4 +31,6 @@ def fit_circles(
 ) -> FloatArray:
     """Return the outcomes of N circles, (N, 31). Arguments as `detection.circles.fit.fit_circles`; `capacity` is how
     many pixels the largest window has."""
-    return np.asarray(kernels().fit_circles(image, pixels, maps, curvatures, blur, uneven, reach, beside, rules, capacity))
+    return np.asarray(
+        kernels().fit_circles(image, pixels, maps, curvatures, blur, uneven, reach, beside, rules, capacity)
+    )

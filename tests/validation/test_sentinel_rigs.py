@@ -311,4 +311,6 @@ def test_a_step_so_wide_that_nothing_is_seen_ends_no_check(rng: np.random.Genera
         return matches_say(now, matches)
 
     check = judge_evidence(_rig(), look)
-    assert len(looks) >= 3 and not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
+    assert (
+        len(looks) >= 3 and not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
+    )
