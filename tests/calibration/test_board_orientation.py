@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
-from rigkit.calibration.board_orientation import board_turn, same_looks, with_views_turned
+from rigkit.calibration.board_orientation import _improved, board_turn, same_looks, with_views_turned
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.state import State, evaluate
@@ -108,6 +108,14 @@ def test_a_sheet_that_bends_from_view_to_view_is_told_by_its_print_alone(
         views.append(replace(other_end(view, 2) if other else view, image=f"{k:03d}.png"))
     found = changed(calibrate(views, SIZE, model="brown", board="released"), views)
     assert (found == turned).all() if printed_mm else not found.any()
+
+
+def test_the_worst_sign_is_turned_as_long_as_that_gains() -> None:
+    true = np.array([1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+    alike = np.outer(true, true) * (1.0 - np.eye(7))
+    silent = np.where(np.arange(7) == 2, 0.0, 1.0)
+    found = _improved(alike, np.stack([np.ones(7), true, silent]))
+    assert np.array_equal(found, [true, true, true * silent])
 
 
 def test_a_board_with_a_first_corner_is_left_alone(rng: np.random.Generator) -> None:

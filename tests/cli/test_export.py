@@ -22,9 +22,9 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
-from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera
+from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera, save_camera
 from rigkit.io.ply import read_ply
-from rigkit.workflows.export_camera import foreign_files
+from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, foreign_files
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.pairs import find_boards
 
@@ -67,7 +67,10 @@ def test_nothing_is_said_where_nothing_is_lost(tmp_path: Path, caplog: pytest.Lo
     brown = replace(calibration, camera=BROWN, covariance=np.eye(p), frame_covariance=np.eye(p + 6))
     with caplog.at_level("INFO"):
         files = foreign_files(brown, tmp_path / "brown.json", ["opencv", "ros"])
-    assert len(files) == 2 and not caplog.text
+        save_camera(tmp_path / "camera.json", BROWN)
+        options = ExportCameraOptions(output=tmp_path / "camera.yml", kind="opencv")
+        done = export_camera(tmp_path / "camera.json", options)
+    assert len(files) == 2 and done.max_error_px == 0.0 and not caplog.text
 
 
 def test_a_cloud_as_colmap_model_and_npz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

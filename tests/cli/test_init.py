@@ -139,7 +139,7 @@ def test_several_cameras_and_pose_types(
     for name in ("wide", "tele"):
         shutil.copy(CALIBRATION, tmp_path / f"{name}.json")
     monkeypatch.chdir(tmp_path)
-    command = ["init", "lab", "--square-mm", "50", "--force"]
+    command = ["init", "lab", *3 * ["--board", "8x6x50"], "--force"]
     told = ["--pose-type", "*-standard=standard", "--pose-type", "general"]
     assert main([*command, "--calibration", "wide.json", "--calibration", "tele.json", *told]) == 0
     dataset = load_dataset(root)
@@ -148,6 +148,8 @@ def test_several_cameras_and_pose_types(
         ("standard", "camera1", "camera2"),
     ]
     assert dataset.pairs[0].camera1.calibration == (tmp_path / "wide.json").resolve()
+    boards = [(board.board_id, board.size, board.square_x_mm) for board in dataset.boards]
+    assert boards == [(f"plane{n}", (8, 6), 50.0) for n in (1, 2, 3)]
     three = [f"--calibration={name}" for name in ("w=wide.json", "t=tele.json", "x=wide.json")]
     assert main([*command, *three, *told]) == 2
     assert "which cameras took pair 'fisheye-general'; add --cameras" in capsys.readouterr().err

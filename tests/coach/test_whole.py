@@ -16,14 +16,18 @@ from helpers.calibration_scenes import noisy_view
 
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
+from rigkit.coach.coach import Coach
 from rigkit.coach.guide import CHECKING, WORTH_GOING_ON, CaptureGuide, GuideOptions
+from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance
 from rigkit.coach.whole import STEADY, Whole, WholeCalibrations, whole_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
+from rigkit.io.session import Session
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal, projection_goal
-from rigkit.workflows.coach import CoachOptions, open_coach
+from rigkit.workflows.calibrate import SessionCalibration
+from rigkit.workflows.coach import CoachOptions, finished_words, open_coach
 
 FRAMES, NOISE_PX = 10, 0.05
 EMPTY = Glance(size_px=SIZE, view=None)
@@ -171,3 +175,21 @@ def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted
     assert now.more_percent is not None and now.more_percent > 100.0 * WORTH_GOING_ON, "more pictures would help"
     assert now.enough is (min(px, mm) > 1.0) and not now.waits
     assert wanted.stated(whole.calibration).count("as wanted") == (px > 1.0) + (mm > 1.0)
+
+
+def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
+    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session(
+        path=tmp_path / "session.toml", images=(), boards=(BOARD,), model="auto", degree=None, board_shape="auto"
+    )
+    written = (tmp_path / "calibration.json", tmp_path / "page.html")
+    done = SessionCalibration(session=session, calibration=whole.calibration, unreadable={}, written=written)
+    monkeypatch.setattr("rigkit.workflows.coach.calibrate_session_file", lambda *_: done)
+    told: list[str] = []
+    wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=100.0)
+    coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), tell=told.append)
+    words = coach.finish(". What it lacks: nothing")
+    assert words.startswith(f"Done: {whole.calibration.camera.model}, {wanted.stated(whole.calibration)}, held-out ")
+    assert "(as wanted)" in words and "calibration.json written" in words and words.endswith("What it lacks: nothing")
+    assert told == [words] and coach.finished == words

@@ -19,7 +19,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.candidates import MAX_SLANT_DEG, TILT_DEG, Reach, held_boards, outline_mm
-from rigkit.planning.goal import Goal, projection_goal, px_words
+from rigkit.planning.goal import Goal, projection_goal, px_words, rays_within
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import choose_views, covariance_of, plan_views
@@ -56,6 +56,15 @@ def test_the_error_promised_is_the_error_found(name: str, rng: np.random.Generat
         )
         squared.append(compare_cameras(camera, found.camera, grid=(24, 18), mask=seen).rms_px ** 2)
     assert np.sqrt(np.mean(squared)) == pytest.approx(promised, rel=PREDICTED_WITHIN)
+
+
+def test_a_field_leaves_rays_out_that_the_lens_sees() -> None:
+    camera, field_deg = lens("fish"), 2.0 * REACH_DEG["fish"]
+    pixels = grid_pixels(camera.size_px, (24, 18)).reshape(-1, 2)
+    every = rays_within(camera, pixels, None)
+    inside = every[:, 2] >= np.cos(np.radians(0.5 * field_deg))
+    assert 0 < inside.sum() < len(every)
+    assert np.array_equal(rays_within(camera, pixels, field_deg), every[inside])
 
 
 def test_a_calibration_is_known_as_its_own_views_say(rng: np.random.Generator) -> None:

@@ -42,6 +42,10 @@ def test_a_disk_of_any_size_gives_the_square_in_it() -> None:
 
 def test_what_the_coarse_cells_leave_is_taken_too() -> None:
     assert largest_rectangle(np.ones((601, 703), dtype=bool)) == (0, 0, 703, 601)
+    # The coarse cells at all four sides are lost, each for its outermost row or column alone.
+    framed = np.zeros((601, 703), dtype=bool)
+    framed[1:-1, 1:-1] = True
+    assert largest_rectangle(framed) == (1, 1, 702, 600)
 
 
 def test_nothing_seen_is_nothing() -> None:

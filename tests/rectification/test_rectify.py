@@ -194,6 +194,7 @@ def test_an_image_by_its_spline_is_the_image_where_its_pixels_are(rng: np.random
     v, u = np.mgrid[:9, :11].astype(np.float64)
     here = np.stack([u.ravel(), v.ravel()], axis=-1)
     assert np.allclose(_Sampler(image, "spline")(here), image.ravel(), atol=1e-9)
+    assert _Sampler(np.zeros((9, 11, 3), np.uint8), "spline")(np.empty((0, 2))).shape == (0, 3)
     line = (10.0 + 3.0 * v - 2.0 * u).astype(np.float64)
     between = np.array([[5.25, 4.5], [5.5, 3.75]])
     # The border mirrors the picture, whose slope ends there: a tenth of it is left three pixels away.

@@ -33,6 +33,17 @@ COVARIANCE_REL = 0.15
 """Standard deviations, predicted against Monte Carlo: 160 runs know one to 5.6 %."""
 
 
+def test_the_rule_auto_takes_how_sure_affinities_are_from_themselves(rng):
+    m, _, _ = pair(rng, 60, noise_px=1.0, sigma_A=0.002)
+    told = [replace(m, sigma_A=np.full(len(m), sigma)) for sigma in (0.002, 1.0)]
+    one, two = (estimate_pose(matches, weights="auto") for matches in told)
+    assert np.allclose(two.cam2_from_cam1.matrix(), one.cam2_from_cam1.matrix(), atol=1e-9)
+    assert np.allclose(two.covariance, one.covariance, rtol=1e-6)
+    # As sure as they are: told so, about the same comes out, and told another number, another one.
+    so, less = (np.sqrt(np.trace(estimate_pose(matches).covariance)) for matches in told)
+    assert np.sqrt(np.trace(one.covariance)) == pytest.approx(so, rel=0.2) and less > 1.2 * so
+
+
 @pytest.mark.parametrize("camera", [REGULAR, FISHEYE], ids=["pinhole", "fisheye"])
 def test_jacobians_are_derivatives(rng, camera):
     m, pose, _ = pair(rng, 20, noise_px=0.1, sigma_A=0.01, camera=camera)
