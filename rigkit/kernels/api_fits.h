@@ -247,7 +247,7 @@ EXPORT void board_places(
 EXPORT void sheet_places(
     ARRAY(const double, places, height, width, 2), int64_t width, int64_t height, ARRAY(const uint8_t, corners, 2, rows, columns),
     int64_t rows, int64_t columns, ARRAY(const double, first, 2), double each, ARRAY(const double, reach, 2),
-    RESULT(float, on_sheet, height, width, 2), RESULT(truth_t, near, 2, height, width));
+    RESULT(float, on_sheet, 2, height, width), RESULT(truth_t, near, 2, height, width));
 
 /* boards.c */
 

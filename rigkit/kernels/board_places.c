@@ -217,11 +217,11 @@ void sheet_places(
     for (int64_t k = 0; k < area; k++) {
         const double x = places[2 * k], y = places[2 * k + 1];
         near[k] = near[area + k] = 0;
-        on_sheet[2 * k] = on_sheet[2 * k + 1] = (float)(-2.0 * each);
+        on_sheet[k] = on_sheet[area + k] = (float)(-2.0 * each);
         if (!isfinite(x))
             continue;
-        on_sheet[2 * k] = (float)((x - first[0]) * each - 0.5);
-        on_sheet[2 * k + 1] = (float)((y - first[1]) * each - 0.5);
+        on_sheet[k] = (float)((x - first[0]) * each - 0.5);
+        on_sheet[area + k] = (float)((y - first[1]) * each - 0.5);
         const double column = nearest_line(x, columns), row = nearest_line(y, rows);
         const double off_x = fabs(x - column), off_y = fabs(y - row), off = off_x > off_y ? off_x : off_y;
         const uint8_t *corner = corners + (int64_t)row * columns + (int64_t)column;

@@ -73,7 +73,7 @@ def board_picture(
 def sheet_places(
     places: FloatArray, first: FloatArray, each: int, corners: BoolArray, reach: FloatArray
 ) -> tuple[Picture, BoolArray]:
-    """Return columns and rows (H, W, 2) of `places` (H, W, 2) on a sheet of `each` x `each` samples a square that
+    """Return columns and rows (2, H, W) of `places` (H, W, 2) on a sheet of `each` x `each` samples a square that
     begins at `first` (2,), and (2, H, W) which are nearest to one of the `corners` (2, R, C) and within `reach` (2,) of
     it along columns and rows."""
     found: tuple[Picture, BoolArray] = kernels().sheet_places(places, corners, first, each, reach)

@@ -194,8 +194,8 @@ def test_places_on_a_sheet_and_beside_corners(rng: np.random.Generator) -> None:
     corners, reach = rng.random((2, *SIZE)) < 0.7, np.array([0.45, 0.3])
     found, near = sheet_places(places, first, each, corners, reach)
     known = np.isfinite(places).all(axis=2)
-    assert np.array_equal(found[known], ((places[known] - first) * each - 0.5).astype(np.float32))
-    assert (found[~known] < -each).all()
+    assert np.array_equal(found[:, known], ((places[known] - first) * each - 0.5).astype(np.float32).T)
+    assert (found[:, ~known] < -each).all()
     nearest = np.rint(places[known]).astype(np.int64).clip(0, np.array(SIZE[::-1]) - 1)
     off = np.abs(places[known] - nearest).max(axis=1)
     for kind in range(2):

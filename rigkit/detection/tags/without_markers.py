@@ -135,10 +135,10 @@ def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int
 
 
 def _ink(board: Board, on_sheet: Picture, each: int, square_px: float) -> Picture:
-    """Return how much of each pixel is ink of markers, blurred by SHARP_PX: `on_sheet` (H, W, 2) says where on `_sheet`
+    """Return how much of each pixel is ink of markers, blurred by SHARP_PX: `on_sheet` (2, H, W) says where on `_sheet`
     it lies."""
     smooth = _blurred(_sheet(board, each), SHARP_PX * each / square_px)
-    return np.asarray(cv2.remap(smooth, on_sheet, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return np.asarray(cv2.remap(smooth, *on_sheet, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 @functools.lru_cache(maxsize=8)
