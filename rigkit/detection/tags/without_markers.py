@@ -137,8 +137,9 @@ def _box(image: GreyImage, lattice: FloatArray, margin: float) -> tuple[int, int
 def _ink(board: Board, on_sheet: Picture, each: int, square_px: float) -> Picture:
     """Return how much of each pixel is ink of markers, blurred by SHARP_PX: `on_sheet` (2, H, W) says where on `_sheet`
     it lies."""
+    columns, rows = on_sheet
     smooth = _blurred(_sheet(board, each), SHARP_PX * each / square_px)
-    return np.asarray(cv2.remap(smooth, *on_sheet, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return np.asarray(cv2.remap(smooth, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 @functools.lru_cache(maxsize=8)
