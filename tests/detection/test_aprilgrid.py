@@ -159,6 +159,17 @@ def test_blurred_tags_are_read_together(turns: int, rng: np.random.Generator) ->
     assert np.abs(off).max() < 1.0
 
 
+def test_corners_of_blurred_tags_that_lack_one_are_fitted_with_the_whole_tag() -> None:
+    """Left to windows full of code, they were off by up to .95 px: .18 px in the mean, 1.5 of their sigmas."""
+    board = replace(KALIBR, columns=12, rows=12)
+    scene = one_board(np.random.default_rng(72), board=board)
+    (found,) = detect_boards(scene.render(blur_px=3.0, noise_levels=2.0, rng=np.random.default_rng(2)), [board])
+    error = errors_by_place(found, scene.truth()[0])
+    assert 100 < len(found.grid) < 144
+    assert np.sqrt((error**2).mean()) < 0.08
+    assert 0.7 < np.sqrt(((error / found.sigma_px[:, None]) ** 2).mean()) < 1.3
+
+
 def test_blurred_tags_of_another_board_are_none(rng: np.random.Generator) -> None:
     image = facing(KALIBR, 25.0).render(optics=Optics(2.5), noise_levels=2.0, rng=rng)
     others = replace(KALIBR, board_id="o", pattern=AprilGrid(0.3, first_tag=100))

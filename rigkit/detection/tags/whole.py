@@ -3,7 +3,8 @@
 An edge spreads two standard deviations of the blur to either side. Where a tag's border is narrower than four of them,
 no pixel near its corners shows their two lines and nothing of the code. But then the code is known, as is what lies
 around the tag: all of it is the model, and its four corners are what is sought. How the picture bends between them is
-told by the corners of the other tags.
+told by the corners of the other tags. Where one of the four is not seen, the others are had from the whole tag all
+the same: it starts where those of other tags foretell it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
 from rigkit.detection.guided.board_guide import BoardState
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
+from rigkit.detection.guided.guided import MARGIN_PX, MAX_ADDED_RESIDUAL
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.edge_fit import (
     BLUR_RANGE,
@@ -96,35 +98,57 @@ def with_whole_tags(
 
     `places` (R, C, 2) of the corners, in sides of a tag; `map_of_state` makes the map through the corners of the state.
     """
-    longer, height = tag_heights(state.pixels)
     # What single corners have for blur is not to be relied on where the code is in their windows.
     blur = known_median(state.blur)
-    narrow = tags.pattern.border / tags.codes.modules * height < NARROW_BLURS * blur
-    if not narrow.any():
+    narrowest = NARROW_BLURS * blur * tags.codes.modules / tags.pattern.border
+    if not (tag_heights(state.pixels)[1] < narrowest).any():
         return state
+    smooth = map_of_state()
+    filled, partly = _foretold(state, smooth.at(places.reshape(-1, 2)).pixels.reshape(places.shape), image.shape)
+    longer, height = tag_heights(filled)
+    narrow = height < narrowest
     row, column = (2 * part for part in np.nonzero(narrow))
     mine = row[:, None] + TAG_CORNERS[:, 1], column[:, None] + TAG_CORNERS[:, 0]
-    corners = state.pixels[mine]
-    smooth = map_of_state()
+    corners = filled[mine]
     maps, centres, scales = _maps(places[row, column], corners, smooth)
     ink, breaks = _ink(tags)
     step = 1.0 if tags.pattern.corner_squares else PAPER_STEP
     found = fit_tags(
         *(image, maps, centres, scales, ink[row // 2, column // 2], breaks, 0.5 * tags.pattern.spacing),
-        *(np.full(len(row), blur), step * state.contrast[mine].mean(axis=1)),
-        *(BEND_SIGMAS * np.maximum(np.median(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
+        *(np.full(len(row), blur), step * np.nanmean(state.contrast[mine], axis=1)),
+        *(BEND_SIGMAS * np.maximum(np.nanmedian(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
     )
     moves = found[:, :8].reshape(-1, 4, 2)
     furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
     good = (found[:, 15] > 0.5) & (found[:, 13] > 0.0)
     good &= furthest < np.maximum(VALID_MOVE_CELLS * longer[narrow], VALID_MOVE_PX)
+    residual = found[:, 14] / np.maximum(found[:, 13], 1e-9)
+    complete = ~partly[narrow]
+    good &= complete | (residual < MAX_ADDED_RESIDUAL * known_median(residual[complete & good]))
     pixels, sigma_px, blurs, contrast = (
         part.copy() for part in (state.pixels, state.sigma_px, state.blur, state.contrast)
     )
     better = mine[0][good], mine[1][good]
     pixels[better], sigma_px[better] = corners[good] + moves[good], found[good, 8:12]
     blurs[better], contrast[better] = found[good, 12:13], found[good, 13:14] / step
+    # A foretold corner that nothing showed by itself is no corner found.
+    for values in (pixels, sigma_px, blurs, contrast):
+        values[~state.known] = np.nan
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
+
+
+def _foretold(state: BoardState, foretold: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, BoolArray]:
+    """Return the corners (R, C, 2) with those `foretold` of tags of which some are known, if the image has all four,
+    and which tags (R / 2, C / 2) these are."""
+    inside = ((foretold > MARGIN_PX) & (foretold < np.array(shape[::-1]) - 1.0 - MARGIN_PX)).all(axis=2)
+    known = state.known
+    some, every, fits = (
+        how(part.reshape(known.shape[0] // 2, 2, -1, 2), axis=(1, 3))
+        for how, part in ((np.any, known), (np.all, known), (np.all, known | inside))
+    )
+    partly = some & ~every & fits
+    wanted = ~known & np.repeat(np.repeat(partly, 2, axis=0), 2, axis=1)
+    return np.where(wanted[..., None], foretold, state.pixels), partly
 
 
 def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[FloatArray, FloatArray, FloatArray]:

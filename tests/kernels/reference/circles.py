@@ -45,4 +45,4 @@ def picture(
     )
     share = ndtr(-distance / blur - 0.5 * curvature * blur)
     light = 1.0 + (pixels - centre) @ slope
-    return (light * (outside + contrast * share)).reshape(size_px[1], size_px[0])
+    return np.asarray((light * (outside + contrast * share)).reshape(size_px[1], size_px[0]))
