@@ -127,7 +127,8 @@ def mesh_bytes(points: Points, normals: Normals, colours: NDArray[np.uint8], tri
             vertices[name] = column
     faces = np.empty(len(triangles), dtype=[("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, triangles
-    header = ["ply", "format binary_little_endian 1.0", "comment rigkit mesh", f"element vertex {len(vertices)}"]
+    header = ["ply", "format binary_little_endian 1.0", "comment rigkit mesh"]
+    header += ["comment units mm, frame as of the cloud", f"element vertex {len(vertices)}"]
     header += [f"property float {name}" for name, _ in places]
     header += [f"property uchar {name}" for name in COLOUR]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]

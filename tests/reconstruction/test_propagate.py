@@ -86,4 +86,4 @@ def test_nothing_is_filled_where_no_pixels_agree(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(AllAlike, "of_rivals", lambda *_: np.where(np.arange(24) == 7, 0.5, 2.0))
     best = propagate._best(alike, pixels, rays, plane, slope, around)
     assert best.source.tolist() == [around[0, 7]]
-    assert (best.agree, best.scatter) == (1.0, 0.0)
+    assert best.agree.tolist() == [1.0] and best.scatter.tolist() == [0.0]

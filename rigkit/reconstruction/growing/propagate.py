@@ -24,7 +24,7 @@ OFFSETS = np.array([(r * i, r * j) for r in REACHES for i in (-1, 0, 1) for j in
 MAX_OF_RIVAL_PROPAGATED = 1.8
 """As MAX_OF_RIVAL, of the best of many planes, none of which was measured there: what is added between 1.8 and 2.2 is
 wrong twice as often and more (22 % on motorcycle, REAL; two thirds on RENDERED dull cards)."""
-ROUNDS = 2
+PROPAGATION_ROUNDS = 2
 """More rounds reach further, and what they add is wrong more often (motorcycle, REAL: 13, 22 and 24 % in turns)."""
 SAME_PLANE_PX = 0.5
 """Along the epipolar line, by which planes that say the same of a place differ: finer than the sweep's samples."""
@@ -67,7 +67,7 @@ def propagated(
     scatter = np.zeros(seen.shape)
     source = np.arange(seen.size).reshape(seen.shape)
     fresh = surface.valid.ravel()
-    for _ in range(ROUNDS):
+    for _ in range(PROPAGATION_ROUNDS):
         holes = np.flatnonzero(seen & ~np.isfinite(plane[..., 0]))
         around = _around(holes, seen.shape)
         # Where nothing came since, nothing changes.
