@@ -23,7 +23,7 @@ from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 ARROWS = (21, 16)
 ARROW_LENGTH = 0.05
 """The largest arrow is as long as this part of the image's width."""
-SEEN = 0.5
+LIKELY_SEEN = 0.5
 """Pictures that would miss a change more often than find it do not say that there was none."""
 PART_OF = {"focus": "lens", "principal point": "lens", "distortion": "lens", "rotation": "moved", "shift": "moved"}
 """What changes in several ways are made of."""
@@ -39,7 +39,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
     ]
     change = check.change
     if check.holds:
-        little = min((power.chance for power in check.powers), default=0.0) < SEEN
+        little = min((power.chance for power in check.powers), default=0.0) < LIKELY_SEEN
         headline = f"Still holds{', as far as these pictures tell' if little else ''} ({p}, {frames})"
         if change is not None and check.chance < ALARM_CHANCE:
             sentences.append(

@@ -105,8 +105,8 @@ def check_pictures(
     options, source = options or CheckOptions(), Path(path)
     if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
         raise InputError(
-            f"'{source}': another program's file does not say how sure it is, so that nobody can tell a change from its "
-            "own error; `rigkit calibrate` pictures of the time when it held, and check what that writes"
+            f"'{source}': another program's file does not say how sure it is, so that nobody can tell a change from "
+            "its own error; `rigkit calibrate` pictures of the time when it held, and check what that writes"
         )
     watched, known = load_watched(source)
     warn_if_bad(source)
