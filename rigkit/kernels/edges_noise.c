@@ -31,7 +31,8 @@ double leave_residuals(window_t *window, const double *step, int parameters)
 FOR_EACH_PROCESSOR
 double unmirrored(const double *values, window_t *window, int parameters, const edge_rules_t *rules)
 {
-    if (fabs(values[X]) > rules->max_mirrored || fabs(values[Y]) > rules->max_mirrored)
+    /* NaN, of a picture that has no numbers there, is nowhere. */
+    if (!(fabs(values[X]) <= rules->max_mirrored && fabs(values[Y]) <= rules->max_mirrored))
         return -1.0;
     /* What is left as a picture, and turned by half a turn: then mirror images are read in the order of the pixels. */
     const int32_t across = (int32_t)window->across, middle = across / 2, radius = (int32_t)window->radius;

@@ -10,6 +10,7 @@ from collections import defaultdict
 from itertools import combinations
 
 import numpy as np
+from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.core.arrays import FloatArray
@@ -18,7 +19,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
-from .sessions import BOARD, CORNERS_PX, MOUNT, SECOND_CENTRE, SIZE, lens
+from .sessions import CORNERS_PX, MOUNT, SECOND_CENTRE
 
 FRAMES_PER_S = 6.0
 LAG_S, JITTER_S = 0.012, 0.003

@@ -8,13 +8,13 @@ side of a line across them.
 
 from __future__ import annotations
 
-import sys
 from collections import defaultdict
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
+from helpers.board_rig_scenes import DIFFERENT, corner_of_a_room, target_views
+from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.coverage import covered_by_boards
@@ -30,11 +30,6 @@ from rigkit.core.errors import DegenerateError, RigkitError
 from rigkit.core.truth import Feature
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-
-from helpers.board_rig_scenes import DIFFERENT, corner_of_a_room, target_views
-from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 LENSES = ("reg", "wide", "fish")
 """Of 60, 110 and 185 degrees."""

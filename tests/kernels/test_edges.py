@@ -206,3 +206,19 @@ def test_a_corner_of_no_known_place_or_shape_is_not_fitted(rng: np.random.Genera
     geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends)
     fit = fit_edges(image, start, geometry, np.ones(len(start)), np.full(len(start), 0.7), radius_px=18.0, iterations=8)
     assert not fit.valid[:4].any()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
+@pytest.mark.parametrize("share", [0.003, 0.5])
+def test_pictures_without_numbers_are_read_inside_the_memory(
+    value: float, share: float, rng: np.random.Generator
+) -> None:
+    image, truth = scene(0.7, 2.0, rng)
+    image[rng.random(image.shape) < share] = value
+    cells = np.ones(truth.shape[:2], bool)
+    shape = fit_cells(truth, cells)
+    sides = np.stack([shape.along_column, shape.along_row], axis=1)
+    geometry = Geometry(sides, shape.curvature(), shape.gaps(), ends_of(cells, cells))
+    start = truth.reshape(-1, 2)
+    fit = fit_edges(image, start, geometry, np.ones(len(start)), np.ones(len(start)), radius_px=12.0, iterations=20)
+    assert np.isfinite(fit.pixels[fit.valid]).all() and np.isfinite(fit.sigma_px[fit.valid]).all()

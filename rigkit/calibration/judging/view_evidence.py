@@ -153,7 +153,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
         return None
     return ViewEvidence(
-        views=[k for k, tells in zip(telling, told.tolist(), strict=True) if tells],
+        views=[k for k, tells in zip(telling, told, strict=True) if tells],
         own=own,
         length=length,
         along=own[:, :, residual] - own[:, :, COMMON] @ step,

@@ -25,7 +25,8 @@ MAX_OF_RIVAL_PROPAGATED = 1.8
 """As MAX_OF_RIVAL, of the best of many planes, none of which was measured there: what is added between 1.8 and 2.2 is
 wrong twice as often and more (22 % on motorcycle, REAL; two thirds on RENDERED dull cards)."""
 PROPAGATION_ROUNDS = 2
-"""More rounds reach further, and what they add is wrong more often (motorcycle, REAL: 13, 22 and 24 % in turns)."""
+"""More rounds reach further, and what they add is wrong more often (motorcycle, REAL: 13, 22 and 24 % in turns, while
+the other limits were still sought)."""
 SAME_PLANE_PX = 0.5
 """Along the epipolar line, by which planes that say the same of a place differ: finer than the sweep's samples."""
 
