@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.subpixel import edge_fit, subpixel
-from rigkit.detection.subpixel.correlation import sigma_factors
+from rigkit.detection.subpixel.correlation import board_factors, sigma_factors
 from rigkit.detection.subpixel.edge_fit import EdgeFit, fit_edges
 from rigkit.detection.subpixel.edge_model import Geometry
 from rigkit.synthetic.render import Optics
@@ -168,11 +168,12 @@ def test_windows_of_few_pixels_say_nothing(monkeypatch: pytest.MonkeyPatch) -> N
     """Blurred squares of 6 px: the fit takes nearly all of the noise in their windows."""
     seen: list[np.ndarray] = []
 
-    def kept(*arguments: Any) -> np.ndarray:
-        seen.append(sigma_factors(*arguments))
-        return seen[-1]
+    def kept(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+        both = board_factors(*arguments)
+        seen.append(both[0])
+        return both
 
-    monkeypatch.setattr(subpixel, "sigma_factors", kept)
+    monkeypatch.setattr(subpixel, "board_factors", kept)
     for seed in range(6):
         rng = np.random.default_rng(seed)
         scene = small_board(rng, square_px=6.0)
