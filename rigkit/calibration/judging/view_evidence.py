@@ -135,7 +135,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         return None
     products = products_of([calibration.views[k] for k in telling], lambda views: rows_of(calibration, views))
     # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
-    told = np.isfinite(products).all(axis=(1, 2))
+    told = np.asarray(np.isfinite(products).all(axis=(1, 2)))
     if np.count_nonzero(told) < MIN_TELLING_VIEWS:
         return None
     products = products[told]
