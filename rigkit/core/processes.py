@@ -20,7 +20,8 @@ from concurrent.futures import (
     as_completed,
 )
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from multiprocessing.reduction import ForkingPickler
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
@@ -90,8 +91,8 @@ def _terminal_silent() -> Iterator[None]:
 
 @contextmanager
 def _script_left_alone() -> Iterator[None]:
-    """Let processes that start here not import the caller's script: work of ours needs nothing of it, and without
-    `if __name__ == "__main__"` it would begin again in each of them. So it is in notebooks, which have no file."""
+    """Let processes that start here not import the caller's script: without `if __name__ == "__main__"` it would begin
+    again in each of them. So it is in notebooks, which have no file."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -100,8 +101,18 @@ def _script_left_alone() -> Iterator[None]:
         sys.modules["__main__"] = script
 
 
+def _is_of_script(*work: Any) -> bool:
+    """Return whether `work` has something of the caller's script in it, such as its functions, or cannot be sent."""
+    try:
+        return b"__main__" in bytes(ForkingPickler.dumps(work))
+    except Exception:
+        return True
+
+
 class _Pool(ProcessPoolExecutor):
     """A pool that starts its processes silently, all where the first work is submitted.
+
+    They import the caller's script only where that work has something of it: ours has not.
 
     Started one by one, as work comes, a process that begins while another is found dead is neither ended nor fed, and
     waited for for ever (CPython: `terminate_broken` does not know of it).
@@ -111,15 +122,23 @@ class _Pool(ProcessPoolExecutor):
         # "spawn": a fork after OpenCV has started its threads can hang.
         super().__init__(count, mp_context=multiprocessing.get_context("spawn"), initializer=initializer)
         self._safe_to_dynamically_spawn_children = False
+        self._of_script: bool | None = None
 
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        with _terminal_silent(), _script_left_alone():
+        if self._of_script is None:
+            self._of_script = _is_of_script(fn, args, kwargs)
+        with _terminal_silent():
             future = super().submit(fn, *args, **kwargs)
         # What waits is cancelled before the workers end; the pool would then stumble, loudly, over telling it so.
         future.set_exception = functools.partial(_tell, future)  # type: ignore[method-assign]
         return future
+
+    def _launch_processes(self) -> None:
+        # Before the pool has a thread that would miss the script, too.
+        with nullcontext() if self._of_script else _script_left_alone():
+            super()._launch_processes()  # type: ignore[misc]
 
 
 def _tell(future: Future[Any], error: BaseException | None) -> None:

@@ -164,6 +164,25 @@ def test_a_plain_script_is_not_run_again_by_workers(tmp_path: Path, file: str) -
     assert (done.stdout.split(), done.stderr) == (["begun", "1", "2"], "")
 
 
+OWN_WORK = """
+from rigkit.core.processes import worker_pool
+
+def own(number):
+    return -number
+
+if __name__ == "__main__":
+    with worker_pool(2) as pool:
+        print(*pool.map(own, [-1, -2]))
+"""
+
+
+def test_workers_know_the_functions_of_a_script(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(OWN_WORK)
+    command = [sys.executable, "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert (done.stdout.split(), done.stderr) == (["1", "2"], "")
+
+
 @pytest.mark.parametrize("jobs", [None, 2])
 def test_a_worker_of_the_callers_works_alone(monkeypatch: pytest.MonkeyPatch, jobs: int | None) -> None:
     """Those of multiprocessing.Pool may start no processes."""
