@@ -49,16 +49,24 @@ INLINE void gather(
         }
 }
 
+/* Differentiate a block of spots from `first` on; return how many of them there are. */
+INLINE int64_t differentiated(const group_t *at, const spots_t *spots, int64_t first, places_t *places, double rows[ROWS][BLOCK])
+{
+    double du[BLOCK], dv[BLOCK], value[BLOCK];
+    const int64_t here = offsets(&at->own, spots, first, du, dv);
+    for (int64_t k = 0; k < BLOCK; k++)
+        value[k] = spots->value[first + (k < here ? k : 0)];
+    differentiate(at, du, dv, value, places, rows);
+    return here;
+}
+
 /* Fill the normal equations; return the sum of squared residuals. */
 INLINE double linearise(const group_t *at, const spots_t *spots, double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
 {
-    double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK], sums[COLUMNS][COLUMNS] = {{0.0}};
+    double rows[ROWS][BLOCK], sums[COLUMNS][COLUMNS] = {{0.0}};
     places_t places;
     for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = offsets(&at->own, spots, first, du, dv);
-        for (int64_t k = 0; k < BLOCK; k++)
-            value[k] = spots->value[first + (k < here ? k : 0)];
-        differentiate(at, du, dv, value, &places, rows);
+        const int64_t here = differentiated(at, spots, first, &places, rows);
         for (int i = 0; i < COLUMNS; i++)
             for (int64_t k = here; k < BLOCK; k++)
                 rows[i][k] = 0.0;
@@ -135,14 +143,11 @@ static int moved(group_t *group, const double step[PARAMETERS], const circle_rul
  * angle in the plane, in radii (cosine and sine each). A disc has none; a square has the fourth. */
 INLINE void harmonics(const group_t *at, const spots_t *spots, double out[8])
 {
-    double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK], weight = 0.0;
+    double rows[ROWS][BLOCK], weight = 0.0;
     places_t places;
     memset(out, 0, 8 * sizeof(double));
     for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = offsets(&at->own, spots, first, du, dv);
-        for (int64_t k = 0; k < BLOCK; k++)
-            value[k] = spots->value[first + (k < here ? k : 0)];
-        differentiate(at, du, dv, value, &places, rows);
+        const int64_t here = differentiated(at, spots, first, &places, rows);
         for (int64_t k = 0; k < here; k++) {
             const double grown = rows[OWN][k], per_r = 1.0 / (places.r[k] > 1e-9 ? places.r[k] : 1e-9);
             const double c = places.x[k] * per_r, s = places.y[k] * per_r;
@@ -165,14 +170,11 @@ INLINE void harmonics(const group_t *at, const spots_t *spots, double out[8])
  * equations of these (3) once all else is solved for, from the factor `N` of those of the rest. */
 static void unevenness(const group_t *at, const spots_t *spots, const double *N, double out[5])
 {
-    double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK], with[2][PARAMETERS] = {{0.0}}, solved[2][PARAMETERS];
+    double rows[ROWS][BLOCK], with[2][PARAMETERS] = {{0.0}}, solved[2][PARAMETERS];
     places_t places;
     memset(out, 0, 5 * sizeof(double));
     for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = offsets(&at->own, spots, first, du, dv);
-        for (int64_t k = 0; k < BLOCK; k++)
-            value[k] = spots->value[first + (k < here ? k : 0)];
-        differentiate(at, du, dv, value, &places, rows);
+        const int64_t here = differentiated(at, spots, first, &places, rows);
         for (int64_t k = 0; k < here; k++) {
             const double one = rows[Q1][k], two = rows[Q2][k];
             out[0] += one * rows[OFF][k];

@@ -46,8 +46,8 @@ SURE_GAIN = 1.5
 """Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
 BLUR_ROUNDS = 3
 """The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
-blur 3 px); the third, where the blur
-differs with the direction, has that from what the neighbours' light leaves, and circles that this light had hidden."""
+blur 3 px); the third, where the blur differs with the direction, has that from what the neighbours' light leaves, and
+circles that this light had hidden."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
