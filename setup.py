@@ -5,6 +5,8 @@ from __future__ import annotations
 import runpy
 import shutil
 import sys
+from itertools import chain
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -38,9 +40,27 @@ class build_kernels(build_ext):
             self.spawn([*zig, *BUILDING["FLAGS"], "-s", "-shared", *ext.sources, "-o", str(library)])
             compiler = "ziglang"
         else:
+            ext.extra_objects, ext.sources = self._objects(ext), []
             super().build_extension(ext)
             compiler = " ".join(self.compiler.compiler_so[:1])
         BUILDING["write_record"](library, FOLDER, compiler)
+
+    def _objects(self, ext: Extension) -> list[str]:
+        """Compile side by side the sources that are newer than their objects; setuptools takes one after another."""
+        headers = max(Path(header).stat().st_mtime for header in [*ext.depends, FOLDER / "building.py"])
+
+        def compiled(source: str) -> list[str]:
+            names: list[str] = self.compiler.object_filenames([source], output_dir=self.build_temp)
+            made = [Path(name).stat().st_mtime for name in names if Path(name).exists()]
+            if made and not self.force and min(made) > max(headers, Path(source).stat().st_mtime):
+                return names
+            options = {"output_dir": self.build_temp, "extra_postargs": ext.extra_compile_args}
+            return list(self.compiler.compile([source], **options))
+
+        # The largest first, so that no processor waits for it at the end.
+        largest_first = sorted(ext.sources, key=lambda source: -Path(source).stat().st_size)
+        with ThreadPool() as pool:
+            return sorted(chain.from_iterable(pool.imap_unordered(compiled, largest_first)))
 
     def copy_extensions_to_source(self) -> None:
         super().copy_extensions_to_source()
