@@ -12,15 +12,14 @@ from rigkit.calibration.clustered import Clustered
 from rigkit.calibration.covariance import GlobalCovariance, PoseJacobians
 from rigkit.calibration.pupil import without_pupil
 from rigkit.calibration.result import Calibration, Candidate, Outlier, ViewResult
-from rigkit.calibration.solving.fit import Fit
+from rigkit.calibration.solving.fit import Fit, not_identifiable
 from rigkit.calibration.solving.normal_equations import Residuals
 from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
-from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.errors import DegenerateError, InputError
+from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 
 UNKNOWN_SHARE = 0.05
@@ -89,37 +88,6 @@ def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
         length = float(np.linalg.norm(fit.residuals.px[i, j])) if fit.residuals.valid[i, j] else float("nan")
         out.append(Outlier(view.image, view.board.board_id, column, row, length))
     return tuple(out)
-
-
-def identifiable(fit: Fit) -> bool:
-    """Return whether the images tell the camera's parameters from each other, and each of them at all.
-
-    A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may look told when its tiny
-    effects are compared with each other. Then its standard deviation leads out of the model on both sides.
-    """
-    if not fit.normal.identifiable:
-        return False
-    camera = fit.state.camera
-    sigma = fit.sigma_px * np.sqrt(np.diag(fit.normal.covariance[0])[: camera.parameters.size])
-    # Models limit each parameter by itself: where all steps at once lead to a camera, each alone does.
-    return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
-
-
-def _exists(camera: Camera, step: FloatArray) -> bool:
-    """Return whether the model has a camera with parameters `step` (P,) further on."""
-    try:
-        camera.with_parameters(camera.parameters + step)
-    except InputError:
-        return False
-    return True
-
-
-def not_identifiable(model: str) -> DegenerateError:
-    """Return the error for a model whose parameters the images do not tell from each other."""
-    return DegenerateError(
-        f"calibration: a {model} camera is not identifiable from these images: other numbers show them as well; take a "
-        "simpler model, or views with the board tilted by 20 to 50 degrees in several directions and towards the rim"
-    )
 
 
 def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:

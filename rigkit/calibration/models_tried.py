@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.calibration.assemble import identifiable, not_identifiable
 from rigkit.calibration.choice import Option
 from rigkit.calibration.heldout import heldout_squares
 from rigkit.calibration.result import Candidate
-from rigkit.calibration.solving.fit import Fit, fit_kept, fit_model, robust_sigma
+from rigkit.calibration.solving.fit import Fit, fit_kept, fit_model, identifiable, not_identifiable, robust_sigma
 from rigkit.calibration.solving.shape import SHAPES
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera

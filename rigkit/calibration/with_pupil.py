@@ -13,13 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.choice import SURELY, Option, choose, described
 from rigkit.calibration.judging.pupil import BY_CHANCE
 from rigkit.calibration.models_tried import Request, compared, enough_agree, reweighted
 from rigkit.calibration.one_model import Solved, on_same_images, with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, posed, robust_sigma
+from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, identifiable, posed, robust_sigma
 from rigkit.calibration.solving.outliers import inliers
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
-from rigkit.calibration.assemble import identifiable
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.verdicts import judge_session
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.solving.fit import fit_model
+from rigkit.calibration.solving.fit import fit_model, identifiable
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import with_priors

@@ -17,7 +17,7 @@ from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.core.errors import DegenerateError
+from rigkit.core.errors import DegenerateError, InputError
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 CAUCHY_SIGMAS = 2.5
@@ -234,3 +234,34 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
         )
     sigma = np.sqrt(total / freedom)
     return float(np.sqrt((total + prior * sigma**2) / freedom)) if prior else float(sigma)
+
+
+def identifiable(fit: Fit) -> bool:
+    """Return whether the images tell the camera's parameters from each other, and each of them at all.
+
+    A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may look told when its tiny
+    effects are compared with each other. Then its standard deviation leads out of the model on both sides.
+    """
+    if not fit.normal.identifiable:
+        return False
+    camera = fit.state.camera
+    sigma = fit.sigma_px * np.sqrt(np.diag(fit.normal.covariance[0])[: camera.parameters.size])
+    # Models limit each parameter by itself: where all steps at once lead to a camera, each alone does.
+    return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
+
+
+def _exists(camera: Camera, step: FloatArray) -> bool:
+    """Return whether the model has a camera with parameters `step` (P,) further on."""
+    try:
+        camera.with_parameters(camera.parameters + step)
+    except InputError:
+        return False
+    return True
+
+
+def not_identifiable(model: str) -> DegenerateError:
+    """Return the error for a model whose parameters the images do not tell from each other."""
+    return DegenerateError(
+        f"calibration: a {model} camera is not identifiable from these images: other numbers show them as well; take a "
+        "simpler model, or views with the board tilted by 20 to 50 degrees in several directions and towards the rim"
+    )
