@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 from split_halves import CAPTURES
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.board_pose import cam_from_seen_board

@@ -39,7 +39,7 @@ from sentinel.tally import CHANGED_PX, COUNTED, FRESH, KINDS, SCENE_TURNED_DEG, 
 from split_halves import identified
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import DisplacedCamera
+from rigkit.calibration.certainty.displaced import DisplacedCamera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.views.usable import views_of_image

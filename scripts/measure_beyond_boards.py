@@ -24,9 +24,9 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from split_halves import CAPTURES, Loaded, Views, calibrated, load
 
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.errors import RigkitError

@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from helpers.measuring import read_off
 
 from rigkit.calibration.calibrate import FOLDS, calibrate
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.displaced import DisplacedCamera
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.displaced import DisplacedCamera
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera
 from rigkit.cameras.brown import Brown

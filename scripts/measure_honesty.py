@@ -26,7 +26,7 @@ from honesty.moving import moving_sessions
 from honesty.sessions import IMAGES, sessions
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera

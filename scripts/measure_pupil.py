@@ -32,11 +32,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.certainty.uncertainty import FarProjection, worst_direction
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.moving_pupil import NearCamera

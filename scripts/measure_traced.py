@@ -19,9 +19,9 @@ import numpy as np
 from scipy.optimize import least_squares
 from traced.lenses import Lens
 
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3

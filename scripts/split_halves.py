@@ -34,13 +34,13 @@ from honesty.twins import twin
 from truth.cameras import published_corners
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.clustered import drawn_errors, reduced_by_cluster
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.compare import CalibrationComparison, CameraVerdict, compare_calibrations
-from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.solving.clustered import drawn_errors, reduced_by_cluster
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.state import State
-from rigkit.calibration.uncertainty import projection_design
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera

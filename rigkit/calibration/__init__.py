@@ -2,15 +2,17 @@
 
 - `views`: what can be used (`usable`), as arrays (`observations`), and what is left out together (`repeats`, `folds`)
 - `solving`: a start (`radial_alignment`, `initialise`, `poses`), then one model by least squares (`state`, `shape`,
-  `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`)
-- which end of a board is which: `board_orientation`
-- which model and board shape: `heldout`, `models_tried`, `choice`, `lens_choice`, `one_model`
-- how sure that is: `clustered`, `covariance`, `uncertainty`, `between_models`, `departures`, `series`,
-  `displaced`
-- where boards were, and how alike neighbours' residuals are: `coverage`, `neighbours`
-- `judging`: `captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`, `pupil` (with `view_evidence`),
-  `verdicts`
-- what comes out: `assemble`, `result`
+  `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`) with its covariance
+  (`clustered`)
+- `choosing`: which end of a board is which (`board_orientation`), which model and which board shape (`heldout`,
+  `choice`, `models_tried`, `lens_choice`, `one_model`); `between_models` says what that leaves open, `begun` keeps it
+  for a rig
+- `certainty`, how sure that is: `covariance`, `uncertainty`, `departures`, `series`, `displaced`; `coverage` says where
+  boards were
+- `judging`: `captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`, `pupil` (with `view_evidence` and
+  `neighbours`), `verdicts`
+- what comes out: `assemble`, `result` (with `board_shape`, `pupil`)
+- again with a pupil that moves, where the images ask for it: `with_pupil`
 
 `compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.between_models import RivalFit, between_models
 from rigkit.calibration.board_shape import BoardShape
-from rigkit.calibration.clustered import Clustered
-from rigkit.calibration.covariance import GlobalCovariance, PoseJacobians
+from rigkit.calibration.certainty.covariance import GlobalCovariance, PoseJacobians
+from rigkit.calibration.choosing.between_models import RivalFit, between_models
 from rigkit.calibration.pupil import without_pupil
 from rigkit.calibration.result import Calibration, Candidate, Outlier, ViewResult
+from rigkit.calibration.solving.clustered import Clustered
 from rigkit.calibration.solving.fit import Fit, not_identifiable
 from rigkit.calibration.solving.normal_equations import Residuals
 from rigkit.calibration.solving.shape import ShapeModel

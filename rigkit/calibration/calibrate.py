@@ -11,23 +11,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from rigkit.calibration.assemble import assemble, require_determined
-from rigkit.calibration.begun import Begun, about_camera, begin
-from rigkit.calibration.between_models import rival_fits, rival_shapes, with_rivals
-from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, described
-from rigkit.calibration.judging.moved import moved_lens
-from rigkit.calibration.judging.pupil import may_move
-from rigkit.calibration.judging.verdicts import judge
-from rigkit.calibration.lens_choice import (
+from rigkit.calibration.certainty.uncertainty import FarProjection
+from rigkit.calibration.choosing.begun import Begun, about_camera, begin
+from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes, with_rivals
+from rigkit.calibration.choosing.choice import SURELY, HeldOut, Option, choose, described
+from rigkit.calibration.choosing.lens_choice import (
     Choice,
     Lenses,
     best_sizes,
     choose_lenses,
     twins,
 )
-from rigkit.calibration.models_tried import Request
-from rigkit.calibration.one_model import Solved, on_same_images
+from rigkit.calibration.choosing.models_tried import Request
+from rigkit.calibration.choosing.one_model import Solved, on_same_images
+from rigkit.calibration.judging.moved import moved_lens
+from rigkit.calibration.judging.pupil import may_move
+from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,

@@ -13,10 +13,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from rigkit.calibration.clustered import NULL_DRAWS, drawn_errors
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_design
+from rigkit.calibration.solving.clustered import NULL_DRAWS, drawn_errors
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera

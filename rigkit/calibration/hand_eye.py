@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.clustered import Clustered, clustered_covariance, effective_freedom, widening
+from rigkit.calibration.solving.clustered import Clustered, clustered_covariance, effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.arrays import FloatArray, IntArray

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
-from rigkit.calibration.choice import Option
-from rigkit.calibration.heldout import heldout_squares
+from rigkit.calibration.choosing.choice import Option
+from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.one_model import with_board_shape
 from rigkit.calibration.judging.verdicts import judge
-from rigkit.calibration.one_model import with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import Fit, fit_kept, posed
 from rigkit.calibration.solving.linearise import normal_equations

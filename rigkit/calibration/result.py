@@ -10,8 +10,8 @@ from typing import Self
 import numpy as np
 
 from rigkit.calibration.board_shape import BoardShape
-from rigkit.calibration.clustered import effective_freedom, widening
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
+from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera, pupil_shift_of_rays_mm

@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.choice import SURELY, Option, choose, described
+from rigkit.calibration.choosing.choice import SURELY, Option, choose, described
+from rigkit.calibration.choosing.models_tried import Request, compared, enough_agree, reweighted
+from rigkit.calibration.choosing.one_model import Solved, on_same_images, with_board_shape
 from rigkit.calibration.judging.pupil import BY_CHANCE
-from rigkit.calibration.models_tried import Request, compared, enough_agree, reweighted
-from rigkit.calibration.one_model import Solved, on_same_images, with_board_shape
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, identifiable, posed, robust_sigma
 from rigkit.calibration.solving.outliers import inliers

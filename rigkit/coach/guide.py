@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rigkit.calibration.begun import Begun
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.choosing.begun import Begun
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera

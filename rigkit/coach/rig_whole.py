@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.begun import Begun
+from rigkit.calibration.choosing.begun import Begun
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration

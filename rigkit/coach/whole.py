@@ -13,10 +13,10 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
-from rigkit.calibration.begun import Begun, begin
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.models_tried import Request
+from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.choosing.begun import Begun, begin
+from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.detections import BoardView

@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rigkit.calibration.uncertainty import projection_design
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, IntArray, Pixels, Rays

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.displaced import LensModes, lens_modes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes, lens_modes, with_modes
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.camera_prior import camera_prior
+from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.shape import WARP_UNKNOWNS, ShapeModel, warp_of_board
 from rigkit.calibration.solving.state import State
-from rigkit.calibration.uncertainty import projection_design
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels

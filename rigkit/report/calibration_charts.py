@@ -10,8 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from rigkit.calibration.certainty.uncertainty import projection_uncertainty
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.core.arrays import FloatArray
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.report import svg

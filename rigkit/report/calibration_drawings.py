@@ -9,9 +9,9 @@ from html import escape
 
 import numpy as np
 
-from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.certainty.coverage import outline_of_corners
+from rigkit.calibration.certainty.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import projection_uncertainty, uncertainty_map
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.report import svg

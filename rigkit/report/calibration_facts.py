@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import FarProjection, uncertainty_map
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.uncertainty import FarProjection, uncertainty_map
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Severity, gravest_first, worst

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.core.findings import Severity
 from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties

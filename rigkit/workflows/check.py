@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.calibration.clustered import with_block
-from rigkit.calibration.displaced import lens_of
+from rigkit.calibration.certainty.displaced import lens_of
 from rigkit.calibration.pupil import SolvedPupil
+from rigkit.calibration.solving.clustered import with_block
 from rigkit.calibration.views.usable import other_size, views_of_image, without_lookalikes, without_parts
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from rigkit.affine.directions import Support
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigkit.calibration.coverage import outline_of_corners
+from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import Pixels

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.calibration.hand_eye import HandEye, hand_eye
-from rigkit.calibration.uncertainty import pose_covariance_of_lens
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import board_from_afar
 from rigkit.cameras.moving_pupil import NearCamera, far_camera

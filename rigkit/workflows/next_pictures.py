@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.layout import Layout
 from rigkit.cameras.base import Camera

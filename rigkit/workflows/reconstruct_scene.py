@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rigkit.affine.correspondences import Correspondences
 from rigkit.affine.features import TILTS, match_affine_features
 from rigkit.affine.from_points import are_rough, with_affinities
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair

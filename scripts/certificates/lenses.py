@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigkit.calibration.displaced import DisplacedCamera
+from rigkit.calibration.certainty.displaced import DisplacedCamera
 from rigkit.cameras.base import Camera, RadialCurve
 from rigkit.cameras.radial import FocalCamera, ScaleDerivatives
 from rigkit.core.arrays import BoolArray, FloatArray

@@ -17,11 +17,11 @@ from helpers.board_rig_scenes import DIFFERENT, corner_of_a_room, target_views
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import projection_uncertainty
 from rigkit.calibration.hand_eye import hand_eye
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.uncertainty import projection_uncertainty
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import FloatArray

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
-from rigkit.calibration.coverage import covered_by_boards
 from rigkit.calibration.judging.captured import ASKED_DEG
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError

@@ -14,7 +14,7 @@ import numpy as np
 from split_halves import load
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, Pixels

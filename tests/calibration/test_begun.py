@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
-from rigkit.calibration.begun import begin
 from rigkit.calibration.calibrate import calibrate_together
-from rigkit.calibration.models_tried import Request
+from rigkit.calibration.choosing.begun import begin
+from rigkit.calibration.choosing.models_tried import Request
 from rigkit.core.detections import BoardView
 from rigkit.core.progress import silent
 
@@ -39,7 +39,7 @@ def test_what_is_known_of_a_camera_is_not_found_again(views: list[BoardView], mo
         raise AssertionError("done again")
 
     for step in ("begun.fit_all", "begun.solved", "lens_choice.fit_other_lens", "lens_choice.heldout_squares"):
-        monkeypatch.setattr(f"rigkit.calibration.{step}", again)
+        monkeypatch.setattr(f"rigkit.calibration.choosing.{step}", again)
     (found,) = calibrate_together(in_rig, known=[known])
     np.testing.assert_array_equal(found.camera.parameters, expected.camera.parameters)
     np.testing.assert_array_equal(found.frame_covariance, expected.frame_covariance)

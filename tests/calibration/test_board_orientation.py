@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, projection_difference, random_views
 
-from rigkit.calibration.board_orientation import _improved, board_turn, same_looks, with_views_turned
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.choosing.board_orientation import _improved, board_turn, same_looks, with_views_turned
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.state import State, evaluate
 from rigkit.calibration.views.observations import Observations

@@ -19,11 +19,11 @@ from helpers.calibration_scenes import (
 )
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.solving.fit import fit_model, robust_sigma
 from rigkit.calibration.solving.initialise import initialise
 from rigkit.calibration.solving.poses import find_poses
 from rigkit.calibration.solving.state import State, evaluate
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.double_sphere import DoubleSphere
 from rigkit.cameras.registry import MODELS

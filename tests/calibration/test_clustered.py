@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, lens, random_views
 
-from rigkit.calibration import clustered
 from rigkit.calibration.assemble import assemble
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.clustered import clustered_covariance, with_block
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.solving import clustered
+from rigkit.calibration.solving.clustered import clustered_covariance, with_block
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations

@@ -9,9 +9,9 @@ from helpers.calibration_scenes import REACH_DEG, lens, random_views
 
 from rigkit.calibration import compare
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.clustered import drawn_errors
 from rigkit.calibration.compare import compare_calibrations
 from rigkit.calibration.result import Calibration
+from rigkit.calibration.solving.clustered import drawn_errors
 
 SEEDS = 6
 MOVED_PX = 3.0

@@ -10,10 +10,10 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.departures import Departures
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.departures import Departures
+from rigkit.calibration.certainty.uncertainty import Along, FarProjection, projection_uncertainty
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import Along, FarProjection, projection_uncertainty
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray

@@ -9,11 +9,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_modes, uncertain_camera, with_modes
+from rigkit.calibration.certainty.series import Remainder
+from rigkit.calibration.certainty.uncertainty import FarProjection, _projected, projection_design
 from rigkit.calibration.result import Calibration, Rival
-from rigkit.calibration.series import Remainder
-from rigkit.calibration.uncertainty import FarProjection, _projected, projection_design
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.uncertain import UncertainCamera
@@ -195,5 +195,5 @@ def test_amounts_that_no_camera_has_are_passed_over(monkeypatch: pytest.MonkeyPa
             raise InputError("beyond")
         return DisplacedCamera(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("rigkit.calibration.displaced.DisplacedCamera", refused)
+    monkeypatch.setattr("rigkit.calibration.certainty.displaced.DisplacedCamera", refused)
     assert np.isfinite(lens_modes(calibration).modes).all() and len(asked) > 1

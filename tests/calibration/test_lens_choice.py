@@ -9,17 +9,17 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, projection_difference, random_views
 
 from rigkit.calibration import calibrate as module
-from rigkit.calibration import uncertainty
-from rigkit.calibration.between_models import rival_fits, rival_shapes
 from rigkit.calibration.calibrate import calibrate, calibrate_together
-from rigkit.calibration.choice import HeldOut, Option, choose, described, settled
-from rigkit.calibration.lens_choice import Lenses, choose_lenses, twins
-from rigkit.calibration.models_tried import Request
-from rigkit.calibration.one_model import Solved
+from rigkit.calibration.certainty import uncertainty
+from rigkit.calibration.certainty.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
+from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
+from rigkit.calibration.choosing.choice import HeldOut, Option, choose, described, settled
+from rigkit.calibration.choosing.lens_choice import Lenses, choose_lenses, twins
+from rigkit.calibration.choosing.models_tried import Request
+from rigkit.calibration.choosing.one_model import Solved
 from rigkit.calibration.result import Rival
 from rigkit.calibration.solving.fit import Fit, fit_model
 from rigkit.calibration.solving.solver import Convergence
-from rigkit.calibration.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cameras.registry import camera_model

@@ -9,8 +9,8 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.judging.mixed import two_cameras
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.folds import folds_of
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.core.arrays import FloatArray

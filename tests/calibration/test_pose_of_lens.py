@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.calibration_scenes import lens
 
-from rigkit.calibration.uncertainty import pose_covariance_of_lens
+from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.core.boards import Board
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3

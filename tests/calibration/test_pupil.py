@@ -9,15 +9,15 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.judging.changing import changing
+from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.pupil import BY_CHANCE, MovingPupil
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.judging.view_evidence import view_evidence
-from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.with_pupil import CENTRAL, MOVING
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera

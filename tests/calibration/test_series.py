@@ -9,11 +9,11 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.coverage import covered_by_boards
-from rigkit.calibration.departures import amounts_of
+from rigkit.calibration.certainty.coverage import covered_by_boards
+from rigkit.calibration.certainty.departures import amounts_of
+from rigkit.calibration.certainty.series import LEFT_OUT
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.series import LEFT_OUT
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView

@@ -7,7 +7,7 @@ import pytest
 from helpers.calibration_scenes import lens
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.uncertainty import projection_uncertainty
+from rigkit.calibration.certainty.uncertainty import projection_uncertainty
 from rigkit.calibration.views.usable import views_of_image
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView

@@ -12,9 +12,9 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION, changing
+from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.judging.view_evidence import view_evidence
-from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.cameras.base import Camera

@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from helpers.sentinel_scenes import best_held
 
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach, Take

@@ -13,8 +13,8 @@ import pytest
 from coach.test_coach import BOARD, CAMERA, SIZE, ask, options, picture
 from helpers.calibration_scenes import noisy_view
 
-from rigkit.calibration.displaced import uncertain_camera
-from rigkit.calibration.models_tried import Request
+from rigkit.calibration.certainty.displaced import uncertain_camera
+from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.coach.coach import Coach, Take

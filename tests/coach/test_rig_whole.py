@@ -14,7 +14,7 @@ import pytest
 from coach.test_coach import BOARD, SIZE
 from coach.test_rig import REACH, both, shared_boards
 
-from rigkit.calibration.displaced import uncertain_camera
+from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration

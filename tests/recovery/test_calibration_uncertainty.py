@@ -9,11 +9,11 @@ import pytest
 from helpers.calibration_scenes import BOARD, REACH_DEG, SIZE, lens, random_views
 
 from rigkit.calibration.assemble import assemble
+from rigkit.calibration.certainty.uncertainty import Along, FarProjection, projection_uncertainty, uncertainty_map
 from rigkit.calibration.solving.fit import fit_kept
 from rigkit.calibration.solving.initialise import initialise
 from rigkit.calibration.solving.solver import Convergence, solve
 from rigkit.calibration.solving.state import State
-from rigkit.calibration.uncertainty import Along, FarProjection, projection_uncertainty, uncertainty_map
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.registry import MODELS
 from rigkit.geometry.rotation import exp_so3

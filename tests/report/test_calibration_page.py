@@ -13,9 +13,9 @@ from helpers.calibration_scenes import BOARD, lens, random_views, with_outliers
 from report.test_page_in_browser import MIN_FONT_PX, measured_at_widths
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.certainty.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
-from rigkit.calibration.uncertainty import FarProjection, projection_uncertainty
 from rigkit.calibration.with_pupil import CENTRAL, MOVING, kept_central
 from rigkit.cameras.eucm import EUCM
 from rigkit.cli.calibration_words import describe

@@ -12,7 +12,7 @@ from helpers.calibration_scenes import REACH_DEG, lens, noisy_view, random_views
 from helpers.sentinel_scenes import NOISE_PX, best_held, changed_lens, checked, poses_held
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.displaced import DisplacedCamera, lens_of
+from rigkit.calibration.certainty.displaced import DisplacedCamera, lens_of
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board

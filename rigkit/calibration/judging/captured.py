@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.coverage import corner_ranges, covered_by_boards
+from rigkit.calibration.certainty.coverage import corner_ranges, covered_by_boards
+from rigkit.calibration.certainty.uncertainty import FarProjection, worst_direction
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import FarProjection, worst_direction
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels, Rays, quantiles_of
 from rigkit.core.findings import Finding, Severity

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.clustered import reduced_by_cluster
 from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, UNTRUE, min_of_a_kind
+from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
 from rigkit.calibration.solving.state import State, weighted_squares

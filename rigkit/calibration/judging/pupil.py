@@ -23,9 +23,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.clustered import MIN_LEFT
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.judging.captured import SMALL_PX
 from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
+from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.view_evidence import (
     CHANGE_COLUMNS,
     MIN_TELLING_CORNERS,
@@ -36,9 +37,8 @@ from rigkit.calibration.judging.view_evidence import (
     rows_of,
     without_pose,
 )
-from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
-from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.solving.clustered import MIN_LEFT
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
 from rigkit.kernels.departures import displacements

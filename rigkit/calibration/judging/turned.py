@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, view_results
-from rigkit.calibration.board_orientation import with_views_turned
+from rigkit.calibration.choosing.board_orientation import with_views_turned
 from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration

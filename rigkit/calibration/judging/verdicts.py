@@ -12,6 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
+from rigkit.calibration.certainty.uncertainty import FarProjection
+from rigkit.calibration.choosing.models_tried import DISAGREES_WITH_VIEWS
 from rigkit.calibration.judging.boards import judge_boards
 from rigkit.calibration.judging.captured import (
     ASKED_DEG,
@@ -25,13 +27,11 @@ from rigkit.calibration.judging.captured import (
 from rigkit.calibration.judging.changing import CHANGES, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
+from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
 from rigkit.calibration.judging.two_kinds import APART, min_of_a_kind
-from rigkit.calibration.models_tried import DISAGREES_WITH_VIEWS
-from rigkit.calibration.neighbours import neighbour_correlation
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.calibration.views.usable import GRIDS_BESIDE

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, view_results
-from rigkit.calibration.clustered import Clustered, effective_freedom
-from rigkit.calibration.covariance import GlobalCovariance
+from rigkit.calibration.certainty.covariance import GlobalCovariance
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.pupil import SolvedPupil, without_pupil
 from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
@@ -22,7 +22,7 @@ from rigkit.calibration.rig.pose_jacobians import pose_jacobians, pose_products
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
 from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.rig.state import RigState
-from rigkit.calibration.uncertainty import FarProjection
+from rigkit.calibration.solving.clustered import Clustered, effective_freedom
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board

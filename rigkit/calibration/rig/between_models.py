@@ -1,4 +1,4 @@
-"""What nobody knows of a rig because nobody knows its lenses' models: `rigkit.calibration.between_models` for a rig.
+"""What nobody knows of a rig because nobody knows its lenses' models: `choosing.between_models` for a rig.
 
 The rig is solved again with each rival of its lenses, of all cameras that have it at once: cameras that are alike have
 one model, whichever that is.
@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.between_models import same_model, spread_rays
+from rigkit.calibration.certainty.uncertainty import followed
+from rigkit.calibration.choosing.between_models import same_model, spread_rays
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import solve_rig
 from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
-from rigkit.calibration.uncertainty import followed
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, Mat3, Rays

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.clustered import widening
+from rigkit.calibration.solving.clustered import widening
 from rigkit.core.arrays import FloatArray, Points, keep_arrays
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError

@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
-from rigkit.calibration.begun import Begun
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.models_tried import Request
+from rigkit.calibration.choosing.begun import Begun
+from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig

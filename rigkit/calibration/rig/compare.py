@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.clustered import drawn_errors
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.compare import SAME_CHANCE
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.uncertainty import projection_design
+from rigkit.calibration.solving.clustered import drawn_errors
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.core.arrays import FloatArray, scaled_pinv

@@ -1,6 +1,6 @@
 """What the lenses of a rig may do beyond their models, and how all that was solved for moves with it.
 
-As a camera alone (`rigkit.calibration.displaced`); in a rig the poses of the boards are those of all cameras, so that
+As a camera alone (`certainty.displaced`); in a rig the poses of the boards are those of all cameras, so that
 mounts move along with a lens's displacements: globals follow by the rig's normal equations, the boards' shape held.
 """
 
@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.displaced import LensModes, telling_modes
+from rigkit.calibration.certainty.displaced import LensModes, telling_modes
+from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.solving.state import State
-from rigkit.calibration.uncertainty import FarProjection
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.geometry.rotation import skew

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.board_orientation import same_looks
+from rigkit.calibration.choosing.board_orientation import same_looks
 from rigkit.calibration.rig.observations import (
     FrameObservations,
     Observation,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigkit.calibration.heldout import MIN_IMAGES_OF_FIT
+from rigkit.calibration.choosing.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
 from rigkit.calibration.rig.solver import refine_frames, solve_rig
 from rigkit.calibration.rig.state import RigObservations

@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.covariance import PoseJacobians
+from rigkit.calibration.certainty.covariance import PoseJacobians
 from rigkit.calibration.rig.flatness import CHANCE_SIGMAS
 from rigkit.calibration.rig.pose_jacobians import pose_jacobians, summed_products
 from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.core.arrays import FloatArray, scaled_pinv
 from rigkit.core.identifiers import natural_key

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.board_orientation import board_turn, same_looks
+from rigkit.calibration.choosing.board_orientation import board_turn, same_looks
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera

@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.clustered import effective_freedom, widening
-from rigkit.calibration.displaced import LensModes, with_modes
+from rigkit.calibration.certainty.displaced import LensModes, with_modes
 from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, keep_arrays

@@ -34,7 +34,7 @@ class Instrument:
     ----------
     names, cameras, cam_from_rig : of one or of two cameras, in this order.
     covariance : (P, P) of the intrinsics, camera by camera; what a lens may do beyond its model is among them
-        (`rigkit.calibration.displaced`). Of two cameras also of both mounts, six each: left perturbation in rad and
+        (`calibration.certainty.displaced`). Of two cameras also of both mounts, six each: left perturbation in rad and
         translation in mm, zero for the camera that is the rig's frame.
     sigma_px : standard deviation of a measured corner per coordinate.
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rigkit.calibration.clustered import reduced_by_cluster
-from rigkit.calibration.displaced import lens_of
+from rigkit.calibration.certainty.displaced import lens_of
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.pose_jacobians import pose_jacobians_of_mount, summed_products
+from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.outliers import inliers, sigma_of
 from rigkit.calibration.solving.poses import refine_poses
@@ -46,7 +46,7 @@ class Watched:
     ----------
     names, cameras, cam_from_rig : of one camera or of all of a rig, the first its frame: cameras of points in mm, a
         `NearCamera` where the pupil moves. What a lens may do beyond its model is among the parameters of a camera
-        (`rigkit.calibration.displaced`), after those of the model and before those of the pupil.
+        (`rigkit.calibration.certainty.displaced`), after those of the model and before those of the pupil.
     covariance : (T, T) of theta.
     sigma_px, overdispersion : of a corner, and by how much more images disagree than independent corners would.
     scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured; 0 where

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.displaced import lens_of
-from rigkit.calibration.uncertainty import projection_design
+from rigkit.calibration.certainty.displaced import lens_of
+from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import far_camera

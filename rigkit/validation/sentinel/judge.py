@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import fdtrc
 
-from rigkit.calibration.clustered import LARGE_FREEDOM
+from rigkit.calibration.solving.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import Goal

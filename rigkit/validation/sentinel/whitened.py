@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.clustered import effective_freedom
+from rigkit.calibration.solving.clustered import effective_freedom
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched

@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choice import HeldOut, Option
-from rigkit.calibration.covariance import motion_of_world
+from rigkit.calibration.certainty.covariance import motion_of_world
+from rigkit.calibration.certainty.uncertainty import followed
+from rigkit.calibration.choosing.choice import HeldOut, Option
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.solving.fit import Fit, fit_other_lens
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.state import State
-from rigkit.calibration.uncertainty import followed
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera, far_camera

@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.choice import Option
-from rigkit.calibration.lens_choice import Lenses, lenses_on_boards, lenses_on_flat_boards
-from rigkit.calibration.models_tried import ModelInQuestion, Request, fit_all, wanted_models
-from rigkit.calibration.one_model import Solved, only, solved
+from rigkit.calibration.choosing.choice import Option
+from rigkit.calibration.choosing.lens_choice import Lenses, lenses_on_boards, lenses_on_flat_boards
+from rigkit.calibration.choosing.models_tried import ModelInQuestion, Request, fit_all, wanted_models
+from rigkit.calibration.choosing.one_model import Solved, only, solved
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers

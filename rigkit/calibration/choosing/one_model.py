@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.board_orientation import turned_views, with_views_turned
-from rigkit.calibration.choice import SURELY, Option, choose, described
-from rigkit.calibration.models_tried import (
+from rigkit.calibration.choosing.board_orientation import turned_views, with_views_turned
+from rigkit.calibration.choosing.choice import SURELY, Option, choose, described
+from rigkit.calibration.choosing.models_tried import (
     ModelInQuestion,
     Request,
     agreeing,

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.departures import amounts_of
+from rigkit.calibration.certainty.departures import amounts_of
 from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray
 

@@ -22,8 +22,8 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigkit.calibration.certainty.uncertainty import Along, FarProjection
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.uncertainty import Along, FarProjection
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import grid_pixels
 from rigkit.cameras.moving_pupil import NearCamera

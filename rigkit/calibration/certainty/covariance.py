@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
+from rigkit.calibration.solving.clustered import Clustered, clustered_covariance, reduced_by_cluster, with_block
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.core.arrays import FloatArray, IntArray, Points
 from rigkit.geometry.rotation import skew

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choice import SURELY, HeldOut, Option, choose, settled
-from rigkit.calibration.heldout import heldout_squares
-from rigkit.calibration.models_tried import Request, agreeing, compared, fit_of_views, reweighted
-from rigkit.calibration.one_model import Solved
+from rigkit.calibration.choosing.choice import SURELY, HeldOut, Option, choose, settled
+from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, fit_of_views, reweighted
+from rigkit.calibration.choosing.one_model import Solved
 from rigkit.calibration.solving.fit import fit_other_lens
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera

@@ -25,9 +25,9 @@ from functools import cached_property
 
 import numpy as np
 
-from rigkit.calibration.departures import Departures, information_of_lens, turned_rays
+from rigkit.calibration.certainty.departures import Departures, information_of_lens, turned_rays
+from rigkit.calibration.certainty.series import TERMS, Remainder
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
-from rigkit.calibration.series import TERMS, Remainder
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.departures import SMALLEST_PX
+from rigkit.calibration.certainty.departures import SMALLEST_PX
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.fit import Fit
 from rigkit.core.arrays import BoolArray, FloatArray

@@ -1,0 +1,1 @@
+"""How sure a calibration is, over the image and beyond its model."""
