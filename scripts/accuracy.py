@@ -22,7 +22,7 @@ from rigkit.cameras.base import Camera
 from rigkit.cli.console import progress_on_stderr
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, nearest_rotation, rotation_angle
-from rigkit.io.manifest import load_dataset
+from rigkit.io.manifests.manifest import load_dataset
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors

@@ -26,7 +26,7 @@ from rigkit.core.cloud import OrientedCloud
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, log_so3, rotation_angle, unit
 from rigkit.interop.open3d import poisson_mesh
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 from rigkit.reconstruction.scene import reconstruct_scene

@@ -21,8 +21,8 @@ import numpy as np
 from rigkit.cameras.brown import Brown
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
-from rigkit.io.board_file import board_text
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.boards.board_file import board_text
+from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics

@@ -34,8 +34,8 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.board_file import load_board
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
 from rigkit.synthetic.scene import PlacedBoard

@@ -43,8 +43,8 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.detect import detect_boards
-from rigkit.io.board_words import board_of_words
-from rigkit.io.images import IMAGE_ENDINGS, read_image
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.media.images import IMAGE_ENDINGS, read_image
 
 AS_IS = ("as it is", 0.0)
 DEGRADATIONS = (

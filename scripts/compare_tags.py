@@ -37,9 +37,9 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.board_file import load_board
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.media.images import read_image
 
 BLUR_PX, NOISE_LEVELS = 0.7, 2.0
 

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import RigkitError
-from rigkit.io.manifest import Dataset, Pair, load_dataset
-from rigkit.io.session import load_session
+from rigkit.io.manifests.manifest import Dataset, Pair, load_dataset
+from rigkit.io.manifests.session import load_session
 from rigkit.workflows.calibrate import calibration_from
 from rigkit.workflows.inputs.corners import session_corners
 from rigkit.workflows.pairs import match_images, reconstruct_with

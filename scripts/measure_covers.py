@@ -34,8 +34,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.lattice.local_fit import fit_cells
-from rigkit.io.board_words import board_of_words
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.media.images import read_image
 
 KINDS = ("flat", "texture", "hand")
 IN_VIEW, FALSE_CELLS, FALSE_PX, UNSURE_CELLS = 0.5, 0.1, 1.0, 0.05

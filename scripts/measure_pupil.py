@@ -47,7 +47,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, nearest_rotation
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.media.images import read_image, to_grey
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.geometry import pair_geometry
 from rigkit.reconstruction.pairing import match_pair

@@ -27,8 +27,8 @@ from rigkit.affine.features import match_affine_features
 from rigkit.cameras.uncertain import UncertainPair
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import RigkitError
-from rigkit.io.images import read_image
-from rigkit.io.rig_file import load_saved_rig
+from rigkit.io.calibrations.rig_file import load_saved_rig
+from rigkit.io.media.images import read_image
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose

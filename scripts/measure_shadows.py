@@ -25,8 +25,8 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
-from rigkit.io.board_words import board_of_words
-from rigkit.io.images import IMAGE_ENDINGS, read_image
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.media.images import IMAGE_ENDINGS, read_image
 
 NEAR_PX = 12.0
 """So far from a shadow's edge corners are near it."""

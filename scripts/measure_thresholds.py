@@ -59,7 +59,7 @@ from rigkit.detection.lattices import Seen, candidates
 from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image
 from rigkit.detection.subpixel.subpixel import refine
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 
 SIZES_PX = ((640, 480), (1280, 960), (320, 240))
 MIN_CORNERS = 12

@@ -30,8 +30,8 @@ from detectors.degradations import degraded, eight_bit
 from rigkit.calibration.compare import CameraVerdict, compare_calibrations
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import RigkitError
-from rigkit.io.board_words import words_of_board
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_words import words_of_board
+from rigkit.io.media.images import read_image
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
 from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.inputs.corners import Cache

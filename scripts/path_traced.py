@@ -32,7 +32,7 @@ from traced.sensor import JPEG_QUALITY, develop
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.board_file import board_text
+from rigkit.io.boards.board_file import board_text
 
 LABORATORY = "laboratory"
 

@@ -50,8 +50,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.detection.detect import detect_boards
-from rigkit.io.board_words import board_in_words
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_words import board_in_words
+from rigkit.io.media.images import read_image
 
 Views = dict[str, list[BoardView]]
 """What each image shows, by its name."""

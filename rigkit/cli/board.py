@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.core.boards import Board
-    from rigkit.io.board_words import board_in_words
+    from rigkit.io.boards.board_words import board_in_words
     from rigkit.workflows.print_board import PrintOptions, print_board
 
     if args.size == "identify":

@@ -13,9 +13,9 @@ def identify(args: argparse.Namespace) -> int:
     """Print which board the images show, write its file where one is named, and return the exit code."""
     from rigkit.cli.console import note, progress_on_stderr
     from rigkit.detection.twins import ALIKE_REMEDY
-    from rigkit.io.board_file import board_text
-    from rigkit.io.files import ensure_writable, write_atomic
-    from rigkit.io.video import is_video
+    from rigkit.io.boards.board_file import board_text
+    from rigkit.io.disk.writing import ensure_writable, write_atomic
+    from rigkit.io.media.video import is_video
     from rigkit.workflows.detect import images_in
     from rigkit.workflows.inputs.identify_board import identify_board
 

@@ -30,7 +30,7 @@ def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
 
 def summary(calibration: Calibration) -> dict[str, Any]:
     """Return the figures for programs."""
-    from rigkit.io.calibration_file import camera_to_json
+    from rigkit.io.calibrations.calibration_file import camera_to_json
 
     camera = calibration.camera
     return {

@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, note_written, options_of, print_json, print_statement, progress_on_stderr
-    from rigkit.io.board_words import board_files, board_of_words
-    from rigkit.io.files import ensure_writable
+    from rigkit.io.boards.board_words import board_files, board_of_words
+    from rigkit.io.disk.writing import ensure_writable
     from rigkit.report.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
     from rigkit.workflows.check import CheckOptions, check_pictures

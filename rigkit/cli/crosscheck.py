@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.io.manifest import load_dataset
+    from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import tables_to_text
     from rigkit.workflows.crosscheck import crosscheck_dataset
     from rigkit.workflows.datasets import DatasetOptions

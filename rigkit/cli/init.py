@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _session(args: argparse.Namespace) -> int:
-    from rigkit.io.files import write_together
+    from rigkit.io.disk.writing import write_together
     from rigkit.workflows.inputs.folder_session import session_of_folders
 
     if (

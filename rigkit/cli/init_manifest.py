@@ -20,12 +20,12 @@ from rigkit.cli.manifest_words import (
     told_poses,
 )
 from rigkit.core.errors import ExitCode, InputError
-from rigkit.io.reading import usable_path
+from rigkit.io.disk.reading import usable_path
 
 
 def run_manifest(args: argparse.Namespace) -> int:
-    from rigkit.io.files import ensure_writable
-    from rigkit.io.manifest_writer import NewManifest, find_images
+    from rigkit.io.disk.writing import ensure_writable
+    from rigkit.io.manifests.manifest_writer import NewManifest, find_images
     from rigkit.workflows.new_manifest import find_pairs, name_of_folder, write_manifest
 
     if args.model:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TextIO
 
 from rigkit.core.errors import InputError, printable
-from rigkit.io.reading import usable_path
+from rigkit.io.disk.reading import usable_path
 
 FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 LINE = re.compile(rb"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} [A-Z]+ rigkit")

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
 from rigkit.core.posetype import PoseType
-from rigkit.io.reading import usable_path
+from rigkit.io.disk.reading import usable_path
 
 if TYPE_CHECKING:
-    from rigkit.io.manifest_writer import ToldBoard
+    from rigkit.io.manifests.manifest_writer import ToldBoard
 
 POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
@@ -60,7 +60,7 @@ def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
 
 def _of_rigs(told: Sequence[str]) -> list[str]:
     """Return what is told with every rig's file replaced by those of its cameras, NAME=FILE."""
-    from rigkit.io.rig_file import is_rig_file
+    from rigkit.io.calibrations.rig_file import is_rig_file
     from rigkit.workflows.inputs.camera_files import own_files
 
     out: list[str] = []
@@ -73,9 +73,9 @@ def _of_rigs(told: Sequence[str]) -> list[str]:
 
 def told_boards(words: Sequence[str]) -> list[ToldBoard]:
     """Return the boards that are told: files keep their names, words are called plane1, plane2, ... in their order."""
-    from rigkit.io.board_file import load_board
-    from rigkit.io.board_words import board_in_words
-    from rigkit.io.manifest_writer import ToldBoard
+    from rigkit.io.boards.board_file import load_board
+    from rigkit.io.boards.board_words import board_in_words
+    from rigkit.io.manifests.manifest_writer import ToldBoard
 
     out = []
     for number, text in enumerate(words, start=1):

@@ -67,8 +67,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.io.board_words import board_files, board_of_words
-    from rigkit.io.files import ensure_writable
+    from rigkit.io.boards.board_words import board_files, board_of_words
+    from rigkit.io.disk.writing import ensure_writable
     from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
     if (args.source is None) == (args.lens is None):

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         if direction_options(args):
             raise InputError("reconstruct: --directions and --det-scale are about boards, and a scene has none")
         return run_scene(args)
-    from rigkit.io.manifest import load_dataset
+    from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
     from rigkit.workflows.reconstruct import ReconstructOptions, reconstruct_dataset
 

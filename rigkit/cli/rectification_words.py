@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 def image_to_dict(one: RectifiedImage, projection: str) -> dict[str, Any]:
     """Return what a program needs to know."""
-    from rigkit.io.calibration_file import camera_to_json
+    from rigkit.io.calibrations.calibration_file import camera_to_json
 
     target = one.map.target
     return {

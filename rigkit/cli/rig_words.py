@@ -12,7 +12,7 @@ from rigkit.core.printing import length_words
 
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
-    from rigkit.io.rig_session import RigSession
+    from rigkit.io.manifests.rig_session import RigSession
     from rigkit.report.page_facts import PageFacts
     from rigkit.validation.check import Check
 

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.io.files import write_atomic
+    from rigkit.io.disk.writing import write_atomic
     from rigkit.io.schema import SCHEMAS, key_rows, schema_named, schema_text
 
     if args.name is None:

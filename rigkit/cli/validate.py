@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from rigkit.io.manifest import load_dataset
+    from rigkit.io.manifests.manifest import load_dataset
     from rigkit.workflows.paper import PaperOptions, validate_as_paper
     from rigkit.workflows.validate import validate_dataset
 

@@ -18,7 +18,7 @@ from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance, glance_at
 from rigkit.coach.rig import RigAdvice, RigGuide
 from rigkit.core.errors import InputError
-from rigkit.io.images import announced_sizes, quiet_opencv
+from rigkit.io.media.images import announced_sizes, quiet_opencv
 
 MAX_PICTURE_PX = 12000
 """Of a picture that a page sends."""

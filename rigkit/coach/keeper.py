@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.files import write_atomic
-from rigkit.io.images import read_image
-from rigkit.io.reading import read_text
-from rigkit.io.rig_session import ONE
+from rigkit.io.disk.reading import read_text
+from rigkit.io.disk.writing import write_atomic
+from rigkit.io.manifests.rig_session import ONE
+from rigkit.io.media.images import read_image
 
 _log = logging.getLogger(__name__)
 

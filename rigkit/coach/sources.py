@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import IMAGE_ENDINGS, read_image
-from rigkit.io.rig_session import frames_of_images
+from rigkit.io.manifests.rig_session import frames_of_images
+from rigkit.io.media.images import IMAGE_ENDINGS, read_image
 
 POLL_S = 0.3
 SETTLED_S = 0.2

@@ -1,1 +1,2 @@
-"""Files: manifests, calibrations, corners, clouds, images. Whole or not at all."""
+"""Files: what a person writes (`manifests`, `boards`), what cameras write (`media`), what the program writes
+(`calibrations`, `corners`, `ply`), each with its schema (`schema`). All through `disk`: whole or not at all."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rigkit.core.arrays import FloatArray, Normals, Points
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
-from rigkit.io.files import write_atomic
-from rigkit.io.reading import read_bytes
+from rigkit.io.disk.reading import read_bytes
+from rigkit.io.disk.writing import write_atomic
 
 PLY_TYPES = {
     "char": "i1",

@@ -6,13 +6,14 @@ import json
 from collections.abc import Iterator
 
 from rigkit.core.errors import InputError
-from rigkit.io import schema_calibration, schema_results
-from rigkit.io.board_file import BOARD_FILE
-from rigkit.io.manifest import DATASET_FILE
-from rigkit.io.public_set import PUBLIC_FILE
-from rigkit.io.schema_words import ANY_OF, Schema
-from rigkit.io.session import SESSION_FILE
-from rigkit.io.study_file import STUDY_FILE
+from rigkit.io import schema_results
+from rigkit.io.boards.board_file import BOARD_FILE
+from rigkit.io.calibrations import schema_calibration
+from rigkit.io.disk.schema_words import ANY_OF, Schema
+from rigkit.io.manifests.manifest import DATASET_FILE
+from rigkit.io.manifests.public_set import PUBLIC_FILE
+from rigkit.io.manifests.session import SESSION_FILE
+from rigkit.io.manifests.study_file import STUDY_FILE
 
 _OF_PEOPLE = (BOARD_FILE, DATASET_FILE, PUBLIC_FILE, SESSION_FILE, STUDY_FILE)
 _RESULTS = [

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rigkit.core.claims import Verdict
-from rigkit.io.history_file import HistoryEntry
-from rigkit.io.schema_words import (
+from rigkit.io.calibrations.history_file import HistoryEntry
+from rigkit.io.disk.schema_words import (
     ANY_OF,
     BOOLEAN,
     INTEGER,

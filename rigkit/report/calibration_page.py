@@ -14,7 +14,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.findings import gravest_first
 from rigkit.core.printing import brief
 from rigkit.core.tables import Table
-from rigkit.io.images import Image
+from rigkit.io.media.images import Image
 from rigkit.planning.plan import Plan
 from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
 from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg

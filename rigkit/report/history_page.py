@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Table, cells, columns
-from rigkit.io.history_file import Edition, HistoryEntry, editions
+from rigkit.io.calibrations.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
 from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG

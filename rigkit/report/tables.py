@@ -15,7 +15,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, without_nan
 from rigkit.core.printing import MAX_DECIMALS
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.io.reading import is_number
+from rigkit.io.disk.reading import is_number
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """What a spreadsheet takes for the beginning of a formula."""

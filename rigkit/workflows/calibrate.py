@@ -14,11 +14,11 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibration_file import calibration_text
-from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.reading import about
-from rigkit.io.rig_session import RigSession
-from rigkit.io.session import Session, files_of_session, load_session
+from rigkit.io.calibrations.calibration_file import calibration_text
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_together
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session, files_of_session, load_session
 from rigkit.workflows.export_camera import foreign_files, foreign_paths
 from rigkit.workflows.inputs.corners import (
     Cache,

@@ -11,13 +11,13 @@ from pathlib import Path
 
 from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.progress import Progress, silent
-from rigkit.io.board_words import board_of_words
-from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.images import IMAGE_ENDINGS
-from rigkit.io.reading import about, read_bytes, read_text, usable_path
-from rigkit.io.rig_session import RigSession, is_rig_session, load_rig_session
-from rigkit.io.session import SESSION_NAME, Session, load_session
-from rigkit.io.video import VIDEO_ENDINGS, is_video
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.disk.reading import about, read_bytes, read_text, usable_path
+from rigkit.io.disk.writing import ensure_writable, write_together
+from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig_session
+from rigkit.io.manifests.session import SESSION_NAME, Session, load_session
+from rigkit.io.media.images import IMAGE_ENDINGS
+from rigkit.io.media.video import VIDEO_ENDINGS, is_video
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.inputs.folder_session import boards_seen, session_of_folders

@@ -16,12 +16,12 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibration_file import calibration_text
-from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.reading import about
-from rigkit.io.rig_file import board_rigs_text, rig_text
-from rigkit.io.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
-from rigkit.io.session import Session, load_session
+from rigkit.io.calibrations.calibration_file import calibration_text
+from rigkit.io.calibrations.rig_file import board_rigs_text, rig_text
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_together
+from rigkit.io.manifests.rig_session import RigSession, frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.manifests.session import Session, load_session
 from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.checks import COVERAGE
 from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs

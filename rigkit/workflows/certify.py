@@ -11,9 +11,9 @@ from rigkit.cameras.moving_pupil import NearCamera
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
-from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file
+from rigkit.io.calibrations.rig_file import is_rig_file
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify

@@ -24,19 +24,19 @@ from rigkit.core.findings import Finding
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.calibration_file import (
+from rigkit.io.calibrations.calibration_file import (
     camera_to_json,
     findings_to_json,
     load_calibration,
     pupil_from_json,
     pupil_to_json,
 )
-from rigkit.io.files import ensure_writable, write_together
-from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
-from rigkit.io.images import read_image_of
-from rigkit.io.json_reader import json_text
-from rigkit.io.reading import about
-from rigkit.io.rig_file import SavedRig, is_rig_file, load_saved_rig
+from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register
+from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file, load_saved_rig
+from rigkit.io.disk.json_reader import json_text
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_together
+from rigkit.io.media.images import read_image_of
 from rigkit.report.check_page import check_facts, check_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task

@@ -29,10 +29,10 @@ from rigkit.core.findings import Severity, worst
 from rigkit.core.processes import worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.files import ensure_folder_writable
-from rigkit.io.rig_session import ONE
-from rigkit.io.session import SESSION_NAME
-from rigkit.io.video import Video
+from rigkit.io.disk.writing import ensure_folder_writable
+from rigkit.io.manifests.rig_session import ONE
+from rigkit.io.manifests.session import SESSION_NAME
+from rigkit.io.media.video import Video
 from rigkit.planning.goal import Goal
 from rigkit.planning.guess import check_field
 from rigkit.validation.certificate.contracts import Task

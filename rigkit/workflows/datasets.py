@@ -25,9 +25,9 @@ from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.errors import InputError, InternalError, RigkitError, interruption
 from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
-from rigkit.io.calibration_file import calibration_text, load_calibration_or_camera
-from rigkit.io.manifest import CameraEntry, Dataset, Pair, load_dataset
-from rigkit.io.reading import about
+from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration_or_camera
+from rigkit.io.disk.reading import about
+from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
 from rigkit.workflows.calibrate_rig import calibrate_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.inputs.paths import NamesFiles

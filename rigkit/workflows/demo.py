@@ -13,8 +13,8 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.core.processes import process_count
 from rigkit.core.progress import Progress, silent
-from rigkit.io.manifest import load_dataset
-from rigkit.io.reading import usable_path
+from rigkit.io.disk.reading import usable_path
+from rigkit.io.manifests.manifest import load_dataset
 from rigkit.synthetic.demo import build_demo
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache

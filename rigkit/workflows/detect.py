@@ -23,11 +23,11 @@ from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
 from rigkit.detection.twins import alike_boards
-from rigkit.io.board_words import board_of_words
-from rigkit.io.corners_file import write_corners
-from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
-from rigkit.io.video import is_video
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.corners.corners_file import write_corners
+from rigkit.io.disk.writing import ensure_writable, write_atomic
+from rigkit.io.media.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
+from rigkit.io.media.video import is_video
 from rigkit.report.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_video

@@ -12,7 +12,7 @@ from rigkit.calibration.compare import CameraVerdict
 from rigkit.calibration.rig.compare import RigDifference
 from rigkit.core.printing import length_words
 from rigkit.core.tables import Table, cells, columns
-from rigkit.io.files import write_atomic
+from rigkit.io.disk.writing import write_atomic
 from rigkit.report.figures import difference_png
 from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair

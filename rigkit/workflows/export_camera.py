@@ -16,10 +16,10 @@ from rigkit.core.printing import brief
 from rigkit.interop.camera_formats import FOREIGN_FORMATS
 from rigkit.interop.exchange import Written
 from rigkit.interop.rigs import RIG_FORMATS, Outlines, Rig, write_rig
-from rigkit.io.calibration_file import save_camera
-from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.calibrations.rig_file import is_rig_file, load_saved_rig
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic, write_together
 from rigkit.workflows.inputs.camera_files import import_camera, import_rig, own_calibration, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.formats import CAMERA_FORMATS, FOREIGN_ENDINGS
 from rigkit.workflows.inputs.paths import NamesFiles

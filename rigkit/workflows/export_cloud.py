@@ -16,8 +16,8 @@ from rigkit.core.planes import Planes
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.colmap_model import colmap_model
 from rigkit.interop.las import las_bytes
-from rigkit.io.files import ensure_writable, npz_bytes
-from rigkit.io.manifest import Dataset, load_dataset
+from rigkit.io.disk.writing import ensure_writable, npz_bytes
+from rigkit.io.manifests.manifest import Dataset, load_dataset
 from rigkit.io.ply import ply_bytes, ply_unit, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.workflows.datasets import load_cameras

@@ -22,13 +22,13 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.board_pose import BoardPose, board_poses
-from rigkit.io.board_words import board_of_words
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.images import read_image_of
-from rigkit.io.json_reader import json_text
-from rigkit.io.reading import about
-from rigkit.io.robot_poses import read_robot_poses
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.disk.json_reader import json_text
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic
+from rigkit.io.manifests.robot_poses import read_robot_poses
+from rigkit.io.media.images import read_image_of
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import import_near_camera
 from rigkit.workflows.inputs.identify_board import explained

@@ -15,10 +15,17 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
 from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, editions, ensure_register, load_history
-from rigkit.io.reading import about
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.calibrations.history_file import (
+    HistoryEntry,
+    add_entry,
+    as_seen_from,
+    editions,
+    ensure_register,
+    load_history,
+)
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.report.history_page import history_page, overwritten
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched

@@ -8,9 +8,9 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.interop.open3d import Mesh, poisson_mesh
-from rigkit.io.files import ensure_writable, write_atomic
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.ply import mesh_bytes, read_ply
-from rigkit.io.reading import about
 from rigkit.reconstruction.lines_of_sight import with_lines_of_sight
 from rigkit.workflows.inputs.paths import NamesFiles
 

@@ -13,10 +13,17 @@ from rigkit.core.identifiers import MAX_IDENTIFIER
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.files import write_atomic
-from rigkit.io.images import read_image, to_grey
-from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import FoundPair, ImageBoards, NewManifest, board_sizes, group_pairs, manifest_text
+from rigkit.io.disk.writing import write_atomic
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.manifest_writer import (
+    FoundPair,
+    ImageBoards,
+    NewManifest,
+    board_sizes,
+    group_pairs,
+    manifest_text,
+)
+from rigkit.io.media.images import read_image, to_grey
 from rigkit.workflows.inputs.identify_board import suggestion
 
 

@@ -17,8 +17,8 @@ from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.planes import Planes
 from rigkit.detection.detect import detect_boards
 from rigkit.identification.wrong_squares import fitting_squares
-from rigkit.io.images import read_image_of, to_grey
-from rigkit.io.manifest import Pair
+from rigkit.io.manifests.manifest import Pair
+from rigkit.io.media.images import read_image_of, to_grey
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts, calibration_shifts, with_calibrations
 from rigkit.reconstruction.geometry import PairGeometry, pair_geometry

@@ -12,8 +12,8 @@ from rigkit.core.errors import InputError, RigkitError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
-from rigkit.io.manifest import Dataset
-from rigkit.io.reading import csv_table, is_number
+from rigkit.io.disk.reading import csv_table, is_number
+from rigkit.io.manifests.manifest import Dataset
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
 from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files

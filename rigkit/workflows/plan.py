@@ -13,12 +13,12 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.files import ensure_writable, write_atomic
-from rigkit.io.reading import about
-from rigkit.io.rig_file import is_rig_file
-from rigkit.io.rig_session import is_rig_session
-from rigkit.io.session import load_session
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.calibrations.rig_file import is_rig_file
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic
+from rigkit.io.manifests.rig_session import is_rig_session
+from rigkit.io.manifests.session import load_session
 from rigkit.planning.candidates import Reach
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, Knowledge

@@ -8,9 +8,9 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
-from rigkit.io.board_file import board_text, load_layout
-from rigkit.io.files import write_atomic, write_together
-from rigkit.io.reading import about
+from rigkit.io.boards.board_file import board_text, load_layout
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import write_atomic, write_together
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.workflows.inputs.paths import NamesFiles
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from rigkit.core.errors import InputError
-from rigkit.io.corner_cache import image_hash
+from rigkit.io.corners.corner_cache import image_hash
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless")
 """Whose versions every result depends on."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from rigkit.core.planes import Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.manifest import Dataset
+from rigkit.io.manifests.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import pair_pictures

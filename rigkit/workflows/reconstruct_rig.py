@@ -18,7 +18,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.images import read_image_of
+from rigkit.io.media.images import read_image_of
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.fuse import FusedCloud, PosedCloud, fuse_clouds

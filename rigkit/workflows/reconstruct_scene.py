@@ -23,11 +23,11 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.correspondences import correspondences_text, read_correspondences
-from rigkit.io.files import npz_bytes
-from rigkit.io.images import read_image_of
+from rigkit.io.corners.correspondences import correspondences_text, read_correspondences
+from rigkit.io.disk.reading import about, read_text
+from rigkit.io.disk.writing import npz_bytes
+from rigkit.io.media.images import read_image_of
 from rigkit.io.ply import ply_bytes
-from rigkit.io.reading import about, read_text
 from rigkit.reconstruction.calibration_shifts import calibration_shifts, with_calibrations
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs

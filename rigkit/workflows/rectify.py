@@ -17,11 +17,11 @@ from rigkit.cameras.pinhole import camera_matrix
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.files import ensure_writable, npz_bytes, write_atomic, write_together
-from rigkit.io.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
-from rigkit.io.reading import about
-from rigkit.io.rig_session import frames_of_images
-from rigkit.io.video import Video, is_video
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, npz_bytes, write_atomic, write_together
+from rigkit.io.manifests.rig_session import frames_of_images
+from rigkit.io.media.images import Image, quiet_opencv, read_image_of, require_pixels, require_size
+from rigkit.io.media.video import Video, is_video
 from rigkit.rectification.crop import cropped
 from rigkit.rectification.rectify import RectifyMap, rectify_map, rotation_from_view_angles
 from rigkit.rectification.stereo import StereoRectification, rectify_pair

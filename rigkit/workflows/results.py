@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from rigkit.core.errors import InputError
-from rigkit.io.files import FORCE, ensure_folder_writable, ensure_writable, write_together
+from rigkit.io.disk.writing import FORCE, ensure_folder_writable, ensure_writable, write_together
 
 CALIBRATIONS = "calibrations"
 """Folder of results for cameras that were calibrated on the way."""

@@ -13,8 +13,8 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.identification.board_ids import LocatedBoard, assign_board_ids
 from rigkit.identification.placements import board_kinds
-from rigkit.io.corner_cache import FoundCorners
-from rigkit.io.rig_session import RigSession
+from rigkit.io.corners.corner_cache import FoundCorners
+from rigkit.io.manifests.rig_session import RigSession
 
 
 def require_distinct(session: RigSession) -> None:

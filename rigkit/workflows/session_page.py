@@ -9,9 +9,9 @@ from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.io.images import read_image
-from rigkit.io.rig_session import RigSession
-from rigkit.io.session import Session
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session
+from rigkit.io.media.images import read_image
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
 from rigkit.workflows.inputs.corners import SessionCorners, named_images

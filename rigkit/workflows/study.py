@@ -19,11 +19,11 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.processes import over_items, process_count
 from rigkit.core.progress import Progress, silent
-from rigkit.io.corner_cache import source_hash
-from rigkit.io.files import ensure_writable, write_atomic, write_together
-from rigkit.io.json_reader import json_text
-from rigkit.io.reading import about
-from rigkit.io.study_file import load_study
+from rigkit.io.corners.corner_cache import source_hash
+from rigkit.io.disk.json_reader import json_text
+from rigkit.io.disk.reading import about
+from rigkit.io.disk.writing import ensure_writable, write_atomic, write_together
+from rigkit.io.manifests.study_file import load_study
 from rigkit.report.study_figure import study_figure
 from rigkit.report.study_page import cell_table, study_page, study_tables
 from rigkit.report.tables import tables_to_csv, tables_to_markdown

@@ -14,8 +14,8 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.files import ensure_folder_writable, write_atomic
-from rigkit.io.public_set import PublicSet, load_public_set
+from rigkit.io.disk.writing import ensure_folder_writable, write_atomic
+from rigkit.io.manifests.public_set import PublicSet, load_public_set
 
 CATALOGUE = "datasets/public"
 """Where the descriptions are, from the folder of the project or any folder below it."""

@@ -16,7 +16,7 @@ from rigkit.core.findings import Finding, Severity
 from rigkit.core.planes import PLANE_CHOICES, Planes
 from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
-from rigkit.io.manifest import Dataset
+from rigkit.io.manifests.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.calibration_shifts import CalibrationShifts, with_calibrations

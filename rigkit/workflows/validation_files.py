@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from rigkit.calibration.result import Calibration
 from rigkit.core.printing import brief
-from rigkit.io.manifest import Dataset
+from rigkit.io.manifests.manifest import Dataset
 from rigkit.report.page import PairSection, build_page, validation_facts
 from rigkit.report.page_facts import PageFacts
 from rigkit.report.tables import TABLE_WRITERS, table_files

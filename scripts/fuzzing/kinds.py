@@ -26,7 +26,7 @@ def _camera_file(name: str, *more: tuple[str, ...]) -> Kind:
 
 
 def _board_file(name: str) -> Kind:
-    return Kind(name, (("rigkit.io.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b")))
+    return Kind(name, (("rigkit.io.boards.board_file:load_board", "{case}"), ("board", "{case}", "-o", "{out}/b")))
 
 
 def _video(name: str) -> Kind:
@@ -39,7 +39,7 @@ def _found_board(name: str, picture: str) -> Kind:
 
 
 MATCHES = (
-    ("rigkit.io.correspondences:read_correspondences", "{case}"),
+    ("rigkit.io.corners.correspondences:read_correspondences", "{case}"),
     ("reconstruct", "--correspondences", "{case}", "--rig", "rig.json", "--images", "scene1.png", "scene2.png", "-o",
      "{out}/new", "--sparse", "--no-pictures"),
 )  # fmt: skip
@@ -96,30 +96,30 @@ KINDS: dict[str, Kind] = {
     "png": Kind(
         "image.png",
         (
-            ("rigkit.io.images:read_image", "{case}"),
+            ("rigkit.io.media.images:read_image", "{case}"),
             ("detect", "-j", "1", "{case}"),
             ("board", "identify", "{case}"),
             ("pose", "{case}", "--camera", "calibration.json", "--board", "floor.toml"),
             ("rectify", "{case}", "--camera", "calibration.json", "-o", "{out}/new.png"),
         ),
     ),
-    "png16": Kind("deep.png", (("rigkit.io.images:read_image", "{case}"),)),
-    "jpg": Kind("image.jpg", (("rigkit.io.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
-    "tif": Kind("image.tif", (("rigkit.io.images:read_image", "{case}"),)),
-    "bmp": Kind("image.bmp", (("rigkit.io.images:read_image", "{case}"),)),
-    "pgm": Kind("image.pgm", (("rigkit.io.images:read_image", "{case}"),)),
-    "webp": Kind("image.webp", (("rigkit.io.images:read_image", "{case}"),)),
+    "png16": Kind("deep.png", (("rigkit.io.media.images:read_image", "{case}"),)),
+    "jpg": Kind("image.jpg", (("rigkit.io.media.images:read_image", "{case}"), ("detect", "-j", "1", "{case}"))),
+    "tif": Kind("image.tif", (("rigkit.io.media.images:read_image", "{case}"),)),
+    "bmp": Kind("image.bmp", (("rigkit.io.media.images:read_image", "{case}"),)),
+    "pgm": Kind("image.pgm", (("rigkit.io.media.images:read_image", "{case}"),)),
+    "webp": Kind("image.webp", (("rigkit.io.media.images:read_image", "{case}"),)),
     "board": _board_file("board.toml"),
     "aprilgrid": _board_file("aprilgrid.toml"),
     "circles": _board_file("circles.toml"),
-    "session": Kind("session.toml", (("rigkit.io.session:load_session", "{case}"),)),
-    "rig-session": Kind("rig-session.toml", (("rigkit.io.rig_session:load_rig_session", "{case}"),)),
-    "dataset": Kind("dataset.toml", (("rigkit.io.manifest:load_dataset", "{case}"),)),
-    "study": Kind("study.toml", (("rigkit.io.study_file:load_study", "{case}"),)),
+    "session": Kind("session.toml", (("rigkit.io.manifests.session:load_session", "{case}"),)),
+    "rig-session": Kind("rig-session.toml", (("rigkit.io.manifests.rig_session:load_rig_session", "{case}"),)),
+    "dataset": Kind("dataset.toml", (("rigkit.io.manifests.manifest:load_dataset", "{case}"),)),
+    "study": Kind("study.toml", (("rigkit.io.manifests.study_file:load_study", "{case}"),)),
     "calibration": Kind(
         "calibration.json",
         (
-            ("rigkit.io.calibration_file:load_calibration", "{case}"),
+            ("rigkit.io.calibrations.calibration_file:load_calibration", "{case}"),
             ("diff", "{case}", "calibration.json"),
             ("plan", "{case}", "-n", "1"),
             ("certify", "{case}", "--length", "200", "--distance", "900"),
@@ -155,7 +155,7 @@ KINDS: dict[str, Kind] = {
     "rig": Kind(
         "rig.json",
         (
-            ("rigkit.io.rig_file:load_saved_rig", "{case}"),
+            ("rigkit.io.calibrations.rig_file:load_saved_rig", "{case}"),
             ("diff", "{case}", "rig.json"),
             ("certify", "{case}", "--depth", "200", "--distance", "900"),
             ("export", "{case}", "--to", "kalibr", "-o", "{out}/new.yaml"),
@@ -167,19 +167,20 @@ KINDS: dict[str, Kind] = {
     "board-rigs": Kind(
         "board-rigs.json",
         (
-            ("rigkit.io.rig_file:load_board_rigs", "{case}"),
+            ("rigkit.io.calibrations.rig_file:load_board_rigs", "{case}"),
             ("diff", "{case}", "board-rigs.json"),
             ("diff", "{case}", "{case}", "-r", "{out}/new.html"),
         ),
     ),
     "corners-json": Kind(
-        "corners.json", (("rigkit.io.corners_file:read_corners", "{case}"), ("fuzzing.readers:read_cache", "{case}"))
+        "corners.json",
+        (("rigkit.io.corners.corners_file:read_corners", "{case}"), ("fuzzing.readers:read_cache", "{case}")),
     ),
-    "corners-csv": Kind("corners.csv", (("rigkit.io.corners_file:read_corners", "{case}"),)),
+    "corners-csv": Kind("corners.csv", (("rigkit.io.corners.corners_file:read_corners", "{case}"),)),
     "corners-vnl": Kind("corners.vnl", (("fuzzing.readers:read_vnl", "{case}"),)),
     "truth-csv": Kind("truth.csv", (("fuzzing.readers:read_truth", "{case}"),)),
-    "pairs-csv": Kind("pairs.csv", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
-    "pairs-npz": Kind("pairs.npz", (("rigkit.io.correspondences:read_correspondences", "{case}"),)),
+    "pairs-csv": Kind("pairs.csv", (("rigkit.io.corners.correspondences:read_correspondences", "{case}"),)),
+    "pairs-npz": Kind("pairs.npz", (("rigkit.io.corners.correspondences:read_correspondences", "{case}"),)),
     "ply": Kind(
         "cloud.ply",
         (("rigkit.io.ply:read_ply", "{case}"), ("mesh", "{case}", "-o", "{out}/new.ply", "--depth", "3")),
@@ -209,7 +210,7 @@ KINDS: dict[str, Kind] = {
     "known-session": Kind(
         "known.toml",
         (
-            ("rigkit.io.rig_session:load_rig_session", "{case}"),
+            ("rigkit.io.manifests.rig_session:load_rig_session", "{case}"),
             ("calibrate", "{case}", "--no-cache", "-o", "{out}/new.json"),
         ),
         judged=True,
@@ -255,8 +256,8 @@ KINDS: dict[str, Kind] = {
     "matches-npz": Kind("lightglue.npz", MATCHES),
     "frames-npz": Kind("lafs.npz", MATCHES),
     "colmap-database": Kind("matches.db", (("fuzzing.readers:read_database", "{case}"), *MATCHES[1:])),
-    "poses": Kind("poses.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
-    "poses-turned": Kind("turns.csv", (("rigkit.io.robot_poses:read_robot_poses", "{case}"),)),
+    "poses": Kind("poses.csv", (("rigkit.io.manifests.robot_poses:read_robot_poses", "{case}"),)),
+    "poses-turned": Kind("turns.csv", (("rigkit.io.manifests.robot_poses:read_robot_poses", "{case}"),)),
     "pose": Kind("pose.txt", (("rigkit.workflows.reconstruct_scene:_read_pose", "{case}"),)),
     "avi": _video("film.avi"),
     "mp4": _video("film.mp4"),
@@ -276,7 +277,7 @@ KINDS: dict[str, Kind] = {
     "boofcv-target": _board_file("boofcv.yaml"),
     "opencv-target": _board_file("settings.xml"),
     "caliscope-target": _board_file("charuco.toml"),
-    "public-set": Kind("public.toml", (("rigkit.io.public_set:load_public_set", "{case}"),)),
+    "public-set": Kind("public.toml", (("rigkit.io.manifests.public_set:load_public_set", "{case}"),)),
     "opencv": _camera_file("opencv.yaml", ("export", "{case}", "--from", "opencv", "-o", "{out}/new.json")),
     "kalibr": _camera_file("kalibr.yaml", ("rigkit.workflows.inputs.camera_files:import_camera", "{case}")),
     "chain": Kind("chain.yaml", (("export", "{case}", "--to", "mrcal", "-o", "{out}/new.cameramodel"),)),

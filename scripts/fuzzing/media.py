@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rigkit.io.history_file import HISTORY_SCHEMA
+from rigkit.io.calibrations.history_file import HISTORY_SCHEMA
 
 FRAMES = 8
 CODECS = {"film.avi": "MJPG", "film.mp4": "mp4v", "film.mkv": "FFV1", "cam1.avi": "MJPG", "cam2.avi": "MJPG"}

@@ -14,13 +14,13 @@ from rigkit.coach.sources import watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
 from rigkit.interop.ocamcalib import read_py_ocamcalib
-from rigkit.io.corner_cache import CornerCache
-from rigkit.io.corners_file import read_corners
-from rigkit.io.correspondences import read_correspondences
-from rigkit.io.reading import read_text
-from rigkit.io.session import load_session
-from rigkit.io.truth_csv import load_truth_csv
-from rigkit.io.video import read_timestamps
+from rigkit.io.corners.corner_cache import CornerCache
+from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.corners.correspondences import read_correspondences
+from rigkit.io.disk.reading import read_text
+from rigkit.io.manifests.session import load_session
+from rigkit.io.manifests.truth_csv import load_truth_csv
+from rigkit.io.media.video import read_timestamps
 from rigkit.workflows.calibrate import calibrate_session
 from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach
 from rigkit.workflows.inputs.frames import frames_of_video

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rigkit.io.board_file import load_board
+from rigkit.io.boards.board_file import load_board
 
 SIZE_PX = (160, 120)
 FINER = 8

@@ -21,9 +21,9 @@ from rigkit.interop.mrcal import write_cameramodel
 from rigkit.interop.ocamcalib import write_ocamcalib
 from rigkit.interop.opencv import opencv_stereo, write_opencv
 from rigkit.interop.ros import write_camera_info
-from rigkit.io import corner_cache
-from rigkit.io.corners_file import corners_text
-from rigkit.io.correspondences import correspondences_text
+from rigkit.io.corners import corner_cache
+from rigkit.io.corners.corners_file import corners_text
+from rigkit.io.corners.correspondences import correspondences_text
 from rigkit.io.ply import write_ply
 
 ROOT = Path(__file__).resolve().parents[2]

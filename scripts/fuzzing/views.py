@@ -13,11 +13,11 @@ from fuzzing.scenes import H21, PLACES
 from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.registry import camera_model
 from rigkit.core.detections import BoardDetection
-from rigkit.io.board_file import load_board
-from rigkit.io.calibration_file import save_camera
-from rigkit.io.corner_cache import CornerCache, FoundCorners
-from rigkit.io.corners_file import corners_text
-from rigkit.io.correspondences import correspondences_text
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
+from rigkit.io.corners.corners_file import corners_text
+from rigkit.io.corners.correspondences import correspondences_text
 
 SIZE_PX = (160, 120)
 FIRST_PX, STEP_PX = (37.5, 29.5), 18.0

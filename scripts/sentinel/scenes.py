@@ -16,7 +16,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import unit
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import covariance_of, plan_views

@@ -18,8 +18,8 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.images import read_image
-from rigkit.io.robot_poses import read_robot_poses
+from rigkit.io.manifests.robot_poses import read_robot_poses
+from rigkit.io.media.images import read_image
 from truth import peers
 from truth.resection import FOLDS, Fit, Size, Views, folds_of, held_out_rms, rms_of
 from truth.table import MRCAL, RIGKIT, Bench, Row

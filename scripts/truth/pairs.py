@@ -14,9 +14,9 @@ from rigkit.cameras.brown import Brown
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import save_camera
-from rigkit.io.correspondences import correspondences_text
-from rigkit.io.images import read_image
+from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.corners.correspondences import correspondences_text
+from rigkit.io.media.images import read_image
 from rigkit.workflows.reconstruct_scene import SceneOptions, reconstruct_views
 from rigkit.workflows.validate import ValidateOptions, validate_dataset
 from truth import peers
@@ -222,7 +222,7 @@ def _faces(a: str, b: str) -> str:
 
 
 def trihedral_peers(bench: Bench, folder: object) -> Iterator[Row]:
-    from rigkit.io.manifest import load_dataset
+    from rigkit.io.manifests.manifest import load_dataset
     from rigkit.workflows.datasets import load_cameras
     from rigkit.workflows.pairs import match_images
 

@@ -22,7 +22,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.media.images import read_image, to_grey
 from truth.colmap import colmap_camera
 from truth.resection import Fit, Size, Views
 

@@ -8,7 +8,7 @@ import cv2
 
 from rigkit.core.arrays import in_8_bits
 from rigkit.detection.detect import detect_boards
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.media.images import read_image, to_grey
 from truth.table import OPENCV, RIGKIT, Bench, Row
 
 

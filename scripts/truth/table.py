@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from rigkit.core.boards import Board
-from rigkit.io.public_set import PublicMeasurement
-from rigkit.io.rig_session import RigSession
-from rigkit.io.session import Session
+from rigkit.io.manifests.public_set import PublicMeasurement
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.inputs.corners import Cache

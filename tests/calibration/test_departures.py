@@ -17,7 +17,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray
-from rigkit.io.calibration_file import load_calibration, save_calibration
+from rigkit.io.calibrations.calibration_file import load_calibration, save_calibration
 from rigkit.kernels.departures import DISPLACEMENTS, displacements
 
 NOISE_PX = 0.02

@@ -18,8 +18,8 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.io.board_file import board_text
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.boards.board_file import board_text
+from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper

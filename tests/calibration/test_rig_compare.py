@@ -16,7 +16,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.io.rig_file import load_saved_rig, rig_text
+from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.kernels.departures import displacements
 from rigkit.workflows.certify import load_instrument
 from rigkit.workflows.diff import RigPair, diff

@@ -24,7 +24,7 @@ from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Severity, worst
-from rigkit.io.session import Session
+from rigkit.io.manifests.session import Session
 from rigkit.workflows.calibrate_rig import judged
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from helpers.schemas import faults
 
-from rigkit.io import files
+from rigkit.io.disk import writing
 
 SHOWN = 6
 """Of a long list so many of its first and last: there is more of the same between, which takes a checker seconds."""
@@ -19,14 +19,14 @@ SHOWN = 6
 @pytest.fixture(autouse=True)
 def _files_are_of_their_schemas(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     found: list[str] = []
-    fill = files._fill
+    fill = writing._fill
 
     def checked(handle: int, data: bytes) -> None:
         fill(handle, data)
         for document in _documents(data):
             found.extend(faults(_shortened(document)))
 
-    monkeypatch.setattr(files, "_fill", checked)
+    monkeypatch.setattr(writing, "_fill", checked)
     yield
     assert not found, found[:3]
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rigkit.cli.main import main
-from rigkit.io.board_file import load_board
-from rigkit.io.board_words import board_of_words
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.boards.board_words import board_of_words
 from rigkit.workflows.inputs.identify_board import IdentifiedBoard
 
 READ = ["--ruler-x-mm", "249", "--ruler-y-mm", "169.49"]

@@ -20,10 +20,10 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
-from rigkit.io import files
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.corner_cache import CornerCache, FoundCorners
-from rigkit.io.session import load_session
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
+from rigkit.io.disk import writing
+from rigkit.io.manifests.session import load_session
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import place_board, sees_paper
@@ -189,7 +189,7 @@ def test_a_disk_that_fills_up_leaves_all_files_as_they_were(
 ) -> None:
     assert main(["calibrate", str(session), "--report"]) == 0
     before = {path.name: path.read_bytes() for path in session.parent.iterdir()}
-    fill = files._fill
+    fill = writing._fill
 
     def until_the_page(handle: int, data: bytes) -> None:
         if data.startswith(b"<!"):
@@ -197,7 +197,7 @@ def test_a_disk_that_fills_up_leaves_all_files_as_they_were(
             raise OSError(28, "No space left on device")
         fill(handle, data)
 
-    monkeypatch.setattr(files, "_fill", until_the_page)
+    monkeypatch.setattr(writing, "_fill", until_the_page)
     session.write_text(SESSION.replace("kannala_brandt", "eucm"))
     before["session.toml"] = session.read_bytes()
     assert main(["calibrate", str(session), "--report", "--force"]) == 2

@@ -19,12 +19,12 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info
-from rigkit.io.calibration_file import camera_to_json, load_calibration
-from rigkit.io.corner_cache import FoundCorners
-from rigkit.io.corners_file import read_corners
-from rigkit.io.rig_file import load_rig, load_saved_rig
-from rigkit.io.rig_session import load_rig_session
-from rigkit.io.session import load_session
+from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration
+from rigkit.io.calibrations.rig_file import load_rig, load_saved_rig
+from rigkit.io.corners.corner_cache import FoundCorners
+from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.manifests.rig_session import load_rig_session
+from rigkit.io.manifests.session import load_session
 from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
 from rigkit.workflows.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig

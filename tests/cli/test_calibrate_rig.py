@@ -15,10 +15,10 @@ from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.corner_cache import CornerCache, FoundCorners
-from rigkit.io.rig_file import load_board_rigs, load_rig
-from rigkit.io.rig_session import load_rig_session
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.calibrations.rig_file import load_board_rigs, load_rig
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
+from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.workflows.calibrate_rig import calibrate_camera
 
 NAMES = ("reg", "wide")

@@ -13,7 +13,7 @@ from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibration_file import camera_to_json
+from rigkit.io.calibrations.calibration_file import camera_to_json
 
 SIGMAS = [0.3, 0.3, 0.3, 0.3, 1e-4, 1e-4, 1e-4, 1e-4]
 

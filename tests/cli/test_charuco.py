@@ -14,7 +14,7 @@ from detection_bench.scenes import bench_camera, one_board
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
-from rigkit.io.board_file import load_board
+from rigkit.io.boards.board_file import load_board
 
 PX_PER_MM = 8.0
 

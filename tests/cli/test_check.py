@@ -26,9 +26,9 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.board_words import board_of_words
-from rigkit.io.calibration_file import camera_to_json, load_camera, save_calibration
-from rigkit.io.images import read_image
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.calibrations.calibration_file import camera_to_json, load_camera, save_calibration
+from rigkit.io.media.images import read_image
 from rigkit.report.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render

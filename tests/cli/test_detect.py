@@ -13,7 +13,7 @@ from helpers.detection_scenes import single
 
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
-from rigkit.io.corners_file import read_corners
+from rigkit.io.corners.corners_file import read_corners
 
 BOARD_TOML = """schema = "rigkit.board/1"
 columns = 9

@@ -20,11 +20,11 @@ from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.board_file import board_text
-from rigkit.io.board_words import board_of_words
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.images import read_image, to_grey
-from rigkit.io.rig_file import load_board_rigs, load_saved_rig
+from rigkit.io.boards.board_file import board_text
+from rigkit.io.boards.board_words import board_of_words
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.calibrations.rig_file import load_board_rigs, load_saved_rig
+from rigkit.io.media.images import read_image, to_grey
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render

@@ -22,7 +22,7 @@ from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
-from rigkit.io.calibration_file import camera_to_json, load_calibration, load_camera, save_camera
+from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration, load_camera, save_camera
 from rigkit.io.ply import read_ply
 from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, foreign_files
 from rigkit.workflows.inputs.camera_files import import_rig

@@ -11,10 +11,10 @@ from helpers.data import REPOSITORY
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import load_calibration_or_camera
-from rigkit.io.manifest import load_dataset
-from rigkit.io.manifest_writer import ImageBoards, group_pairs
-from rigkit.io.rig_session import load_rig_session
+from rigkit.io.calibrations.calibration_file import load_calibration_or_camera
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.manifest_writer import ImageBoards, group_pairs
+from rigkit.io.manifests.rig_session import load_rig_session
 
 IMAGES = REPOSITORY / "datasets" / "lab-a" / "images"
 CALIBRATION = REPOSITORY / "calib" / "cameras" / "mvca020_fe185" / "calibration.json"

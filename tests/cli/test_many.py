@@ -11,7 +11,7 @@ import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
-from rigkit.io.manifest import load_dataset
+from rigkit.io.manifests.manifest import load_dataset
 from rigkit.workflows.datasets import load_cameras
 
 LAB = REPOSITORY / "datasets" / "lab-a"

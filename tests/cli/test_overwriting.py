@@ -15,9 +15,9 @@ import pytest
 from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
-from rigkit.io.corners_file import read_corners
-from rigkit.io.manifest import load_dataset
-from rigkit.io.session import files_of_session, load_session
+from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.session import files_of_session, load_session
 
 LAB = REPOSITORY / "datasets" / "lab-a"
 LENS = REPOSITORY / "calib" / "cameras" / "mvca020_r61" / "calibration.json"

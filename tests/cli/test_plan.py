@@ -14,8 +14,8 @@ from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.board_file import board_values
-from rigkit.io.calibration_file import camera_to_json, load_calibration, save_calibration
+from rigkit.io.boards.board_file import board_values
+from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration, save_calibration
 from rigkit.planning.goal import projection_goal
 
 

@@ -14,7 +14,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibration_file import camera_to_json
+from rigkit.io.calibrations.calibration_file import camera_to_json
 from rigkit.io.ply import read_ply
 from rigkit.workflows.reconstruct_rig import near_pairs
 

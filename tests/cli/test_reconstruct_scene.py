@@ -17,8 +17,8 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibration_file import save_camera
-from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.calibrations.calibration_file import save_camera
+from rigkit.io.corners.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import read_ply
 
 SMALL = Pinhole((320, 240), np.array([280.0, 280.0, 159.5, 119.5]))

@@ -13,7 +13,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibration_file import camera_to_json, save_camera
+from rigkit.io.calibrations.calibration_file import camera_to_json, save_camera
 
 ROW_PX = 0.2
 """Centre of a blob of 3 px in 8-bit pixels, thresholded: the frame of the blob is distorted between the views."""

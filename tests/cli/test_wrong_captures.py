@@ -17,7 +17,7 @@ from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics

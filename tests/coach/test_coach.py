@@ -28,7 +28,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import load_calibration
+from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.planning.goal import projection_goal
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render

@@ -20,8 +20,8 @@ from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.look import glance_at
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.calibration_file import load_calibration
-from rigkit.io.images import read_image
+from rigkit.io.calibrations.calibration_file import load_calibration
+from rigkit.io.media.images import read_image
 from rigkit.planning.goal import projection_goal
 
 POSES, HELD_FRAMES, MOVING_FRAMES, RATE = 13, 14, 2, 10

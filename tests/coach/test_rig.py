@@ -27,7 +27,7 @@ from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.principal_axes import principal_axes
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3, unit
-from rigkit.io.rig_session import load_rig_session
+from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.information import CornerError, HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information

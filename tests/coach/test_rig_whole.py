@@ -24,7 +24,7 @@ from rigkit.coach.rig import MAX_HELP, RigGuide
 from rigkit.coach.rig_whole import RigKnown, WholeRig, left_of_rig, whole_rig
 from rigkit.coach.whole import STEADY, Whole
 from rigkit.core.errors import DegenerateError
-from rigkit.io.rig_session import RigSession
+from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.validation.certificate.contracts import Quantity, Task

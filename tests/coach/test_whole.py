@@ -23,7 +23,7 @@ from rigkit.coach.look import Glance
 from rigkit.coach.whole import STEADY, Whole, WholeCalibrations, whole_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.session import Session
+from rigkit.io.manifests.session import Session
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal, projection_goal
 from rigkit.workflows.calibrate import SessionCalibration

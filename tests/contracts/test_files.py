@@ -13,7 +13,7 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError
-from rigkit.io.files import ensure_folder_writable, ensure_writable, write_atomic, write_together
+from rigkit.io.disk.writing import ensure_folder_writable, ensure_writable, write_atomic, write_together
 from rigkit.io.ply import read_ply, write_ply
 
 ANGLE_REL = 1e-15
@@ -84,7 +84,7 @@ def test_a_write_that_fails_half_way_leaves_the_old_file_and_no_rubbish(
     def full(handle: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("rigkit.io.files.os.fsync", full)
+    monkeypatch.setattr("rigkit.io.disk.writing.os.fsync", full)
     with pytest.raises(InputError, match="No space left"):
         write(target, True)
     assert target.read_text() == "old"
@@ -104,7 +104,7 @@ def test_of_several_files_none_changes_where_one_cannot_be_written(
         if count == 3:
             raise fault
 
-    monkeypatch.setattr("rigkit.io.files.os.fsync", full)
+    monkeypatch.setattr("rigkit.io.disk.writing.os.fsync", full)
     together = {tmp_path / name: "new" for name in ("first", "made/deep/second", "made/third")}
     with pytest.raises(InputError if isinstance(fault, OSError) else KeyboardInterrupt):
         write_together(together, force=True)
@@ -116,7 +116,7 @@ def test_of_several_files_none_changes_where_one_cannot_be_written(
 
 def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "out"
-    monkeypatch.setattr("rigkit.io.files.os.fsync", lambda handle: target.write_text("somebody else's"))
+    monkeypatch.setattr("rigkit.io.disk.writing.os.fsync", lambda handle: target.write_text("somebody else's"))
     with pytest.raises(InputError, match="appeared"):
         write_atomic(target, "ours")
     assert target.read_text() == "somebody else's"
@@ -126,7 +126,9 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path, monkeypat
 def test_of_several_new_files_none_stays_where_one_appears_meanwhile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigkit.io.files.os.fsync", lambda handle: (tmp_path / "second").write_text("somebody else's"))
+    monkeypatch.setattr(
+        "rigkit.io.disk.writing.os.fsync", lambda handle: (tmp_path / "second").write_text("somebody else's")
+    )
     with pytest.raises(InputError, match="appeared"):
         write_together({tmp_path / name: "ours" for name in ("made/first", "second", "third")})
     assert (tmp_path / "second").read_text() == "somebody else's"

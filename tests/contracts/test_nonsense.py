@@ -10,7 +10,7 @@ import pytest
 from helpers.calibration_scenes import REACH_DEG, SIZE, lens, random_views
 
 import rigkit
-import rigkit.io.calibration_file
+import rigkit.io.calibrations.calibration_file
 from rigkit.cameras.registry import camera_model
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
@@ -25,7 +25,7 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
 ) -> None:
     """As programs with y up write it: pixels would come out mirrored."""
     ours, theirs = tmp_path / "camera.json", tmp_path / "camera.yml"
-    rigkit.io.calibration_file.save_camera(ours, PINHOLE)
+    rigkit.io.calibrations.calibration_file.save_camera(ours, PINHOLE)
     ours.write_text(ours.read_text().replace('"fy": 500.0', f'"fy": {focal}'))
     with pytest.raises(InputError, match=r"camera.json': .*focal lengths are 500 and .*positive"):
         rigkit.load_camera(ours)

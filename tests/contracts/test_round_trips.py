@@ -41,10 +41,10 @@ from rigkit.interop.mrcal import read_cameramodel, write_cameramodel
 from rigkit.interop.ocamcalib import read_ocamcalib, write_ocamcalib
 from rigkit.interop.opencv import read_opencv, write_opencv
 from rigkit.interop.ros import read_camera_info, write_camera_info
-from rigkit.io.board_file import board_text, load_board
-from rigkit.io.calibration_file import load_camera, save_camera
-from rigkit.io.corners_file import read_corners, write_corners
-from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.boards.board_file import board_text, load_board
+from rigkit.io.calibrations.calibration_file import load_camera, save_camera
+from rigkit.io.corners.corners_file import read_corners, write_corners
+from rigkit.io.corners.correspondences import correspondences_text, read_correspondences
 from rigkit.io.ply import read_ply, write_ply
 from rigkit.report.tables import tables_to_csv, tables_to_json
 

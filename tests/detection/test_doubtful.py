@@ -15,7 +15,7 @@ from rigkit import detect_boards
 from rigkit.core.boards import Board
 from rigkit.core.errors import CheckFailed
 from rigkit.detection.doubtful import doubtful_grid
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.workflows.detect import detect_in_images
 
 HONEST_RATIO = 1.6

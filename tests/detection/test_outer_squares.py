@@ -16,7 +16,7 @@ from rigkit import detect_boards
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import develop
 from rigkit.synthetic.render import Optics
 

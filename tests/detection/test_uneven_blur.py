@@ -17,7 +17,7 @@ from rigkit.detection.subpixel.blur_shape import blur_covariance
 from rigkit.detection.subpixel.evened import UNEVEN_WIDTHS
 from rigkit.detection.subpixel.resampled import resampled
 from rigkit.detection.subpixel.unsure import strays
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 
 FINER, NOISE_LEVELS, LENS_PX = 4, 1.5, 0.7
 COLUMNS, ROWS = 8, 6

@@ -24,8 +24,8 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.core.errors import RigkitError
-from rigkit.io.corners_file import read_corners
-from rigkit.io.images import read_image
+from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.media.images import read_image
 
 QUICK = (
     "detect -j 1 --board floor.toml image.png -o out/corners.csv --overlay out",

@@ -21,7 +21,7 @@ from rigkit.coach.guide import GuideOptions
 from rigkit.coach.sources import watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.io.history_file import load_history
+from rigkit.io.calibrations.history_file import load_history
 from rigkit.workflows.coach import CoachOptions, open_coach
 from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
 from rigkit.workflows.inputs.frames import frames_of_video
@@ -132,7 +132,7 @@ def test_a_register_loses_nothing(place: Path, capsys: pytest.CaptureFixture[str
     """What several processes add at once is all there; a damaged line is named, before the work."""
     add = (
         "import sys; from dataclasses import replace; from pathlib import Path\n"
-        "from rigkit.io.history_file import add_entry, load_history\n"
+        "from rigkit.io.calibrations.history_file import add_entry, load_history\n"
         "entry = load_history('history.jsonl')[0]\n"
         "for k in range(50): add_entry(Path('grown.jsonl'), replace(entry, source=f'{sys.argv[1]}-{k}'))\n"
     )

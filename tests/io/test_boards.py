@@ -13,8 +13,8 @@ from rigkit.core.patterns.base import Pattern
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
-from rigkit.io.board_file import board_text, load_board
-from rigkit.io.board_words import board_in_words, board_of_words
+from rigkit.io.boards.board_file import board_text, load_board
+from rigkit.io.boards.board_words import board_in_words, board_of_words
 
 PATTERNS = [
     Chessboard(),

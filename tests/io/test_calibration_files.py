@@ -13,9 +13,9 @@ from helpers.calibration_scenes import SIZE, lens, random_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
-from rigkit.io.board_file import load_board
-from rigkit.io.calibration_file import load_calibration, load_camera, save_calibration, save_camera
-from rigkit.io.session import load_session
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.calibrations.calibration_file import load_calibration, load_camera, save_calibration, save_camera
+from rigkit.io.manifests.session import load_session
 
 BOARD_TEXT = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
 

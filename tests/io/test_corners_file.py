@@ -11,9 +11,9 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.io.corner_cache import CornerCache, FoundCorners
-from rigkit.io.corners_file import COLUMNS, read_corners, write_corners
-from rigkit.io.session import Session, load_session
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
+from rigkit.io.corners.corners_file import COLUMNS, read_corners, write_corners
+from rigkit.io.manifests.session import Session, load_session
 from rigkit.workflows.inputs.corners import given_corners
 
 WRITTEN_PX = 1e-5

@@ -11,7 +11,7 @@ from rigkit.affine.correspondences import Correspondences
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
-from rigkit.io.correspondences import correspondences_text, read_correspondences
+from rigkit.io.corners.correspondences import correspondences_text, read_correspondences
 
 FIELDS = ("pixels1", "pixels2", "A21", "sigma_px", "sigma_A")
 

@@ -10,7 +10,7 @@ import PIL.Image
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import no_images, quiet_opencv, read_image, to_grey
+from rigkit.io.media.images import no_images, quiet_opencv, read_image, to_grey
 from rigkit.workflows.detect import images_in
 
 

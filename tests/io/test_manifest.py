@@ -9,7 +9,7 @@ import pytest
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import Feature
-from rigkit.io.manifest import load_dataset
+from rigkit.io.manifests.manifest import load_dataset
 
 REPO = Path(__file__).parents[2]
 TEXT = """

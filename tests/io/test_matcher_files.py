@@ -16,7 +16,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.correspondences import read_correspondences
+from rigkit.io.corners.correspondences import read_correspondences
 
 COUNT = 40
 IMAGES = ("left.png", "right.png")

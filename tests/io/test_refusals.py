@@ -20,16 +20,16 @@ from rigkit.core.boards import Board
 from rigkit.core.cloud import OrientedCloud
 from rigkit.core.errors import InputError, InternalError
 from rigkit.core.identifiers import MAX_IDENTIFIER, check_identifier
-from rigkit.io.board_file import load_board
-from rigkit.io.calibration_file import load_camera
-from rigkit.io.correspondences import read_correspondences
-from rigkit.io.images import announced_sizes, read_image
-from rigkit.io.json_reader import positive
-from rigkit.io.manifest import load_dataset
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.calibrations.calibration_file import load_camera
+from rigkit.io.calibrations.rig_file import load_rig
+from rigkit.io.corners.correspondences import read_correspondences
+from rigkit.io.disk.json_reader import positive
+from rigkit.io.disk.reading import read_bytes, read_text
+from rigkit.io.disk.toml_reader import TomlTable
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.media.images import announced_sizes, read_image
 from rigkit.io.ply import ply_bytes, read_ply
-from rigkit.io.reading import read_bytes, read_text
-from rigkit.io.rig_file import load_rig
-from rigkit.io.toml_reader import TomlTable
 
 BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
 CAMERA = {
@@ -349,9 +349,9 @@ def test_the_size_that_a_file_announces_is_that_of_its_image(ending: str, colour
 
 def test_one_pixel_less_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((40, 60), np.uint8))
-    monkeypatch.setattr("rigkit.io.images.MAX_PIXELS", 40 * 60)
+    monkeypatch.setattr("rigkit.io.media.images.MAX_PIXELS", 40 * 60)
     assert read_image(tmp_path / "a.png").shape == (40, 60)
-    monkeypatch.setattr("rigkit.io.images.MAX_PIXELS", 40 * 60 - 1)
+    monkeypatch.setattr("rigkit.io.media.images.MAX_PIXELS", 40 * 60 - 1)
     with pytest.raises(InputError, match="60 x 40"):
         read_image(tmp_path / "a.png")
 

@@ -8,8 +8,8 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
-from rigkit.io.rig_session import ONE, frames_of_images, is_rig_session, load_rig_session
-from rigkit.io.session import load_session
+from rigkit.io.manifests.rig_session import ONE, frames_of_images, is_rig_session, load_rig_session
+from rigkit.io.manifests.session import load_session
 
 BOARD = 'schema = "rigkit.board/1"\ncolumns = 9\nrows = 6\nsquare_mm = 30.0\n'
 HEAD = 'schema = "rigkit.session/1"\nboard = "board.toml"\nmodel = "brown"\n'

@@ -9,7 +9,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.robot_poses import read_robot_poses
+from rigkit.io.manifests.robot_poses import read_robot_poses
 
 HEAD = "timestamp_ns,x_m,y_m,z_m,rx_deg,ry_deg,rz_deg\n"
 START = 1606153907000000000

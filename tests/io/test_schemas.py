@@ -15,14 +15,14 @@ from helpers.schemas import faults
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, PairTruth
-from rigkit.io.board_file import load_board
-from rigkit.io.manifest import load_dataset
-from rigkit.io.public_set import load_public_set
-from rigkit.io.rig_session import is_rig_session, load_rig_session
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.disk.schema_words import ANY_OF
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.public_set import load_public_set
+from rigkit.io.manifests.rig_session import is_rig_session, load_rig_session
+from rigkit.io.manifests.session import load_session
+from rigkit.io.manifests.study_file import load_study
 from rigkit.io.schema import SCHEMAS, key_rows
-from rigkit.io.schema_words import ANY_OF
-from rigkit.io.session import load_session
-from rigkit.io.study_file import load_study
 from rigkit.report.tables import tables_to_json
 from rigkit.validation.checks import validate
 from rigkit.validation.crosscheck import crosscheck

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rigkit.io.corner_cache import source_hash
-from rigkit.io.toml_reader import toml_text
+from rigkit.io.corners.corner_cache import source_hash
+from rigkit.io.disk.toml_reader import toml_text
 from rigkit.kernels import building
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
-from rigkit.io.study_file import load_study
+from rigkit.io.manifests.study_file import load_study
 from rigkit.synthetic.noise import NoisyImages
 from rigkit.workflows.study import run_study, study_key
 

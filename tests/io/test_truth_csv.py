@@ -9,8 +9,8 @@ import pytest
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature
-from rigkit.io.manifest import load_dataset
-from rigkit.io.truth_csv import load_truth_csv
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.truth_csv import load_truth_csv
 
 BOARDS = {name: (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 28.0, 28.0)) for name in ("first", "second")}
 TEXT = """pair,quantity,a,b,value [mm],sigma [mm],value [deg],sigma [deg],how

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rigkit.core.errors import InputError
-from rigkit.io.images import read_image
-from rigkit.io.video import Video, is_video, read_timestamps
+from rigkit.io.media.images import read_image
+from rigkit.io.media.video import Video, is_video, read_timestamps
 
 
 def video(path: Path, levels: list[int]) -> Path:

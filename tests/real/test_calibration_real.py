@@ -25,7 +25,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 
 pytestmark = pytest.mark.real
 

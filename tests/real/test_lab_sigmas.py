@@ -14,7 +14,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.manifest import load_dataset
+from rigkit.io.manifests.manifest import load_dataset
 from rigkit.validation.checks import validate
 from rigkit.workflows.datasets import load_cameras
 from rigkit.workflows.pairs import match_found, reconstruct_with

@@ -15,8 +15,8 @@ from helpers.data import shared_data
 from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.truth import Feature
-from rigkit.io.calibration_file import load_calibration, load_camera
-from rigkit.io.rig_file import load_board_rigs, load_rig
+from rigkit.io.calibrations.calibration_file import load_calibration, load_camera
+from rigkit.io.calibrations.rig_file import load_board_rigs, load_rig
 
 pytestmark = pytest.mark.real
 

@@ -14,7 +14,7 @@ from helpers.data import shared_data
 
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.cli.main import main
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.io.ply import read_ply
 from rigkit.validation.planes import fit_plane
 

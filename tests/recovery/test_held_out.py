@@ -23,7 +23,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.detection.detect import detect_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, rotation_angle
-from rigkit.io.calibration_file import save_camera
+from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, reconstruct_pair
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rigkit.io.history_file import HistoryEntry, add_entry, editions
+from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, editions
 from rigkit.report.history_page import history_page
 from rigkit.validation.sentinel.drift import heat_drift
 from rigkit.workflows.history import show_history

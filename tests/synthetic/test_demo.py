@@ -14,9 +14,9 @@ from helpers.data import read_grey
 from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.board_file import load_board
-from rigkit.io.manifest import load_dataset
-from rigkit.io.session import load_session
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.manifests.manifest import load_dataset
+from rigkit.io.manifests.session import load_session
 from rigkit.synthetic.demo import OPTICS, build_demo
 
 VIEWS = 3

@@ -15,8 +15,8 @@ from helpers.sentinel_scenes import checked
 
 from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import save_calibration
-from rigkit.io.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
+from rigkit.io.calibrations.calibration_file import save_calibration
+from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
 from rigkit.report.history_page import drift_svg, history_facts, history_page
 from rigkit.workflows.history import add_to_history, show_history
 

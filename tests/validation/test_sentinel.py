@@ -18,8 +18,8 @@ from rigkit.cameras.base import Camera
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.calibration_file import calibration_text, load_calibration, save_calibration
-from rigkit.io.history_file import load_history
+from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration, save_calibration
+from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
 from rigkit.report.check_page import check_facts, check_page

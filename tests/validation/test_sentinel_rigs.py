@@ -18,7 +18,7 @@ from rigkit.cameras.compare import grid_pixels
 from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
-from rigkit.io.history_file import HistoryEntry
+from rigkit.io.calibrations.history_file import HistoryEntry
 from rigkit.planning.candidates import Reach
 from rigkit.report.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task

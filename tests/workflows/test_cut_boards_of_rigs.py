@@ -10,7 +10,7 @@ import pytest
 from helpers.stereo_pictures import RIGHT_FROM_LEFT
 
 from rigkit.cli.main import main
-from rigkit.io.rig_file import load_rig
+from rigkit.io.calibrations.rig_file import load_rig
 from rigkit.workflows.check import load_watched
 
 COVERED = {"01": {"left": 240, "right": 138}, "02": {"left": 311, "right": 184}, "05": {"left": 294, "right": 259}}

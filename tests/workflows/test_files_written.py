@@ -12,7 +12,7 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
-from rigkit.io.calibration_file import load_calibration
+from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.results import write_results

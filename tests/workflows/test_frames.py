@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard

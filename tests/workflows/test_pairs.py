@@ -15,7 +15,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.io.manifest import CameraEntry, Pair
+from rigkit.io.manifests.manifest import CameraEntry, Pair
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render

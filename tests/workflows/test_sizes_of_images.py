@@ -8,8 +8,8 @@ import pytest
 
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
-from rigkit.io.corner_cache import FoundCorners
-from rigkit.io.session import Session
+from rigkit.io.corners.corner_cache import FoundCorners
+from rigkit.io.manifests.session import Session
 from rigkit.workflows.inputs.corners import _common_size
 
 

@@ -13,7 +13,7 @@ from rigkit.cli.main import main
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
-from rigkit.io.images import read_image
+from rigkit.io.media.images import read_image
 from rigkit.synthetic.render import Optics
 from rigkit.workflows.inputs.identify_board import explained, misread
 

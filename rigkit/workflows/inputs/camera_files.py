@@ -22,9 +22,9 @@ from rigkit.interop.colmap_cameras import colmap_cameras_text
 from rigkit.interop.kalibr import read_kalibr
 from rigkit.interop.matlab import is_matlab_pair, matlab_text, read_matlab_pair
 from rigkit.interop.opencv import read_opencv_stereo
-from rigkit.io.calibration_file import load_calibration_or_camera
-from rigkit.io.reading import read_bytes, read_text
-from rigkit.io.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
+from rigkit.io.calibrations.calibration_file import load_calibration_or_camera
+from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file, load_rig, load_saved_rig
+from rigkit.io.disk.reading import read_bytes, read_text
 from rigkit.workflows.inputs.formats import READ_FORMATS
 
 _log = logging.getLogger(__name__)

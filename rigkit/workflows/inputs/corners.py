@@ -20,10 +20,10 @@ from rigkit.core.printing import counted
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
-from rigkit.io.corners_file import read_corners
-from rigkit.io.images import read_image
-from rigkit.io.session import Session
+from rigkit.io.corners.corner_cache import CornerCache, FoundCorners, image_hash, lens_key
+from rigkit.io.corners.corners_file import read_corners
+from rigkit.io.manifests.session import Session
+from rigkit.io.media.images import read_image
 from rigkit.workflows.inputs.identify_board import explained
 
 ODD_SIZES = 3
@@ -244,7 +244,7 @@ def named_images(session: Session) -> dict[str, Path]:
 def given_corners(session: Session, path: Path) -> SessionCorners:
     """Return the corners that a file has of the session's images, which are only read for their size.
 
-    The file is any that `rigkit.io.corners_file.read_corners` reads. It names an image by its path, as seen from here
+    The file is any that `io.corners.corners_file` reads. It names an image by its path, as seen from here
     or from the file, or by its own name where only one image of the file and one of the session are called so. Images
     that it does not name have no corners; those of the file that the session does not list are left out.
 

@@ -12,12 +12,12 @@ from pathlib import Path
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier, natural_key
 from rigkit.core.progress import Progress, silent
-from rigkit.io.board_file import board_text
-from rigkit.io.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
-from rigkit.io.images import images_of_folder, name_unread, no_images
-from rigkit.io.session import SESSION_NAME, SESSION_SCHEMA
-from rigkit.io.toml_reader import relative_path, toml_text
-from rigkit.io.video import is_video
+from rigkit.io.boards.board_file import board_text
+from rigkit.io.boards.board_words import WORDS_HELP, board_in_words, board_of_words, with_length
+from rigkit.io.disk.toml_reader import relative_path, toml_text
+from rigkit.io.manifests.session import SESSION_NAME, SESSION_SCHEMA
+from rigkit.io.media.images import images_of_folder, name_unread, no_images
+from rigkit.io.media.video import is_video
 from rigkit.workflows.inputs.identify_board import Suggestion, suggestion
 
 SIDE = r"left|right|cam(?:era)?[_-]?\d{1,3}"
@@ -78,7 +78,7 @@ def session_of_folders(
     Parameters
     ----------
     folders : of images; see `cameras_in`.
-    boards : files of boards, or words such as 9x6x25: see `rigkit.io.board_words`.
+    boards : files of boards, or words such as 9x6x25: see `rigkit.io.boards.board_words`.
     path : of the session, to whose folder its paths are relative.
     model : of all cameras.
     output : of the calibration, beside the session, if not where the session's name says.

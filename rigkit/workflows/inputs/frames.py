@@ -22,12 +22,12 @@ from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
-from rigkit.io.files import ensure_folder_writable, write_atomic
-from rigkit.io.images import Image
-from rigkit.io.reading import read_text
-from rigkit.io.rig_session import RigSession
-from rigkit.io.session import Session, beside_session
-from rigkit.io.video import Video, is_video, read_timestamps
+from rigkit.io.disk.reading import read_text
+from rigkit.io.disk.writing import ensure_folder_writable, write_atomic
+from rigkit.io.manifests.rig_session import RigSession
+from rigkit.io.manifests.session import Session, beside_session
+from rigkit.io.media.images import Image
+from rigkit.io.media.video import Video, is_video, read_timestamps
 from rigkit.workflows.inputs.frame_choice import FrameChoice, KeptFrame, describe
 from rigkit.workflows.inputs.identify_board import explained
 
@@ -109,7 +109,7 @@ def frames_of_videos(
 ) -> VideoFrames:
     """Keep frames of one moment of several cameras, by name; as `frames_of_video`.
 
-    `timestamps` says which frames are of one moment (`rigkit.io.video.read_timestamps`); without, those of one number
+    `timestamps` says which frames are of one moment (`io.media.video.read_timestamps`); without, those of one number
     are: the videos began together and lost none.
     """
     asked = _asked(sources, boards, timestamps, max_frames)

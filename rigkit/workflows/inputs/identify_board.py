@@ -17,9 +17,9 @@ from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.detection.whole_grids import MIN_IMAGES_OF_GUESS
-from rigkit.io.board_words import words_of_board
-from rigkit.io.images import read_image
-from rigkit.io.video import Video, is_video
+from rigkit.io.boards.board_words import words_of_board
+from rigkit.io.media.images import read_image
+from rigkit.io.media.video import Video, is_video
 
 ENOUGH_IMAGES = 12
 """Images that are looked at, evenly spread: what more of them show is the same board."""

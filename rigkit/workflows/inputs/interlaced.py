@@ -11,7 +11,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.detection.fields import shift_between_fields
-from rigkit.io.images import read_image, to_grey
+from rigkit.io.media.images import read_image, to_grey
 
 MAX_LINES = 1088
 """No interlaced format has more lines: larger images are not looked at."""

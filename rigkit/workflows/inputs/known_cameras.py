@@ -15,8 +15,8 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.rig_file import SavedRig, is_rig_file
-from rigkit.io.rig_session import RigSession
+from rigkit.io.calibrations.rig_file import SavedRig, is_rig_file
+from rigkit.io.manifests.rig_session import RigSession
 from rigkit.workflows.inputs.camera_files import (
     import_camera,
     is_rig,

@@ -9,7 +9,7 @@
     degree = 6                           # optional: of the polynomial; by default chosen by held-out error
     board_shape = "auto"                 # optional: flat, warp, released, or auto (chosen by held-out error)
 
-Sessions of several cameras on one mount have [[cameras]] instead of `images`: see `rigkit.io.rig_session`.
+Sessions of several cameras on one mount have [[cameras]] instead of `images`: see `rigkit.io.manifests.rig_session`.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from rigkit.cameras.registry import MODELS, check_order
 from rigkit.core.boards import Board
 from rigkit.core.printing import brief
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.board_file import load_board
-from rigkit.io.reading import is_file_or_lost_link
-from rigkit.io.schema_words import ANY_OF, COUNT, NAME, TEXT, Schema, array, choice, file, rows, said, table, texts
-from rigkit.io.toml_reader import TomlTable, named_path, read_toml
-from rigkit.io.truth_file import TRUTH_KEYS, between
+from rigkit.io.boards.board_file import load_board
+from rigkit.io.disk.reading import is_file_or_lost_link
+from rigkit.io.disk.schema_words import ANY_OF, COUNT, NAME, TEXT, Schema, array, choice, file, rows, said, table, texts
+from rigkit.io.disk.toml_reader import TomlTable, named_path, read_toml
+from rigkit.io.manifests.truth_file import TRUTH_KEYS, between
 
 SESSION_SCHEMA = "rigkit.session/1"
 SESSION_NAME = "session.toml"

@@ -8,8 +8,8 @@ from typing import Any
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.schema_words import POSITIVE, TEXT, Schema, array, obj, said
-from rigkit.io.toml_reader import TomlTable
+from rigkit.io.disk.schema_words import POSITIVE, TEXT, Schema, array, obj, said
+from rigkit.io.disk.toml_reader import TomlTable
 
 
 def measured(unit: str) -> dict[str, Schema]:

@@ -14,9 +14,9 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.printing import brief
 from rigkit.core.truth import PairTruth
 from rigkit.identification.board_ids import BOARD_SIDES
-from rigkit.io.board_file import BOARD_KEYS, load_board, measured_board
-from rigkit.io.reading import usable_path
-from rigkit.io.schema_words import (
+from rigkit.io.boards.board_file import BOARD_KEYS, load_board, measured_board
+from rigkit.io.disk.reading import usable_path
+from rigkit.io.disk.schema_words import (
     NAME,
     NUMBER,
     TEXT,
@@ -31,10 +31,10 @@ from rigkit.io.schema_words import (
     table,
     texts,
 )
-from rigkit.io.session import SESSION_NAME, files_of_session
-from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.io.truth_csv import load_truth_csv
-from rigkit.io.truth_file import TRUTH_KEYS, measured, truth_from_table
+from rigkit.io.disk.toml_reader import TomlTable, read_toml
+from rigkit.io.manifests.session import SESSION_NAME, files_of_session
+from rigkit.io.manifests.truth_csv import load_truth_csv
+from rigkit.io.manifests.truth_file import TRUTH_KEYS, measured, truth_from_table
 
 DATASET_SCHEMA = "rigkit.dataset/1"
 MANIFEST = "dataset.toml"

@@ -24,9 +24,9 @@ from rigkit.core.patterns.base import Pattern, Value
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS
-from rigkit.io.foreign_boards import foreign_board
-from rigkit.io.schema_words import COUNT, NAME, PLAIN_KINDS, POSITIVE, Schema, choice, file, obj, optional, said
-from rigkit.io.toml_reader import TomlTable, read_toml, toml_text
+from rigkit.io.boards.foreign_boards import foreign_board
+from rigkit.io.disk.schema_words import COUNT, NAME, PLAIN_KINDS, POSITIVE, Schema, choice, file, obj, optional, said
+from rigkit.io.disk.toml_reader import TomlTable, read_toml, toml_text
 
 BOARD_SCHEMA = "rigkit.board/1"
 MAX_CORNERS = 1000
@@ -81,7 +81,7 @@ DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board fi
 def load_board(path: str | Path) -> Board:
     """Return the board that the file describes; its id is the file's name unless it says otherwise.
 
-    Target files of other tools will do: see `rigkit.io.foreign_boards`.
+    Target files of other tools will do: see `rigkit.io.boards.foreign_boards`.
 
     Raises InputError for a missing file, an unknown or missing key, or a value that makes no board.
     """

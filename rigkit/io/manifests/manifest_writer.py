@@ -13,10 +13,10 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.io.board_file import board_values
-from rigkit.io.images import IMAGE_ENDINGS
-from rigkit.io.manifest import DATASET_SCHEMA
-from rigkit.io.toml_reader import relative_path, toml_text
+from rigkit.io.boards.board_file import board_values
+from rigkit.io.disk.toml_reader import relative_path, toml_text
+from rigkit.io.manifests.manifest import DATASET_SCHEMA
+from rigkit.io.media.images import IMAGE_ENDINGS
 
 SIDES = (
     (re.compile(r"(left|_l|-l|view1|cam1|_1|-1|a)$", re.IGNORECASE), 1),

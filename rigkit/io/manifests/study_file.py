@@ -10,7 +10,7 @@ from typing import Any
 from rigkit.affine.registry import AFFINE_METHODS
 from rigkit.core.boards import Board
 from rigkit.core.posetype import PoseType
-from rigkit.io.schema_words import (
+from rigkit.io.disk.schema_words import (
     ANY_OF,
     COUNT,
     INTEGER,
@@ -28,7 +28,7 @@ from rigkit.io.schema_words import (
     said,
     texts,
 )
-from rigkit.io.toml_reader import TomlTable, read_toml
+from rigkit.io.disk.toml_reader import TomlTable, read_toml
 from rigkit.study.study import NOISE_KINDS, Claim, Study, Variant
 from rigkit.synthetic.noise import NoisyImages
 

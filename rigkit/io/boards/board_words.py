@@ -11,10 +11,10 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS, pattern_type
-from rigkit.io.board_file import DECLARED_BOARD, load_board, measured_board
-from rigkit.io.foreign_boards import FOREIGN_SUFFIXES
-from rigkit.io.reading import usable_path
-from rigkit.io.toml_reader import TomlTable
+from rigkit.io.boards.board_file import DECLARED_BOARD, load_board, measured_board
+from rigkit.io.boards.foreign_boards import FOREIGN_SUFFIXES
+from rigkit.io.disk.reading import usable_path
+from rigkit.io.disk.toml_reader import TomlTable
 
 BOARD_WORDS = re.compile(
     r"^(?:(?P<type>[a-z]+):)?(?P<columns>\d{1,4})[xX](?P<rows>\d{1,4})"

@@ -18,8 +18,8 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import check_identifier
-from rigkit.io.reading import damage, fault_of_number, read_text, usable_path
-from rigkit.io.schema_words import ANY_OF, Schema
+from rigkit.io.disk.reading import damage, fault_of_number, read_text, usable_path
+from rigkit.io.disk.schema_words import ANY_OF, Schema
 
 MAX_TOML_BYTES = 4_000_000
 """People write these files; the reader takes a second for each million."""

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.reading import is_file_or_lost_link, read_bytes, refuse_archive
-from rigkit.io.tiff import TIFF_STARTS, as_stored, page_sizes
+from rigkit.io.disk.reading import is_file_or_lost_link, read_bytes, refuse_archive
+from rigkit.io.media.tiff import TIFF_STARTS, as_stored, page_sizes
 
 _log = logging.getLogger(__name__)
 

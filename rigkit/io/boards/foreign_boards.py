@@ -11,7 +11,7 @@ from typing import Any
 
 from rigkit.core.errors import InputError
 from rigkit.interop.yaml_text import parse_yaml
-from rigkit.io.reading import read_text
+from rigkit.io.disk.reading import read_text
 
 FOREIGN_SUFFIXES = (".yaml", ".yml", ".xml")
 """Of files that are no board files of rigkit's."""

@@ -24,9 +24,9 @@ import rigkit
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import parse_json
-from rigkit.io.reading import read_bytes, read_text
+from rigkit.io.disk.json_reader import parse_json
+from rigkit.io.disk.reading import read_bytes, read_text
+from rigkit.io.disk.writing import write_atomic
 
 CORNERS_SCHEMA = "rigkit.corners/2"
 FILE_START = re.compile(rb'^\s*\{\s*"schema":\s*"rigkit\.corners/')

@@ -14,9 +14,9 @@ from typing import Any
 
 from rigkit.core.errors import InputError, printable
 from rigkit.core.printing import brief
-from rigkit.io.files import ensure_writable
-from rigkit.io.json_reader import parse_json, real, whole
-from rigkit.io.reading import MAX_NUMBER, read_text
+from rigkit.io.disk.json_reader import parse_json, real, whole
+from rigkit.io.disk.reading import MAX_NUMBER, read_text
+from rigkit.io.disk.writing import ensure_writable
 from rigkit.validation.sentinel.judge import SentinelCheck
 
 HISTORY_SCHEMA = "rigkit.history/1"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.errors import InputError
-from rigkit.io.reading import usable_path
+from rigkit.io.disk.reading import usable_path
 
 FORCE = "use --force (force=True in Python)"
 """What replaces files."""

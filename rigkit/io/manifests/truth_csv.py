@@ -20,8 +20,8 @@ from pathlib import Path
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.reading import csv_table, fault_of_number, read_text
-from rigkit.io.truth_file import make_angle, make_distance
+from rigkit.io.disk.reading import csv_table, fault_of_number, read_text
+from rigkit.io.manifests.truth_file import make_angle, make_distance
 
 TO_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 TO_DEG = {"deg": 1.0}

@@ -28,8 +28,8 @@ from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.core.identifiers import check_identifier
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.board_file import board_of_values, board_values
-from rigkit.io.calibration_file import (
+from rigkit.io.boards.board_file import board_of_values, board_values
+from rigkit.io.calibrations.calibration_file import (
     Made,
     camera_from_json,
     camera_to_json,
@@ -39,8 +39,8 @@ from rigkit.io.calibration_file import (
     pupil_from_json,
     pupil_to_json,
 )
-from rigkit.io.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
-from rigkit.io.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
+from rigkit.io.calibrations.schema_calibration import BOARD_RIG_FILE, RIG_FILE, keys_of
+from rigkit.io.disk.json_reader import freedom, json_schema, json_text, positive, read_json, real, reals, whole
 from rigkit.kernels.departures import DISPLACEMENTS
 
 RIG_SCHEMA = "rigkit.rig/1"

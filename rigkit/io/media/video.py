@@ -17,8 +17,8 @@ import numpy as np
 
 from rigkit.core.errors import InputError
 from rigkit.core.identifiers import last_number
-from rigkit.io.images import Image, quiet_opencv, require_pixels
-from rigkit.io.reading import csv_table
+from rigkit.io.disk.reading import csv_table
+from rigkit.io.media.images import Image, quiet_opencv, require_pixels
 
 _log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.io.reading import MAX_NUMBER, MIN_POSITIVE, read_text
+from rigkit.io.disk.reading import MAX_NUMBER, MIN_POSITIVE, read_text
 
 MAX_JSON_DIGITS = 18
 """Of a whole number: what 64 bits hold."""

@@ -21,7 +21,7 @@
     boards = ["left", "floor"]
     angles = [ { a = "left", b = "floor", value_deg = 90.0, sigma_deg = 0.3, how = "set square" } ]
 
-Every key, with its meaning, stands in `rigkit.io.session.SESSION_FILE`. A session of one
+Every key, with its meaning, stands in `rigkit.io.manifests.session.SESSION_FILE`. A session of one
 camera with [[rigid_boards]] has `images` as ever.
 
 Images of one moment have the same file name without its ending in every camera's folder (frames = "name"), the same
@@ -41,9 +41,17 @@ from rigkit.core.errors import InputError
 from rigkit.core.identifiers import last_number
 from rigkit.core.printing import brief
 from rigkit.core.truth import MeasuredLength, PairTruth
-from rigkit.io.session import ONE_CAMERA_KEYS, SESSION_FILE, Session, beside_session, boards_of, images_of, options_of
-from rigkit.io.toml_reader import TomlTable, read_toml
-from rigkit.io.truth_file import measured_value, truth_from_table
+from rigkit.io.disk.toml_reader import TomlTable, read_toml
+from rigkit.io.manifests.session import (
+    ONE_CAMERA_KEYS,
+    SESSION_FILE,
+    Session,
+    beside_session,
+    boards_of,
+    images_of,
+    options_of,
+)
+from rigkit.io.manifests.truth_file import measured_value, truth_from_table
 
 ONE = "camera"
 """What the only camera of a session without [[cameras]] is called."""

@@ -20,7 +20,7 @@ import numpy as np
 from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
-from rigkit.io.reading import MAX_NUMBER, csv_table
+from rigkit.io.disk.reading import MAX_NUMBER, csv_table
 
 LENGTHS = {"mm": 1.0, "m": 1000.0}
 TURNS = {"rad": 1.0, "deg": np.pi / 180.0}

@@ -27,11 +27,11 @@ from rigkit.core.arrays import as_covariance, as_indices, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding, Severity
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.io.board_file import board_of_values, board_values
-from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
-from rigkit.io.reading import damage, usable_path
-from rigkit.io.schema_calibration import CALIBRATION_FILE, keys_of
+from rigkit.io.boards.board_file import board_of_values, board_values
+from rigkit.io.calibrations.schema_calibration import CALIBRATION_FILE, keys_of
+from rigkit.io.disk.json_reader import freedom, json_schema, positive, read_json, real, reals, whole
+from rigkit.io.disk.reading import damage, usable_path
+from rigkit.io.disk.writing import write_atomic
 
 CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")

@@ -33,7 +33,7 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError
 from rigkit.core.matches import DirectionPairs
 from rigkit.interop.colmap_database import is_colmap_database, read_colmap_matches
-from rigkit.io.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
+from rigkit.io.disk.reading import MAX_NUMBER, csv_table, damage, is_number, read_bytes
 
 POINT_COLUMNS = ("u1_px", "v1_px", "u2_px", "v2_px")
 AFFINE = ("a11", "a12", "a21", "a22")

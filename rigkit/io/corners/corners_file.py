@@ -23,10 +23,10 @@ import numpy as np
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.errors import InputError
-from rigkit.io.corner_cache import kept_corners
-from rigkit.io.files import write_atomic
-from rigkit.io.json_reader import parse_json
-from rigkit.io.reading import csv_rows, damage, read_text
+from rigkit.io.corners.corner_cache import kept_corners
+from rigkit.io.disk.json_reader import parse_json
+from rigkit.io.disk.reading import csv_rows, damage, read_text
+from rigkit.io.disk.writing import write_atomic
 
 COLUMNS = ("image", "board", "column", "row", "u_px", "v_px", "sigma_px")
 

@@ -1,0 +1,1 @@
+"""Files of points in images: corners of boards, correspondences of any scene."""

@@ -1,0 +1,1 @@
+"""What a person writes: sessions, data sets, studies, and what was measured."""

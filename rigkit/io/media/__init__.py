@@ -1,0 +1,1 @@
+"""Images, TIFF files and videos."""
