@@ -27,9 +27,9 @@ from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.validation.planes import fit_plane, normal_errors
 from rigkit.validation.tables import best_of
-from rigkit.workflows.datasets import DatasetOptions, PairJob, over_pairs
-from rigkit.workflows.pairs import geometry_of, match_images
-from rigkit.workflows.paper import load_paper_tables
+from rigkit.workflows.reconstruction.datasets import DatasetOptions, PairJob, over_pairs
+from rigkit.workflows.reconstruction.pairs import geometry_of, match_images
+from rigkit.workflows.validation.paper import load_paper_tables
 
 ROOT = Path(__file__).resolve().parents[1]
 

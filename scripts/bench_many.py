@@ -26,8 +26,8 @@ from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.synthetic.pairs import trihedral_pair
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics
-from rigkit.workflows.validate import ValidateOptions
-from rigkit.workflows.validate_many import ManyValidation, validate_datasets
+from rigkit.workflows.validation.validate import ValidateOptions
+from rigkit.workflows.validation.validate_many import ManyValidation, validate_datasets
 
 CAMERA = Brown((480, 360), np.array([300.0, 300.5, 241.0, 179.0, -0.05, 0.01, 0.0, 0.0, 0.0]))
 PLANES = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))

@@ -25,7 +25,7 @@ from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.planning.candidates import Reach
 from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.sentinel.evidence import Watched
-from rigkit.workflows.next_pictures import next_frames
+from rigkit.workflows.calibration.next_pictures import next_frames
 
 NAMES = ("left", "right")
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.03, 0.02])), [-60.0, 2.0, 3.0])

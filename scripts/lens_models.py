@@ -16,9 +16,9 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.errors import RigkitError
 from rigkit.io.manifests.manifest import Dataset, Pair, load_dataset
 from rigkit.io.manifests.session import load_session
-from rigkit.workflows.calibrate import calibration_from
+from rigkit.workflows.calibration.calibrate import calibration_from
 from rigkit.workflows.inputs.corners import session_corners
-from rigkit.workflows.pairs import match_images, reconstruct_with
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with
 
 
 def calibrations(dataset: Dataset, pairs: list[Pair], models: list[str]) -> dict[tuple[str, str], Calibration]:

@@ -32,8 +32,8 @@ from rigkit.io.media.images import read_image
 from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
-from rigkit.workflows.calibrate import CalibrateOptions
-from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
+from rigkit.workflows.calibration.calibrate import CalibrateOptions
+from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.inputs.folder_session import cameras_in
 
 Frame = tuple[Path, Path]

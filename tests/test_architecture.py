@@ -330,7 +330,7 @@ def test_help_and_version_import_nothing_heavy(option: str, shown: str) -> None:
 
 def test_verbs_begin_without_scipy() -> None:
     """It takes a quarter of a second, and most sessions have no use for it."""
-    verbs = ("calibrate_any", "detect", "reconstruct_scene", "validate")
+    verbs = ("calibration.calibrate_any", "detect", "reconstruction.reconstruct_scene", "validation.validate")
     loop = f"for verb in {verbs}: __import__('rigkit.workflows.' + verb); print(verb, 'scipy' in sys.modules)"
     code = f"import sys\n{loop}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

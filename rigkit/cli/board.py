@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.core.boards import Board
     from rigkit.io.boards.board_words import board_in_words
-    from rigkit.workflows.print_board import PrintOptions, print_board
+    from rigkit.workflows.capture.print_board import PrintOptions, print_board
 
     if args.size == "identify":
         return identify(args)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _store_measured(args: argparse.Namespace) -> int:
-    from rigkit.workflows.print_board import MeasuredPrint, store_measured_print
+    from rigkit.workflows.capture.print_board import MeasuredPrint, store_measured_print
 
     if args.ruler_x_mm is None or args.ruler_y_mm is None:
         raise InputError("board: measure both rulers; printers stretch the two directions differently")

@@ -13,8 +13,8 @@ from rigkit.cli.calibrate_arguments import calibrate_options, folder_options
 from rigkit.core.errors import ExitCode, InputError, RigkitError
 
 if TYPE_CHECKING:
-    from rigkit.workflows.calibrate import SessionCalibration
-    from rigkit.workflows.calibrate_rig import RigSessionCalibration
+    from rigkit.workflows.calibration.calibrate import SessionCalibration
+    from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,7 +71,7 @@ def _listed(files: Sequence[Path]) -> str:
 
 def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCalibration:
     from rigkit.cli.console import progress_on_stderr
-    from rigkit.workflows.calibrate_any import calibrate_sources
+    from rigkit.workflows.calibration.calibrate_any import calibrate_sources
 
     return calibrate_sources(args.source, folder_options(args), calibrate_options(args), progress=progress_on_stderr())
 
@@ -79,7 +79,7 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
 def _said(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
     """Return the figures for `json` programs, the words for a person, and whether everything measured agrees."""
     from rigkit.cli import calibration_words, rig_words
-    from rigkit.workflows.calibrate import SessionCalibration
+    from rigkit.workflows.calibration.calibrate import SessionCalibration
 
     if isinstance(done, SessionCalibration):
         words = calibration_words.describe(done.calibration)

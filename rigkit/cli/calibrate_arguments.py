@@ -11,8 +11,8 @@ from rigkit.core.errors import InputError
 from rigkit.workflows.inputs.formats import FOREIGN_ENDINGS
 
 if TYPE_CHECKING:
-    from rigkit.workflows.calibrate import CalibrateOptions
-    from rigkit.workflows.calibrate_any import FolderOptions
+    from rigkit.workflows.calibration.calibrate import CalibrateOptions
+    from rigkit.workflows.calibration.calibrate_any import FolderOptions
 
 MODEL_NAMES = ("pinhole", "brown", "kannala_brandt", "scaramuzza", "ucm", "eucm", "double_sphere")
 """Their names as `rigkit.cameras.registry` has them, which takes too long to load for a help text."""
@@ -103,7 +103,7 @@ def _add_of_folders(parser: argparse.ArgumentParser) -> None:
 
 def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
     """Return what is written where, and what is known before."""
-    from rigkit.workflows.calibrate import CalibrateOptions
+    from rigkit.workflows.calibration.calibrate import CalibrateOptions
     from rigkit.workflows.inputs.corners import Cache
     from rigkit.workflows.inputs.folder_session import Known
 
@@ -121,7 +121,7 @@ def calibrate_options(args: argparse.Namespace) -> CalibrateOptions:
 
 def folder_options(args: argparse.Namespace) -> FolderOptions:
     """Return what folders of images do not tell of themselves."""
-    from rigkit.workflows.calibrate_any import FolderOptions
+    from rigkit.workflows.calibration.calibrate_any import FolderOptions
 
     if args.square_mm is not None and not (math.isfinite(args.square_mm) and args.square_mm > 0.0):
         raise InputError(f"calibrate: --square-mm {args.square_mm}: a positive number of mm is needed")

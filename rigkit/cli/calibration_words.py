@@ -20,7 +20,7 @@ MAX_NAMED = 3
 def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
     """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
     from rigkit.report.calibration_facts import camera_facts
-    from rigkit.workflows.next_pictures import next_views
+    from rigkit.workflows.calibration.next_pictures import next_views
 
     try:
         return camera_facts(calibration, next_views(calibration, boards))

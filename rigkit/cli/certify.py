@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.report.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
-    from rigkit.workflows.certify import CertifyOptions, certify_file
+    from rigkit.workflows.checks.certify import CertifyOptions, certify_file
 
     quantity = next(q for q in Quantity if getattr(args, q) is not None)
     if args.sigma_px is not None and not 0.0 < args.sigma_px < float("inf"):

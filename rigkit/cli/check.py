@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.io.disk.writing import ensure_writable
     from rigkit.report.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.check import CheckOptions, check_pictures
+    from rigkit.workflows.checks.check import CheckOptions, check_pictures
 
     length = length_of(args, "check")
     if args.temperature is not None and args.register is None:

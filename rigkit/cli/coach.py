@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import options_of, progress_on_stderr
     from rigkit.coach.guide import GuideOptions
     from rigkit.io.boards.board_words import board_of_words
-    from rigkit.workflows.coach import CoachOptions, run_coach
+    from rigkit.workflows.capture.coach import CoachOptions, run_coach
 
     if not 0.0 < args.goal < float("inf"):
         raise InputError(f"--goal {args.goal}: it must be positive")

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.crosscheck import crosscheck_dataset
-    from rigkit.workflows.datasets import DatasetOptions
+    from rigkit.workflows.reconstruction.datasets import DatasetOptions
+    from rigkit.workflows.validation.crosscheck import crosscheck_dataset
 
     dataset = load_dataset(args.dataset)
     options = DatasetOptions(**dataset_options(args, dataset.name))

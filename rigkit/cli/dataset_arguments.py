@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rigkit.cli.console import note
 
 if TYPE_CHECKING:
-    from rigkit.workflows.datasets import PairFailure
+    from rigkit.workflows.reconstruction.datasets import PairFailure
 
 
 def add_dataset_arguments(parser: argparse.ArgumentParser, *, optional: bool = False, several: bool = False) -> None:
@@ -56,7 +56,7 @@ def add_planes_argument(parser: argparse.ArgumentParser, what: str) -> None:
 
 def results_folder(args: argparse.Namespace, name: str) -> Path:
     """Return the folder asked for, or a new one of that name."""
-    from rigkit.workflows.results import free_folder
+    from rigkit.workflows.outputs.results import free_folder
 
     return Path(args.output) if args.output else free_folder(name, force=args.force)
 

@@ -19,8 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import print_json
-    from rigkit.workflows.diff import DiffOptions, diff
-    from rigkit.workflows.diff_words import facts_of, figures_of, words_of, write_diff_page
+    from rigkit.workflows.checks.diff import DiffOptions, diff
+    from rigkit.workflows.checks.diff_words import facts_of, figures_of, words_of, write_diff_page
 
     options = DiffOptions(output=args.output, force=args.force, report=args.report)
     done = diff(args.a, args.b, options)

@@ -40,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
 
     from rigkit.cli.console import options_of
     from rigkit.rectification.targets import field_across
-    from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, export_rig
     from rigkit.workflows.inputs.camera_files import is_rig
+    from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera, export_rig
 
     size_px = None if args.size is None else size_of_words(args.size)
     told = {"kind": args.to, "source_kind": args.source_format, "size_px": size_px}
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _export_cloud(args: argparse.Namespace) -> int:
     from rigkit.cli.console import options_of, progress_on_stderr
-    from rigkit.workflows.export_cloud import ExportCloudOptions, export_cloud, export_ply
+    from rigkit.workflows.reconstruction.export_cloud import ExportCloudOptions, export_cloud, export_ply
 
     kind = args.to or args.output.suffix.lstrip(".") or "colmap"
     is_ply = args.source.suffix == ".ply"

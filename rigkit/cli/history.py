@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
 
     from rigkit.cli.console import note, note_written, print_json
     from rigkit.core.errors import InputError
-    from rigkit.workflows.history import add_to_history, show_history
+    from rigkit.workflows.checks.history import add_to_history, show_history
 
     if (args.add is None) != (args.to is None):
         raise InputError("history: --add NEW.json needs --to CALIBRATION.json, the one that it is compared with")

@@ -26,7 +26,7 @@ from rigkit.io.disk.reading import usable_path
 def run_manifest(args: argparse.Namespace) -> int:
     from rigkit.io.disk.writing import ensure_writable
     from rigkit.io.manifests.manifest_writer import NewManifest, find_images
-    from rigkit.workflows.new_manifest import find_pairs, name_of_folder, write_manifest
+    from rigkit.workflows.capture.new_manifest import find_pairs, name_of_folder, write_manifest
 
     if args.model:
         raise InputError("init: --model goes with --session only; leave it out")

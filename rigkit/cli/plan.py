@@ -11,7 +11,7 @@ from rigkit.cli.console import size_of_words
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from rigkit.workflows.plan import PlannedSession, PlanOptions
+    from rigkit.workflows.capture.plan import PlannedSession, PlanOptions
 
 MAX_VIEWS = 100
 """Nobody takes more by a plan."""
@@ -69,7 +69,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
-    from rigkit.workflows.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
+    from rigkit.workflows.capture.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
@@ -99,7 +99,7 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
 
 def _options(args: argparse.Namespace, count: int) -> PlanOptions:
     from rigkit.cli.console import options_of
-    from rigkit.workflows.plan import PlanOptions
+    from rigkit.workflows.capture.plan import PlanOptions
 
     if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
         raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")

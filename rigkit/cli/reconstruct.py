@@ -19,7 +19,7 @@ from rigkit.cli.reconstruct_scene import add_scene_arguments, is_scene, run_scen
 from rigkit.core.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
-    from rigkit.workflows.reconstruct import PairReconstruction
+    from rigkit.workflows.reconstruction.reconstruct import PairReconstruction
 
 METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")
 
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         return run_scene(args)
     from rigkit.io.manifests.manifest import load_dataset
     from rigkit.report.tables import measured_words
-    from rigkit.workflows.reconstruct import ReconstructOptions, reconstruct_dataset
+    from rigkit.workflows.reconstruction.reconstruct import ReconstructOptions, reconstruct_dataset
 
     dataset = load_dataset(args.dataset)
     common = dataset_options(args, dataset.name)

@@ -62,7 +62,7 @@ def is_scene(args: argparse.Namespace) -> bool:
 def run_scene(args: argparse.Namespace) -> int:
     if args.images and len(args.images) > 2:
         return _run_rig(args)
-    from rigkit.workflows.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
+    from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SceneOptions, reconstruct_views
 
     for option, given in (("--images", args.images), ("--names", args.names)):
         if given and len(given) != 2:
@@ -90,8 +90,8 @@ def _written(args: argparse.Namespace) -> dict[str, bool]:
 
 
 def _run_rig(args: argparse.Namespace) -> int:
-    from rigkit.workflows.reconstruct_rig import RigSceneOptions, reconstruct_rig_views
-    from rigkit.workflows.reconstruct_scene import CLOUD
+    from rigkit.workflows.reconstruction.reconstruct_rig import RigSceneOptions, reconstruct_rig_views
+    from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD
 
     if not args.rig:
         raise InputError(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> PageFacts:
     """Return what the page says of a rig, and of each camera, calibrated as its session asks for."""
     from rigkit.report.calibration_facts import rig_facts
-    from rigkit.workflows.calibrate_rig import shown_cameras
+    from rigkit.workflows.calibration.calibrate_rig import shown_cameras
 
     shown = shown_cameras(rig, session)
     cameras = {name: calibration_words.page(c, session.cameras[name].boards) for name, c in shown.items()}

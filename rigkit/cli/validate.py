@@ -20,7 +20,7 @@ from rigkit.cli.validation_words import show, show_paper
 from rigkit.core.errors import InputError
 
 if TYPE_CHECKING:
-    from rigkit.workflows.validate import ValidateOptions
+    from rigkit.workflows.validation.validate import ValidateOptions
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from rigkit.io.manifests.manifest import load_dataset
-    from rigkit.workflows.paper import PaperOptions, validate_as_paper
-    from rigkit.workflows.validate import validate_dataset
+    from rigkit.workflows.validation.paper import PaperOptions, validate_as_paper
+    from rigkit.workflows.validation.validate import validate_dataset
 
     if len(args.dataset) > 1:
         return _many(args)
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace, common: dict[str, Any]) -> ValidateOptions:
-    from rigkit.workflows.validate import ValidateOptions
+    from rigkit.workflows.validation.validate import ValidateOptions
 
     return ValidateOptions(
         **common,
@@ -91,7 +91,7 @@ def _many(args: argparse.Namespace) -> int:
 
     from rigkit.core.processes import process_count
     from rigkit.report.tables import tables_to_json, tables_to_text
-    from rigkit.workflows.validate_many import validate_datasets
+    from rigkit.workflows.validation.validate_many import validate_datasets
 
     if args.paper or args.own_solvers:
         raise InputError("--paper is for one data set at a time")

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from rigkit.validation.checks import ValidationReport
     from rigkit.validation.crosscheck import CrossCheckReport
-    from rigkit.workflows.paper import PaperOptions, PaperValidation
-    from rigkit.workflows.validate import DatasetValidation
+    from rigkit.workflows.validation.paper import PaperOptions, PaperValidation
+    from rigkit.workflows.validation.validate import DatasetValidation
 
 
 def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
@@ -51,7 +51,7 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
 def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> int:
     """Print the paper's tables; return the exit code. What the paper claims passes or fails no check of ours."""
     from rigkit.report.tables import tables_to_text
-    from rigkit.workflows.paper import NOT_CHECKED
+    from rigkit.workflows.validation.paper import NOT_CHECKED
 
     if json:
         result = {"output": str(options.output), "reports": [report.to_dict() for report in done.reports]}

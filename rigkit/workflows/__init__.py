@@ -1,5 +1,6 @@
 """What a verb does, as functions: typed options in, typed results out; no printing, progress is told by callback.
 
 Options and results are frozen dataclasses with keywords only. Notes go to the package's loggers. Files are written only
-where the options say so. What verbs work on is made ready in `inputs`.
+where the options say so. What verbs work on is made ready in `inputs`, what several write is in `outputs`; verbs that
+share their work share a folder.
 """

@@ -16,10 +16,10 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.disk.reading import usable_path
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.synthetic.demo import build_demo
-from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.validate import DatasetValidation, ValidateOptions, validate_dataset
+from rigkit.workflows.validation.validate import DatasetValidation, ValidateOptions, validate_dataset
 
 _log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.provenance import software_facts
+from rigkit.workflows.outputs.provenance import software_facts
 
 Errors = NDArray[np.float32]
 

@@ -258,7 +258,7 @@ KINDS: dict[str, Kind] = {
     "colmap-database": Kind("matches.db", (("fuzzing.readers:read_database", "{case}"), *MATCHES[1:])),
     "poses": Kind("poses.csv", (("rigkit.io.manifests.robot_poses:read_robot_poses", "{case}"),)),
     "poses-turned": Kind("turns.csv", (("rigkit.io.manifests.robot_poses:read_robot_poses", "{case}"),)),
-    "pose": Kind("pose.txt", (("rigkit.workflows.reconstruct_scene:_read_pose", "{case}"),)),
+    "pose": Kind("pose.txt", (("rigkit.workflows.reconstruction.reconstruct_scene:_read_pose", "{case}"),)),
     "avi": _video("film.avi"),
     "mp4": _video("film.mp4"),
     "mkv": _video("film.mkv"),

@@ -21,8 +21,8 @@ from rigkit.io.disk.reading import read_text
 from rigkit.io.manifests.session import load_session
 from rigkit.io.manifests.truth_csv import load_truth_csv
 from rigkit.io.media.video import read_timestamps
-from rigkit.workflows.calibrate import calibrate_session
-from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach
+from rigkit.workflows.calibration.calibrate import calibrate_session
+from rigkit.workflows.capture.coach import CoachOptions, coach_frames, coach_recording, open_coach
 from rigkit.workflows.inputs.frames import frames_of_video
 
 SMALL = Board("small", 5, 4, 30.0, 30.0)

@@ -17,8 +17,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.calibrations.calibration_file import save_camera
 from rigkit.io.corners.correspondences import correspondences_text
 from rigkit.io.media.images import read_image
-from rigkit.workflows.reconstruct_scene import SceneOptions, reconstruct_views
-from rigkit.workflows.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.reconstruction.reconstruct_scene import SceneOptions, reconstruct_views
+from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
 from truth import peers
 from truth.cameras import PEER_FAILURES, kept_views
 from truth.colmap import colmap_pair, colmap_rig
@@ -223,8 +223,8 @@ def _faces(a: str, b: str) -> str:
 
 def trihedral_peers(bench: Bench, folder: object) -> Iterator[Row]:
     from rigkit.io.manifests.manifest import load_dataset
-    from rigkit.workflows.datasets import load_cameras
-    from rigkit.workflows.pairs import match_images
+    from rigkit.workflows.reconstruction.datasets import load_cameras
+    from rigkit.workflows.reconstruction.pairs import match_images
 
     dataset = load_dataset(f"{folder}/dataset.toml")
     pair, known = dataset.pairs[0], load_cameras(dataset).known

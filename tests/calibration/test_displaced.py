@@ -24,7 +24,7 @@ from rigkit.kernels.departures import DISPLACEMENTS, displacements
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import covariance_of, plan_views
-from rigkit.workflows.next_pictures import next_views
+from rigkit.workflows.calibration.next_pictures import next_views
 
 DEPARTS = np.zeros(DISPLACEMENTS)
 DEPARTS[5:7] = 0.3, -0.2

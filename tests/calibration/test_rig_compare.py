@@ -18,8 +18,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.kernels.departures import displacements
-from rigkit.workflows.certify import load_instrument
-from rigkit.workflows.diff import RigPair, diff
+from rigkit.workflows.checks.certify import load_instrument
+from rigkit.workflows.checks.diff import RigPair, diff
 
 MOVED_MM = 1.0
 RIGS = 12

@@ -25,7 +25,7 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Severity, worst
 from rigkit.io.manifests.session import Session
-from rigkit.workflows.calibrate_rig import judged
+from rigkit.workflows.calibration.calibrate_rig import judged
 
 
 def said(result: Calibration, words: str) -> bool:

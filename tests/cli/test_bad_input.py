@@ -154,7 +154,9 @@ def test_without_anything_measured_no_work_is_done(
 ) -> None:
     manifest = write() / "dataset.toml"
     manifest.write_text(manifest.read_text().partition("[pairs.truth]")[0])
-    monkeypatch.setattr("rigkit.workflows.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    monkeypatch.setattr(
+        "rigkit.workflows.reconstruction.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done")
+    )
     code, line = run(tmp_path, capsys)
     check(code, line, 2, "dataset.toml", "nothing was measured", "[pairs.truth]")
 
@@ -167,7 +169,9 @@ def test_a_spoiled_table_of_the_paper_is_known_before_the_work(
     (write() / "dataset.toml").rename(folder / "dataset.toml")
     (tmp_path / "hajder2021").mkdir()
     (tmp_path / "hajder2021" / "planes.csv").write_bytes(b"\xff\xfe")
-    monkeypatch.setattr("rigkit.workflows.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    monkeypatch.setattr(
+        "rigkit.workflows.reconstruction.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done")
+    )
     code, line = run(folder, capsys)
     check(code, line, 2, "planes.csv", "not UTF-8")
 

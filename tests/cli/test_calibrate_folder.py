@@ -25,8 +25,8 @@ from rigkit.io.corners.corner_cache import FoundCorners
 from rigkit.io.corners.corners_file import read_corners
 from rigkit.io.manifests.rig_session import load_rig_session
 from rigkit.io.manifests.session import load_session
-from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
-from rigkit.workflows.calibrate_any import calibrate_session_file
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration, calibrate_session
+from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.inputs.camera_files import import_rig
 from rigkit.workflows.inputs.corners import first_camera
 from rigkit.workflows.inputs.folder_session import Known, cameras_in, session_of_folders

@@ -19,7 +19,7 @@ from rigkit.io.calibrations.calibration_file import load_calibration
 from rigkit.io.calibrations.rig_file import load_board_rigs, load_rig
 from rigkit.io.corners.corner_cache import CornerCache, FoundCorners
 from rigkit.io.manifests.rig_session import load_rig_session
-from rigkit.workflows.calibrate_rig import calibrate_camera
+from rigkit.workflows.calibration.calibrate_rig import calibrate_camera
 
 NAMES = ("reg", "wide")
 SIGMAS = 4.0

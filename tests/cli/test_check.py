@@ -36,7 +36,7 @@ from rigkit.synthetic.scene import PlacedBoard
 from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.judge import SentinelCheck
 from rigkit.validation.sentinel.power import Power
-from rigkit.workflows.check import CheckOptions, _frames, _require_right_order, check_pictures
+from rigkit.workflows.checks.check import CheckOptions, _frames, _require_right_order, check_pictures
 
 BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
@@ -131,10 +131,10 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
 
     odd, moved, holding = (found(holds=h, unexplained=u) for h, u in ((False, True), (False, False), (True, False)))
     for given, other, wrong in ((odd, odd, False), (moved, moved, False), (odd, moved, True), (moved, holding, True)):
-        monkeypatch.setattr("rigkit.workflows.check.check_views", lambda *_, other=other: other)
+        monkeypatch.setattr("rigkit.workflows.checks.check.check_views", lambda *_, other=other: other)
         with pytest.raises(InputError, match="'left' and 'right' are exchanged") if wrong else nullcontext():
             _require_right_order(given, [])
-    monkeypatch.setattr("rigkit.workflows.check.check_views", refused)
+    monkeypatch.setattr("rigkit.workflows.checks.check.check_views", refused)
     _require_right_order(odd, [])
 
 

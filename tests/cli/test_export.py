@@ -24,9 +24,9 @@ from rigkit.geometry.rotation import exp_so3, skew
 from rigkit.interop.mrcal import read_cameramodel
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_calibration, load_camera, save_camera
 from rigkit.io.ply import read_ply
-from rigkit.workflows.export_camera import ExportCameraOptions, export_camera, foreign_files
 from rigkit.workflows.inputs.camera_files import import_rig
-from rigkit.workflows.pairs import find_boards
+from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera, foreign_files
+from rigkit.workflows.reconstruction.pairs import find_boards
 
 CAMERAS = REPOSITORY / "calib" / "cameras"
 CALIBRATION = CAMERAS / "mvca020_fe185" / "calibration.json"
@@ -101,7 +101,7 @@ def test_a_cloud_is_the_same_by_export_and_reconstruct(
             found.append(find_boards(*asked))
         return found[0]
 
-    monkeypatch.setattr("rigkit.workflows.pairs.find_boards", find_once)
+    monkeypatch.setattr("rigkit.workflows.reconstruction.pairs.find_boards", find_once)
     shutil.copytree(REPOSITORY / "calib", tmp_path / "calib")
     shutil.copytree(LAB, lab := tmp_path / "datasets" / "lab-a")
     manifest = lab / "dataset.toml"

@@ -20,7 +20,7 @@ from rigkit.cli import diff
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.core.processes import over_items, process_count, worker_pool
-from rigkit.workflows.datasets import _attempt
+from rigkit.workflows.reconstruction.datasets import _attempt
 
 TASK = """
 import os, time

@@ -12,7 +12,7 @@ from helpers.data import REPOSITORY
 
 from rigkit.cli.main import main
 from rigkit.io.manifests.manifest import load_dataset
-from rigkit.workflows.datasets import load_cameras
+from rigkit.workflows.reconstruction.datasets import load_cameras
 
 LAB = REPOSITORY / "datasets" / "lab-a"
 QUICK = ["--no-pictures", "--no-crosscheck"]

@@ -16,7 +16,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import camera_to_json
 from rigkit.io.ply import read_ply
-from rigkit.workflows.reconstruct_rig import near_pairs
+from rigkit.workflows.reconstruction.reconstruct_rig import near_pairs
 
 CAMERA = Pinhole((240, 180), np.array([210.0, 210.0, 119.5, 89.5]))
 TURNS = ((0.0, 0.0, 0.0), (0.02, -0.12, 0.05), (0.03, -0.2, 0.02))

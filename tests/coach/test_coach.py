@@ -33,7 +33,7 @@ from rigkit.planning.goal import projection_goal
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.coach import CoachOptions, coach_frames, coach_recording, open_coach, run_coach
+from rigkit.workflows.capture.coach import CoachOptions, coach_frames, coach_recording, open_coach, run_coach
 
 SIZE = (640, 480)
 BOARD = Board("board-9x6x25", 9, 6, 25.0, 25.0)

@@ -32,7 +32,7 @@ from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.information import CornerError, HeldBoards
 from rigkit.planning.mounts import SharedViews, mean_motion, mount_error_px, mount_information
 from rigkit.validation.certificate.contracts import Quantity, Task
-from rigkit.workflows.coach import CoachOptions, open_coach
+from rigkit.workflows.capture.coach import CoachOptions, open_coach
 
 MOUNT = Rigid3(exp_so3(np.array([0.0, 0.06, 0.01])), [-60.0, 1.0, 2.0])
 NOISE_PX, DRAWS = 0.05, 120

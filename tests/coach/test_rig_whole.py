@@ -28,9 +28,9 @@ from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.validation.certificate.contracts import Quantity, Task
-from rigkit.workflows.calibrate_rig import RigSessionCalibration
-from rigkit.workflows.coach import finished_words
-from rigkit.workflows.next_pictures import length_goals
+from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration
+from rigkit.workflows.calibration.next_pictures import length_goals
+from rigkit.workflows.capture.coach import finished_words
 
 NAMES, OTHER = ("left", "right"), "right"
 FRAMES = 10
@@ -205,7 +205,7 @@ def test_what_came_of_a_rig_is_said_as_the_rig_states_it(
     done = RigSessionCalibration(
         session=session, rig=rig, checks=(), unreadable={}, written=(tmp_path / "rig.json", tmp_path / "page.html")
     )
-    monkeypatch.setattr("rigkit.workflows.coach.calibrate_session_file", lambda *_: done)
+    monkeypatch.setattr("rigkit.workflows.capture.coach.calibrate_session_file", lambda *_: done)
     options = GuideOptions(boards=(BOARD,), goal_px=3.0, reach=REACH)
     words = finished_words(tmp_path, options)
     assert words.count("(as wanted)") == 3 and "together" in words and "rig.json written" in words

@@ -26,8 +26,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.session import Session
 from rigkit.planning.candidates import Reach, held_boards
 from rigkit.planning.goal import Goal, projection_goal
-from rigkit.workflows.calibrate import SessionCalibration
-from rigkit.workflows.coach import CoachOptions, finished_words, open_coach
+from rigkit.workflows.calibration.calibrate import SessionCalibration
+from rigkit.workflows.capture.coach import CoachOptions, finished_words, open_coach
 
 FRAMES, NOISE_PX = 10, 0.05
 EMPTY = Glance(size_px=SIZE, view=None)
@@ -185,7 +185,7 @@ def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
     )
     written = (tmp_path / "calibration.json", tmp_path / "page.html")
     done = SessionCalibration(session=session, calibration=whole.calibration, unreadable={}, written=written)
-    monkeypatch.setattr("rigkit.workflows.coach.calibrate_session_file", lambda *_: done)
+    monkeypatch.setattr("rigkit.workflows.capture.coach.calibrate_session_file", lambda *_: done)
     told: list[str] = []
     wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=100.0)
     coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), tell=told.append)

@@ -21,8 +21,8 @@ from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.metric import MetricPose
 from rigkit.relative_pose.refinement.refine import RefinedPose
 from rigkit.validation.planes import Plane
-from rigkit.workflows.reconstruct import PairReconstruction
-from rigkit.workflows.validation_files import PairValidation
+from rigkit.workflows.reconstruction.reconstruct import PairReconstruction
+from rigkit.workflows.validation.validation_files import PairValidation
 
 MAX_LINES = 5
 COLUMNS = 120

@@ -22,7 +22,7 @@ from rigkit.coach.sources import watched_frames
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.history_file import load_history
-from rigkit.workflows.coach import CoachOptions, open_coach
+from rigkit.workflows.capture.coach import CoachOptions, open_coach
 from rigkit.workflows.handeye import HandEyeOptions, calibrate_hand_eye
 from rigkit.workflows.inputs.frames import frames_of_video
 
@@ -161,7 +161,7 @@ def test_a_cell_without_end(name: str, place: Path) -> None:
 
 
 def test_pictures_of_one_channel_and_sixteen_bits_are_shown() -> None:
-    from rigkit.workflows.coach import _preview
+    from rigkit.workflows.capture.coach import _preview
 
     for picture in (np.full((8, 8), 200, np.uint8), np.full((8, 8, 3), 200 << 8, np.uint16)):
         shown = cv2.imdecode(np.frombuffer(_preview(picture), np.uint8), cv2.IMREAD_GRAYSCALE)

@@ -208,7 +208,9 @@ def test_one_changed_number_of_a_covariance_is_no_calibration(place: Path, capsy
 def test_a_pair_called_as_a_file_of_results_is_refused_before_the_work(
     name: str, place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigkit.workflows.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done"))
+    monkeypatch.setattr(
+        "rigkit.workflows.reconstruction.datasets.load_cameras", lambda *_, **__: pytest.fail("work was done")
+    )
     text = (place / "dataset.toml").read_text()
     (place / "dataset.toml").write_text(text.replace('id = "first"', f'id = "{name}"'))
     assert name in refused("validate dataset.toml -o new -j 1", capsys)

@@ -16,8 +16,8 @@ from rigkit.core.truth import MeasuredAngle, MeasuredLength, PairTruth
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.manifest import load_dataset
 from rigkit.validation.checks import validate
-from rigkit.workflows.datasets import load_cameras
-from rigkit.workflows.pairs import match_found, reconstruct_with
+from rigkit.workflows.reconstruction.datasets import load_cameras
+from rigkit.workflows.reconstruction.pairs import match_found, reconstruct_with
 
 SIGMA_PX = 0.03
 DRAWS_A_PAIR = 25

@@ -23,7 +23,7 @@ from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow,
 from rigkit.reconstruction.growing.surface import PairRays
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
-from rigkit.workflows.reconstruct_scene import _grown
+from rigkit.workflows.reconstruction.reconstruct_scene import _grown
 
 SIZE = (480, 360)
 LENSES = {

@@ -16,7 +16,7 @@ from rigkit.core.patterns.circles import Circles
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.report.plan_page import printed_outlines
-from rigkit.workflows.print_board import PrintOptions, print_board
+from rigkit.workflows.capture.print_board import PrintOptions, print_board
 
 POINTS_PER_MM = 72.0 / 25.4
 PDF_ROUNDING_MM = 1e-4

@@ -12,7 +12,7 @@ import pytest
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, editions
 from rigkit.report.history_page import history_page
 from rigkit.validation.sentinel.drift import heat_drift
-from rigkit.workflows.history import show_history
+from rigkit.workflows.checks.history import show_history
 
 
 def entry(

@@ -14,7 +14,7 @@ from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.paper_claims import CLAIMS, claim_table, estimator_order_table
-from rigkit.workflows.paper import load_paper_tables
+from rigkit.workflows.validation.paper import load_paper_tables
 
 PAPER = load_paper_tables(Path(__file__).parents[2] / "datasets" / "hajder2021")
 METHODS = ("F2UDIR", "F3UDIR", "DET3UDIR", "2SDIR", "3SDIR")

@@ -27,8 +27,8 @@ from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND
 from rigkit.validation.sentinel.watch import watched_camera
-from rigkit.workflows.check import fixed_text
-from rigkit.workflows.history import add_to_history
+from rigkit.workflows.checks.check import fixed_text
+from rigkit.workflows.checks.history import add_to_history
 
 DEPARTURE_PX, LONGER = 0.1, 1.01
 POWER_DRAWS, POWER_NOISE_PX = 30, 0.04

@@ -26,7 +26,7 @@ from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, straightened
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
 from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
-from rigkit.workflows.next_pictures import TASK_CELLS, length_goals
+from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
 

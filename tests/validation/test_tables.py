@@ -28,7 +28,7 @@ from rigkit.report.tables import (
 )
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.tables import PaperTables, best_method, best_report, build_tables, check_table, plane_table
-from rigkit.workflows.paper import load_paper_tables
+from rigkit.workflows.validation.paper import load_paper_tables
 
 REPO = Path(__file__).parents[2]
 PAPER = REPO / "datasets" / "hajder2021"

@@ -11,7 +11,7 @@ from helpers.stereo_pictures import RIGHT_FROM_LEFT
 
 from rigkit.cli.main import main
 from rigkit.io.calibrations.rig_file import load_rig
-from rigkit.workflows.check import load_watched
+from rigkit.workflows.checks.check import load_watched
 
 COVERED = {"01": {"left": 240, "right": 138}, "02": {"left": 311, "right": 184}, "05": {"left": 294, "right": 259}}
 """Frames in which something stands before the board, for the left camera from this column on, for the right one up to

@@ -13,9 +13,9 @@ from helpers.data import REPOSITORY
 from rigkit.cli.main import main
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.calibration_file import load_calibration
-from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session
 from rigkit.workflows.inputs.corners import Cache
-from rigkit.workflows.results import write_results
+from rigkit.workflows.outputs.results import write_results
 
 LAB = REPOSITORY / "datasets" / "lab-a"
 IMAGES = LAB / "calibration" / "fisheye"

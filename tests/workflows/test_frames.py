@@ -21,8 +21,8 @@ from rigkit.io.media.images import read_image
 from rigkit.synthetic.photometry import Photometry, develop
 from rigkit.synthetic.render import Optics, radiance
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.workflows.calibrate import CalibrateOptions
-from rigkit.workflows.calibrate_any import FolderOptions, calibrate_folders
+from rigkit.workflows.calibration.calibrate import CalibrateOptions
+from rigkit.workflows.calibration.calibrate_any import FolderOptions, calibrate_folders
 from rigkit.workflows.detect import detect_in_images
 from rigkit.workflows.inputs.folder_session import boards_seen
 from rigkit.workflows.inputs.frame_choice import DIRECTIONS, FrameChoice, KeptFrame

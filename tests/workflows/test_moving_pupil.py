@@ -26,12 +26,12 @@ from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
-from rigkit.workflows.certify import certify_file
-from rigkit.workflows.check import fixed_text, load_watched
-from rigkit.workflows.diff import CameraPair, diff
-from rigkit.workflows.export_camera import ExportCameraOptions, export_camera
+from rigkit.workflows.checks.certify import certify_file
+from rigkit.workflows.checks.check import fixed_text, load_watched
+from rigkit.workflows.checks.diff import CameraPair, diff
 from rigkit.workflows.handeye import _from_afar
 from rigkit.workflows.inputs.camera_files import import_camera, import_near_camera
+from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera
 
 NEAR = Board("near", 9, 6, 12.0, 12.0)
 TRUE = NearCamera.of(lens("fish"), (2.0, 0.3))

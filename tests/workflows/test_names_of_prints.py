@@ -10,7 +10,7 @@ from rigkit.cli.board_identify import without_scale
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.circles import Circles
-from rigkit.workflows.print_board import PrintOptions, print_board
+from rigkit.workflows.capture.print_board import PrintOptions, print_board
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from rigkit.planning.goal import GOAL_GRID
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.sentinel.evidence import Watched
-from rigkit.workflows.next_pictures import next_frames
+from rigkit.workflows.calibration.next_pictures import next_frames
 
 NAMES = ("reg", "wide")
 AWAY_MM = 500.0

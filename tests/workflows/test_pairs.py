@@ -21,8 +21,8 @@ from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import Panel
 from rigkit.validation.checks import ValidationReport
-from rigkit.workflows.pairs import find_boards
-from rigkit.workflows.validation_files import PairValidation
+from rigkit.workflows.reconstruction.pairs import find_boards
+from rigkit.workflows.validation.validation_files import PairValidation
 
 CAMERA = KannalaBrandt((800, 600), np.array([400.0, 400.0, 405.0, 295.0, -0.02, 0.002, 0.0, 0.0]))
 BOARDS = tuple(Board(name, 11, 8, 30.0, 30.0) for name in ("plane1", "plane2", "plane3"))

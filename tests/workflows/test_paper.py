@@ -12,8 +12,8 @@ import pytest
 
 from rigkit.cli.main import main
 from rigkit.core.errors import ExitCode
-from rigkit.workflows.paper import PaperOptions, validate_as_paper
-from rigkit.workflows.validate import ValidateOptions, validate_dataset
+from rigkit.workflows.validation.paper import PaperOptions, validate_as_paper
+from rigkit.workflows.validation.validate import ValidateOptions, validate_dataset
 
 LAB = Path(__file__).parents[2] / "datasets" / "lab-a"
 PAIRS = ("regular-standard", "regular-forward")

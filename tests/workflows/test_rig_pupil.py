@@ -27,10 +27,10 @@ from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_rig
-from rigkit.workflows.certify import certify_file
-from rigkit.workflows.check import load_watched
+from rigkit.workflows.calibration.next_pictures import next_frames
+from rigkit.workflows.checks.certify import certify_file
+from rigkit.workflows.checks.check import load_watched
 from rigkit.workflows.inputs.camera_files import import_pair
-from rigkit.workflows.next_pictures import next_frames
 
 BOARD = Board("near", 9, 6, 12.0, 12.0)
 NOISE_PX = 0.03

@@ -37,7 +37,7 @@ CALIBRATION_SCHEMA = "rigkit.calibration/1"
 CAMERA_KEYS = keys_of(CALIBRATION_FILE, "camera")
 CALIBRATION_KEYS = keys_of(CALIBRATION_FILE)
 Made = Mapping[str, Any]
-"""By what, when and from what a file was made: see `rigkit.workflows.provenance.made`."""
+"""By what, when and from what a file was made: see `rigkit.workflows.outputs.provenance.made`."""
 LATER_KEYS = {"overdispersion", "freedom", "made", "rivals", "pupil"}
 """Former files do not have them, and cameras that look from one point have no pupil."""
 TERMS_OF_PUPIL = ("mm_per_rad2", "mm_per_rad4")

@@ -18,8 +18,13 @@ from rigkit.io.manifests.rig_session import RigSession, is_rig_session, load_rig
 from rigkit.io.manifests.session import SESSION_NAME, Session, load_session
 from rigkit.io.media.images import IMAGE_ENDINGS
 from rigkit.io.media.video import VIDEO_ENDINGS, is_video
-from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration, calibrate_session, session_inputs
-from rigkit.workflows.calibrate_rig import RigSessionCalibration, calibrate_rig_session
+from rigkit.workflows.calibration.calibrate import (
+    CalibrateOptions,
+    SessionCalibration,
+    calibrate_session,
+    session_inputs,
+)
+from rigkit.workflows.calibration.calibrate_rig import RigSessionCalibration, calibrate_rig_session
 from rigkit.workflows.inputs.folder_session import boards_seen, session_of_folders
 from rigkit.workflows.inputs.frames import (
     frames_folder,

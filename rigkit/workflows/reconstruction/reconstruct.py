@@ -13,8 +13,15 @@ from rigkit.io.manifests.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report.figures import pair_pictures
-from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
+from rigkit.workflows.reconstruction.datasets import (
+    DatasetOptions,
+    PairFailure,
+    PairJob,
+    over_pairs,
+    ready_dataset,
+    write_for,
+)
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_whole_sigmas
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

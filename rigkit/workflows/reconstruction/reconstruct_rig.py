@@ -27,9 +27,9 @@ from rigkit.reconstruction.scene_pose import KnownPose
 from rigkit.report.cloud_page import build_cloud_page
 from rigkit.report.figures import as_png, cloud_figure
 from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad, warn_of_pupils
-from rigkit.workflows.provenance import software_facts
-from rigkit.workflows.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
-from rigkit.workflows.results import require_folder, write_results
+from rigkit.workflows.outputs.provenance import software_facts
+from rigkit.workflows.outputs.results import require_folder, write_results
+from rigkit.workflows.reconstruction.reconstruct_scene import CLOUD, SCENE_PAGE, CloudOptions
 
 PARTNERS = 3
 """Views nearest to each that it is paired with."""

@@ -45,12 +45,12 @@ from rigkit.validation.sentinel.evidence import FreshView, Watched
 from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
 from rigkit.validation.sentinel.watch import watched_camera, with_pupils
+from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import camera_format, camera_text, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.next_pictures import length_goals
-from rigkit.workflows.provenance import digest_line, digest_of, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, digest_of, software_facts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,7 @@ from rigkit.reconstruction.pairing import MatchedPair, match_pair
 from rigkit.reconstruction.reconstruct import Reconstruction, fit_planes, on_planes, reconstruct_from
 from rigkit.relative_pose.refinement.level_frames import LevelFrames
 from rigkit.validation.diagnose import diagnose_squares
-from rigkit.workflows.datasets import LoadedCamera
+from rigkit.workflows.reconstruction.datasets import LoadedCamera
 
 Detections: TypeAlias = tuple[BoardDetection, ...]
 Image: TypeAlias = NDArray[Any]

@@ -32,7 +32,7 @@ from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
-from rigkit.workflows.provenance import digest_line, digest_of, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, digest_of, software_facts
 
 RECALIBRATION_GRID = (40, 30)
 CLOCKS_APART = timedelta(days=1)

@@ -20,10 +20,10 @@ from rigkit.io.disk.writing import ensure_writable, npz_bytes
 from rigkit.io.manifests.manifest import Dataset, load_dataset
 from rigkit.io.ply import ply_bytes, ply_unit, read_ply
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.workflows.datasets import load_cameras
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.pairs import match_images, reconstruct_with, with_whole_sigmas
-from rigkit.workflows.results import write_results
+from rigkit.workflows.outputs.results import write_results
+from rigkit.workflows.reconstruction.datasets import load_cameras
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_with, with_whole_sigmas
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session, files_of_session, load_session
-from rigkit.workflows.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.calibration.session_page import session_page
 from rigkit.workflows.inputs.corners import (
     Cache,
     SessionCorners,
@@ -32,8 +32,8 @@ from rigkit.workflows.inputs.folder_session import Known
 from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.interlaced import interlaced
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.provenance import made
-from rigkit.workflows.session_page import session_page
+from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths
+from rigkit.workflows.outputs.provenance import made
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

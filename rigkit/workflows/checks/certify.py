@@ -18,10 +18,10 @@ from rigkit.report.certificate_page import certificate_facts, certificate_page, 
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
-from rigkit.workflows.check import load_watched
+from rigkit.workflows.checks.check import load_watched
 from rigkit.workflows.inputs.camera_files import called_bad
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

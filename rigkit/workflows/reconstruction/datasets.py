@@ -28,10 +28,10 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.calibrations.calibration_file import calibration_text, load_calibration_or_camera
 from rigkit.io.disk.reading import about
 from rigkit.io.manifests.manifest import CameraEntry, Dataset, Pair, load_dataset
-from rigkit.workflows.calibrate_rig import calibrate_camera
+from rigkit.workflows.calibration.calibrate_rig import calibrate_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.results import CALIBRATIONS, require_folder, write_results
+from rigkit.workflows.outputs.results import CALIBRATIONS, require_folder, write_results
 
 Result = TypeVar("Result")
 

@@ -27,9 +27,16 @@ from rigkit.validation.tables import (
     estimator_table,
     plane_table,
 )
-from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import match_images
-from rigkit.workflows.provenance import software_facts
+from rigkit.workflows.outputs.provenance import software_facts
+from rigkit.workflows.reconstruction.datasets import (
+    DatasetOptions,
+    PairFailure,
+    PairJob,
+    over_pairs,
+    ready_dataset,
+    write_for,
+)
+from rigkit.workflows.reconstruction.pairs import match_images
 
 PAPER = "hajder2021"
 """Folder with the paper's tables, beside the data set."""

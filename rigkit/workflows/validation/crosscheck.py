@@ -13,8 +13,15 @@ from rigkit.io.manifests.manifest import Dataset
 from rigkit.report.tables import table_files
 from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
-from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
+from rigkit.workflows.reconstruction.datasets import (
+    DatasetOptions,
+    PairFailure,
+    PairJob,
+    over_pairs,
+    ready_dataset,
+    write_for,
+)
+from rigkit.workflows.reconstruction.pairs import match_images, reconstruct_other_chain, reconstruct_with, shifts_of
 
 FILES = ("crosscheck.md", "crosscheck.json")
 

@@ -16,8 +16,8 @@ from rigkit.report.validation_verdict import verdict_of
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport
 from rigkit.validation.tables import PaperTables, build_tables
-from rigkit.workflows.datasets import DatasetOptions, LoadedCameras, PairFailure
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, software_facts
+from rigkit.workflows.reconstruction.datasets import DatasetOptions, LoadedCameras, PairFailure
 
 PAGE = "report.html"
 RESERVED = (*(f"tables.{ending}" for ending in TABLE_WRITERS), PAGE)

@@ -36,13 +36,13 @@ from rigkit.io.media.video import Video
 from rigkit.planning.goal import Goal
 from rigkit.planning.guess import check_field
 from rigkit.validation.certificate.contracts import Task
-from rigkit.workflows.calibrate import CalibrateOptions, SessionCalibration
-from rigkit.workflows.calibrate_any import calibrate_session_file
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, SessionCalibration
+from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
+from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_to_come
 from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_beside
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.next_pictures import length_goals
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 LAN_WARNING = (

@@ -44,8 +44,8 @@ from rigkit.workflows.inputs.camera_files import (
     saved_rig,
 )
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.provenance import software_facts
-from rigkit.workflows.results import require_folder, write_results
+from rigkit.workflows.outputs.provenance import software_facts
+from rigkit.workflows.outputs.results import require_folder, write_results
 
 CLOUD = "scene.ply"
 SCENE_PAGE = "scene.html"

@@ -33,8 +33,15 @@ from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras
 from rigkit.validation.fitted_planes import FittedPlanes
 from rigkit.validation.tables import best_report
-from rigkit.workflows.datasets import DatasetOptions, PairFailure, PairJob, over_pairs, ready_dataset, write_for
-from rigkit.workflows.pairs import (
+from rigkit.workflows.reconstruction.datasets import (
+    DatasetOptions,
+    PairFailure,
+    PairJob,
+    over_pairs,
+    ready_dataset,
+    write_for,
+)
+from rigkit.workflows.reconstruction.pairs import (
     find_boards,
     geometry_of,
     match_found,
@@ -43,8 +50,8 @@ from rigkit.workflows.pairs import (
     shifts_of,
     squares_that_fit,
 )
-from rigkit.workflows.paper import printed_tables
-from rigkit.workflows.validation_files import RESERVED, PairValidation, validation_files
+from rigkit.workflows.validation.paper import printed_tables
+from rigkit.workflows.validation.validation_files import RESERVED, PairValidation, validation_files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,8 @@ from rigkit.core.tables import Table, cells, columns
 from rigkit.io.disk.writing import write_atomic
 from rigkit.report.figures import difference_png
 from rigkit.report.page_facts import PageFacts, build_facts_page
-from rigkit.workflows.diff import BoardsPair, CameraPair, RigPair
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.checks.diff import BoardsPair, CameraPair, RigPair
+from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 NO_VERDICT = "no verdict: only rigkit's calibrations state how unsure they are, and one of these is another tool's"
 Pair = CameraPair | RigPair | BoardsPair

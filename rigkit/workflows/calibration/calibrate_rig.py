@@ -24,15 +24,15 @@ from rigkit.io.manifests.rig_session import RigSession, frames_of_images, is_rig
 from rigkit.io.manifests.session import Session, load_session
 from rigkit.validation.check import Check, compare_angle, compare_baseline, compare_distance
 from rigkit.validation.checks import COVERAGE
-from rigkit.workflows.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
-from rigkit.workflows.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibration_from, corners_of, session_inputs
+from rigkit.workflows.calibration.rigid_boards import named_as_listed, named_by_rule, require_distinct
+from rigkit.workflows.calibration.session_page import rig_page
 from rigkit.workflows.inputs.camera_files import own_file
 from rigkit.workflows.inputs.corners import SessionCorners, session_corners, session_views
 from rigkit.workflows.inputs.identify_board import misread
 from rigkit.workflows.inputs.known_cameras import known_cameras, with_known, with_known_first
-from rigkit.workflows.provenance import made
-from rigkit.workflows.rigid_boards import named_as_listed, named_by_rule, require_distinct
-from rigkit.workflows.session_page import rig_page
+from rigkit.workflows.outputs.export_camera import foreign_files, foreign_paths, foreign_rig_files, foreign_rig_paths
+from rigkit.workflows.outputs.provenance import made
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)

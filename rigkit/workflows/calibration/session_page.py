@@ -14,9 +14,9 @@ from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
 from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
+from rigkit.workflows.calibration.next_pictures import next_views
 from rigkit.workflows.inputs.corners import SessionCorners, named_images
-from rigkit.workflows.next_pictures import next_views
-from rigkit.workflows.provenance import digest_line, digest_of_images, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, digest_of_images, software_facts
 
 
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:

@@ -29,13 +29,13 @@ from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.telling import views_that_tell
 from rigkit.validation.sentinel.watch import watched_camera
-from rigkit.workflows.calibrate import CalibrateOptions, calibrate_session, session_inputs
-from rigkit.workflows.check import load_watched
+from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session, session_inputs
+from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
+from rigkit.workflows.checks.check import load_watched
 from rigkit.workflows.inputs.camera_files import warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
-from rigkit.workflows.provenance import digest_line, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
 USUAL_SIGMA_PX = 0.15
 USUAL_RHO = 0.05

@@ -1,0 +1,1 @@
+"""What several verbs write: folders of results, provenance, cameras for other tools."""

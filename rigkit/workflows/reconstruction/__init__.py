@@ -1,0 +1,1 @@
+"""Clouds and meshes: of a data set's pairs, of any scene, of a rig."""

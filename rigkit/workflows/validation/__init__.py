@@ -1,0 +1,1 @@
+"""Data sets against what a person measured, against other programs and against the paper."""
