@@ -14,6 +14,20 @@
 - what comes out: `assemble`, `result` (with `board_shape`, `pupil`)
 - again with a pupil that moves, where the images ask for it: `with_pupil`
 
+What a calibration is called on its way::
+
+    what was asked for                                  Request              choosing/models_tried
+    a model, of one size, that is to be fitted          ModelInQuestion      choosing/models_tried
+    solved by least squares                             Fit                  solving/fit
+    one of several, with its held-out errors            FittedModel          choosing/choice
+    the best size and board shape of one model          ModelOutcome         choosing/one_model
+    a camera with all of these, before it is decided    BegunCalibration     choosing/begun
+    the model that it gets, of all or with its twins    ModelChoice          choosing/lens_choice
+    another that images support as well, with poses     RivalFit             choosing/between_models
+    the result                                          Calibration          result
+    what the result says of each FittedModel            Candidate            result
+    what it says of each RivalFit                       Rival                result
+
 `compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.
 
 `rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is.

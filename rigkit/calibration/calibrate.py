@@ -12,18 +12,12 @@ from dataclasses import replace
 
 from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.choosing.begun import Begun, about_camera, begin
+from rigkit.calibration.choosing.begun import BegunCalibration, about_camera, begin
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes, with_rivals
-from rigkit.calibration.choosing.choice import SURELY, HeldOut, Option, choose, described
-from rigkit.calibration.choosing.lens_choice import (
-    Choice,
-    Lenses,
-    best_sizes,
-    choose_lenses,
-    twins,
-)
+from rigkit.calibration.choosing.choice import SURELY, FittedModel, HeldOut, choose, described, models_of
+from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, twins
 from rigkit.calibration.choosing.models_tried import Request
-from rigkit.calibration.choosing.one_model import Solved, on_same_images
+from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
 from rigkit.calibration.judging.moved import moved_lens
 from rigkit.calibration.judging.pupil import may_move
 from rigkit.calibration.judging.verdicts import judge
@@ -90,7 +84,7 @@ def calibrate(
 def calibrate_together(
     cameras: Sequence[tuple[str, Sequence[BoardView], Request]],
     *,
-    known: Sequence[Begun] = (),
+    known: Sequence[BegunCalibration] = (),
     progress: Progress = silent,
 ) -> list[Calibration]:
     """Return the calibration of each of the cameras of a rig, (name, views, what is asked for) each: alone, but the
@@ -102,18 +96,18 @@ def calibrate_together(
         done = (one.asked(name, views, request) for one in known)
         begun.append(next((one for one in done if one is not None), None) or begin(name, views, request))
     out: dict[int, Calibration] = {}
-    for group in twins([one.tried.alone.fit.state.camera for one in begun]):
+    for group in twins([choose(one.tried, SURELY).fit.state.camera for one in begun]):
         out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
     progress("cameras", len(cameras), len(cameras))
     return [out[k] for k in range(len(begun))]
 
 
-def _finish(group: Sequence[Begun]) -> list[Calibration]:
+def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
     """Return the calibrations of cameras that are alike, or of one."""
     tried = [one.tried for one in group]
     choices = choose_lenses(tried)
     found = [one.solved(choice.model) for one, choice in zip(group, choices, strict=True)]
-    several = any(len(lenses.models) > 1 for lenses in tried)
+    several = any(len(models_of(options)) > 1 for options in tried)
     if several and any(one.chosen.fit.state.shape.kind != "flat" for one in found):
         # Boards that are not flat bend the lenses to themselves: as they were found, another one may be the better.
         names = best_sizes(tried)
@@ -129,16 +123,16 @@ def _finish(group: Sequence[Begun]) -> list[Calibration]:
     elif several:
         rivals = tried
     else:
-        rivals = [Lenses(one.observations, one.sizes) for one in found]
-        choices = [Choice(c.model, HeldOut.of([r.options]).likely()) for c, r in zip(choices, rivals, strict=True)]
+        rivals = [one.sizes for one in found]
+        choices = [ModelChoice(c.model, HeldOut.of([r]).likely()) for c, r in zip(choices, rivals, strict=True)]
     out = []
-    for begun, one, lenses, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
+    for begun, one, options, choice, compared in zip(group, found, tried, choices, rivals, strict=True):
         with about_camera(begun.name, begun.observations.views):
-            out.append(_result(begun, one, lenses, compared.options, choice.likely))
+            out.append(_result(begun, one, options, compared, choice.likely))
     return out
 
 
-def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
+def _better(found: Sequence[ModelOutcome], again: Sequence[ModelOutcome]) -> bool:
     """Say whether cameras that are alike are better off with the model that they were solved with again."""
     pairs = [on_same_images(now, then, ("found", "again")) for now, then in zip(found, again, strict=True)]
     if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
@@ -149,7 +143,11 @@ def _better(found: Sequence[Solved], again: Sequence[Solved]) -> bool:
 
 
 def _result(
-    begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
+    begun: BegunCalibration,
+    found: ModelOutcome,
+    tried: Sequence[FittedModel],
+    rivals: Sequence[FittedModel],
+    likely: Mapping[str, float],
 ) -> Calibration:
     """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
     central, request = _judged(begun, found, tried, rivals, likely), begun.request
@@ -157,7 +155,7 @@ def _result(
         return central
     moving = solved_with_pupil(found, begun.observations, request)
     if moving is not None:
-        if len(tried.models) == 1:
+        if len(models_of(tried)) == 1:
             rivals, likely = moving.sizes, HeldOut.of([moving.sizes]).likely()
         better, candidates = against_central(found, moving, request)
         moving = replace(moving, candidates=[*candidates, *moving.candidates])
@@ -177,11 +175,15 @@ def _result(
 
 
 def _judged(
-    begun: Begun, found: Solved, tried: Lenses, rivals: Sequence[Option], likely: Mapping[str, float]
+    begun: BegunCalibration,
+    found: ModelOutcome,
+    tried: Sequence[FittedModel],
+    rivals: Sequence[FittedModel],
+    likely: Mapping[str, float],
 ) -> Calibration:
     """Return the result of a camera as it was solved for, with its verdicts."""
     request, fit = begun.request, found.chosen.fit
-    others = _others(tried, far_camera(fit.state.camera).model) if len(tried.models) > 1 else []
+    others = _others(tried, far_camera(fit.state.camera).model) if len(models_of(tried)) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
     if not begun.name:
         # What shape boards have is a question to all cameras of a rig together, which holds lenses by what each knows.
@@ -204,13 +206,13 @@ def _judged(
     return replace(result, verdicts=verdicts)
 
 
-def _others(tried: Lenses, model: str) -> list[Candidate]:
+def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
     """Return the lenses tried but those of the `model` chosen, against the best of those."""
-    own = [option for option in tried.options if option.fit.state.camera.model == model]
+    own = [option for option in tried if option.model == model]
     if not own:
         return []
     against = choose(own, SURELY)
-    return described([*(o for o in tried.options if o not in own), against], against)[:-1]
+    return described([*(o for o in tried if o not in own), against], against)[:-1]
 
 
 def _determined(result: Calibration) -> FarProjection:

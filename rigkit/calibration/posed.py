@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike
 
 from rigkit.calibration.assemble import board_shapes, outliers_of, view_results
 from rigkit.calibration.calibrate import FOLDS
-from rigkit.calibration.choosing.choice import Option
+from rigkit.calibration.choosing.choice import FittedModel
 from rigkit.calibration.choosing.heldout import heldout_squares
+from rigkit.calibration.choosing.models_tried import enough_agree
 from rigkit.calibration.choosing.one_model import with_board_shape
 from rigkit.calibration.judging.verdicts import judge
 from rigkit.calibration.result import Calibration, Candidate
@@ -28,8 +29,6 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
-MIN_KEPT_SHARE = 0.5
-"""A view in which fewer of the corners fit the known lens is dropped."""
 MAX_LENS_MISFIT_PX = 1.0
 """A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
 
@@ -87,7 +86,7 @@ def _on_flat_boards(
     used, dropped = usable_views(views, camera.size_px)
     observations = Observations.from_views(used)
     state, kept = posed(observations, camera)
-    fits = kept.sum(axis=1) >= np.maximum(MIN_KEPT_SHARE * observations.present.sum(axis=1), 4)
+    fits = enough_agree(kept.sum(axis=1), observations.present.sum(axis=1))
     if not fits.any():
         raise DegenerateError("no view fits the known lens; is it that of another camera, image size or focus?")
     dropped += tuple(
@@ -111,7 +110,7 @@ def _shaped(
     """Return the fit with boards of the shape asked for, its held-out error, and what was tried; the lens stays."""
     lens = fit.state.camera
     held = fit_kept(observations, replace(fit.state, camera=HeldLens.of(lens)), fit.kept)
-    flat = Option("board flat", held, heldout_squares(observations, held, folds))
+    flat = FittedModel("board flat", held, heldout_squares(observations, held, folds))
     observations, chosen, _, candidates = with_board_shape(observations, flat, board, folds, silent)
     if chosen is flat:
         return observations, fit, fit.rms_px, tuple(candidates)

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import SURELY, Option, choose, described
+from rigkit.calibration.choosing.choice import SURELY, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import Request, compared, enough_agree, reweighted
-from rigkit.calibration.choosing.one_model import Solved, on_same_images, with_board_shape
+from rigkit.calibration.choosing.one_model import ModelOutcome, chosen_of_sizes, on_same_images
 from rigkit.calibration.judging.pupil import BY_CHANCE
 from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.solving.fit import fit_kept, fit_other_lens, identifiable, posed, robust_sigma
@@ -32,7 +32,7 @@ CENTRAL, MOVING = "one point of view", "moving pupil"
 """Names of the candidates."""
 
 
-def solved_with_pupil(found: Solved, everything: Observations, request: Request) -> Solved | None:
+def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Request) -> ModelOutcome | None:
     """Return what a camera comes to with a pupil that moves, its model's sizes and the boards' shape chosen again; None
     where the images do not tell it from the rest. Of `everything` that was seen, views that the central lens left out
     and that agree with this one are taken back."""
@@ -45,25 +45,11 @@ def solved_with_pupil(found: Solved, everything: Observations, request: Request)
             found = replace(found, observations=reweighted(found.observations, options))
     if not options:
         return None
-    observations = found.observations
-    options = compared(observations, options, request.folds, request.progress)
-    chosen = choose(options, SURELY)
-    candidates = described(options, chosen, rivals=request.model == "auto")
-    observations, chosen, shapes, tried = with_board_shape(
-        observations, chosen, request.board, request.folds, request.progress
-    )
-    return replace(
-        found,
-        observations=observations,
-        chosen=chosen,
-        candidates=[*candidates, *tried],
-        beyond=[],
-        sizes=options,
-        shapes=shapes,
-    )
+    sizes = compared(found.observations, options, request.folds, request.progress)
+    return chosen_of_sizes(found.observations, sizes, request, used=found.used, reasons=found.reasons)
 
 
-def _with_every_size(found: Solved, poses: State, kept: BoolArray) -> list[Option]:
+def _with_every_size(found: ModelOutcome, poses: State, kept: BoolArray) -> list[FittedModel]:
     """Return every size of the model with a pupil that moves, fitted to the corners `kept` of flat boards."""
     observations, options = found.observations, []
     for size in found.sizes:
@@ -74,13 +60,13 @@ def _with_every_size(found: Solved, poses: State, kept: BoolArray) -> list[Optio
         except (InputError, DegenerateError):
             continue
         if identifiable(fit):
-            options.append(Option(f"{size.name}, {MOVING}", fit))
+            options.append(FittedModel(f"{size.name}, {MOVING}", fit))
     return options
 
 
 def _taken_back(
-    found: Solved, everything: Observations, options: Sequence[Option]
-) -> tuple[Solved, State, BoolArray] | None:
+    found: ModelOutcome, everything: Observations, options: Sequence[FittedModel]
+) -> tuple[ModelOutcome, State, BoolArray] | None:
     """Return the views used, with those of `everything` that were left out and agree with the best of lenses whose
     pupil moves, the poses of all, and the corners kept; None where there is none."""
     observations, left = found.observations, [everything.views[k] for k in np.flatnonzero(~found.used)]
@@ -109,7 +95,7 @@ def _taken_back(
     return replace(found, observations=whole, used=used, reasons=reasons), poses, kept_of_all
 
 
-def against_central(central: Solved, moving: Solved, request: Request) -> tuple[bool, list[Candidate]]:
+def against_central(central: ModelOutcome, moving: ModelOutcome, request: Request) -> tuple[bool, list[Candidate]]:
     """Return whether images that took no part are shown better with the pupil, on the same corners, and both as
     candidates."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))

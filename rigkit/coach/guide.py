@@ -10,7 +10,7 @@ import numpy as np
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import uncertain_camera
-from rigkit.calibration.choosing.begun import Begun
+from rigkit.calibration.choosing.begun import BegunCalibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
@@ -164,7 +164,7 @@ class CaptureGuide:
         return not self._whole.is_new(self.views)
 
     @property
-    def begun(self) -> Begun | None:
+    def begun(self) -> BegunCalibration | None:
         """What the latest of these calibrations found, for a rig's."""
         return None if self._whole.latest is None else self._whole.latest.begun
 

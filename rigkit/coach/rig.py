@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import (
     CHECKING,
     ENOUGH_FRAMES,
@@ -26,7 +27,7 @@ from rigkit.coach.guide import (
     min_worth_of,
 )
 from rigkit.coach.look import Glance
-from rigkit.coach.rig_whole import RigKnown, WholeRig, whole_rig
+from rigkit.coach.rig_whole import RigKnown, whole_rig
 from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
 from rigkit.core.errors import DegenerateError
@@ -201,8 +202,8 @@ class RigGuide:
         if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], begun):
             self._known = None
 
-    def _known_by(self, whole: WholeRig) -> RigKnown:
-        self._known = self._known or RigKnown.of(whole.rig, self.options)
+    def _known_by(self, rig: RigCalibration) -> RigKnown:
+        self._known = self._known or RigKnown.of(rig, self.options)
         return self._known
 
     def _partner(self, c: int) -> int:

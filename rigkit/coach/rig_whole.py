@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.choosing.begun import Begun
+from rigkit.calibration.choosing.begun import BegunCalibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
@@ -34,23 +34,12 @@ Views = Sequence[BoardView | None]
 """What the cameras saw at one moment, one a camera."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class WholeRig:
-    """A rig's calibration."""
-
-    rig: RigCalibration
-
-    @property
-    def heldout_px(self) -> float | None:
-        return self.rig.heldout_rms_px
-
-
 def whole_rig(
     frames: Sequence[Views],
     names: Sequence[str],
     sizes_px: Sequence[tuple[int, int]],
-    begun: Sequence[Begun] = (),
-) -> WholeRig | None:
+    begun: Sequence[BegunCalibration] = (),
+) -> RigCalibration | None:
     """Return what `calibrate` makes of frames of the cameras `names`; None where they do not determine the rig. `begun`
     are the cameras as `whole_calibration` found them: most of the time goes by there."""
     views: dict[str, list[tuple[str, BoardView]]] = {name: [] for name in names}
@@ -60,7 +49,7 @@ def whole_rig(
                 views[name].append((f"{k:04d}", replace(view, image=f"{len(views[name]):04d}")))
     sizes = dict(zip(names, sizes_px, strict=True))
     try:
-        return WholeRig(calibrate_rig(views, sizes, model="auto", board="auto", begun=begun))
+        return calibrate_rig(views, sizes, model="auto", board="auto", begun=begun)
     except (InputError, DegenerateError):
         return None
 

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
 from rigkit.calibration.certainty.displaced import uncertain_camera
-from rigkit.calibration.choosing.begun import Begun, begin
+from rigkit.calibration.choosing.begun import BegunCalibration, begin
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.result import Calibration
 from rigkit.cameras.uncertain import UncertainCamera
@@ -34,28 +34,28 @@ class WithHeldOut(Protocol):
     """What was calibrated with frames held out."""
 
     @property
-    def heldout_px(self) -> float | None: ...
+    def heldout_rms_px(self) -> float | None: ...
 
 
 Found = TypeVar("Found", bound=WithHeldOut)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Whole:
+class WholeCalibration:
     """A calibration, what is known by it, for what is to be taken next, how sure it says that the lens is, and what its
     rig need not find again."""
 
     calibration: Calibration
     knowledge: Knowledge
     stated: UncertainCamera
-    begun: Begun | None = None
+    begun: BegunCalibration | None = None
 
     @property
-    def heldout_px(self) -> float | None:
+    def heldout_rms_px(self) -> float | None:
         return self.calibration.heldout_rms_px
 
 
-def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> Whole | None:
+def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> WholeCalibration | None:
     """Return what `calibrate` makes of frames, each of which is an image; None where they do not determine the lens."""
     named = [replace(view, image=f"{k:04d}") for k, view in enumerate(views)]
     request = Request(
@@ -64,7 +64,7 @@ def whole_calibration(views: Sequence[BoardView], size_px: tuple[int, int]) -> W
     try:
         begun = begin("", named, request)
         (found,) = calibrate_together([("", named, request)], known=[begun])
-        return Whole(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
+        return WholeCalibration(found, Knowledge.beyond_model(found), uncertain_camera(found), begun)
     except (InputError, DegenerateError):
         return None
 
@@ -77,7 +77,7 @@ class WholeCalibrations(Generic[Found]):
         self.latest: Found | None = None
         self.count = 0
         self._executor, self._calibrated = executor, calibrated
-        self._heldout_px: dict[int, float | None] = {}
+        self._heldout_rms_px: dict[int, float | None] = {}
         self._asked: tuple[int, Future[Found | None]] | None = None
 
     def go_on(self, frames: Sequence[Any], *given: object) -> bool:
@@ -92,7 +92,7 @@ class WholeCalibrations(Generic[Found]):
 
     def is_new(self, frames: Sequence[Any]) -> bool:
         """Say whether so many frames have not been calibrated."""
-        return len(frames) not in self._heldout_px
+        return len(frames) not in self._heldout_rms_px
 
     def ask(self, frames: Sequence[Any], *given: object) -> None:
         """Have frames calibrated, if that is not known, and nothing else is under way."""
@@ -116,7 +116,7 @@ class WholeCalibrations(Generic[Found]):
             # Without its process the page stands still for a moment, but the capture goes on.
             self._executor = Here()
             return False
-        self._heldout_px[count] = None if found is None else found.heldout_px
+        self._heldout_rms_px[count] = None if found is None else found.heldout_rms_px
         if found is None or count < self.count:
             return False
         self.latest, self.count = found, count
@@ -124,8 +124,8 @@ class WholeCalibrations(Generic[Found]):
 
     def steady(self, count: int) -> bool | None:
         """Say whether the held-out error of so many frames is that of fewer; None: nobody knows yet."""
-        before = max((n for n in self._heldout_px if n < count), default=None)
-        if before is None or count not in self._heldout_px:
+        before = max((n for n in self._heldout_rms_px if n < count), default=None)
+        if before is None or count not in self._heldout_rms_px:
             return None
-        now, then = self._heldout_px[count], self._heldout_px[before]
+        now, then = self._heldout_rms_px[count], self._heldout_rms_px[before]
         return self.count == count and now is not None and then is not None and abs(now - then) <= STEADY * then

@@ -13,10 +13,10 @@ from rigkit.calibration.calibrate import calibrate, calibrate_together
 from rigkit.calibration.certainty import uncertainty
 from rigkit.calibration.certainty.uncertainty import Along, FarProjection, followed, projection_design, worst_direction
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes
-from rigkit.calibration.choosing.choice import HeldOut, Option, choose, described, settled
-from rigkit.calibration.choosing.lens_choice import Lenses, choose_lenses, twins
+from rigkit.calibration.choosing.choice import FittedModel, HeldOut, choose, described, settled
+from rigkit.calibration.choosing.lens_choice import choose_lenses, twins
 from rigkit.calibration.choosing.models_tried import Request
-from rigkit.calibration.choosing.one_model import Solved
+from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.result import Rival
 from rigkit.calibration.solving.fit import Fit, fit_model
 from rigkit.calibration.solving.solver import Convergence
@@ -39,14 +39,10 @@ def fits() -> dict[str, tuple[Observations, Fit]]:
     return {name: (observations, fit_model(observations, SIZE, camera_model(name), None)) for name in ("ucm", "eucm")}
 
 
-def lenses(fits: dict[str, tuple[Observations, Fit]], eucm_better_by: np.ndarray) -> Lenses:
+def lenses(fits: dict[str, tuple[Observations, Fit]], eucm_better_by: np.ndarray) -> list[FittedModel]:
     """Return two models, of which eucm errs by so much less in each image."""
     base = 1.0 + 0.1 * np.sin(np.arange(IMAGES))
-    options = [
-        Option("ucm", fits["ucm"][1], base),
-        Option("eucm", fits["eucm"][1], base - eucm_better_by),
-    ]
-    return Lenses(fits["ucm"][0], options)
+    return [FittedModel("ucm", fits["ucm"][1], base), FittedModel("eucm", fits["eucm"][1], base - eucm_better_by)]
 
 
 def scatter(mean: float, size: float) -> np.ndarray:
@@ -105,7 +101,7 @@ def test_a_lens_whose_solver_was_stopped_is_none_where_another_one_is_found(
     fits: dict[str, tuple[Observations, Fit]],
 ) -> None:
     """Of a lens without distortion on bent boards a double sphere was taken, and called bad as it did not converge."""
-    one, other = lenses(fits, np.zeros(IMAGES)).options
+    one, other = lenses(fits, np.zeros(IMAGES))
     stopped = Convergence(iterations=60, converged=False, reason="stopped after 60 iterations")
     creeping = replace(other, fit=replace(other.fit, convergence=stopped))
     assert settled([creeping, one]) == [one]
@@ -205,15 +201,15 @@ def test_cameras_of_a_rig_come_in_their_order() -> None:
 def test_the_chosen_lens_in_another_size_is_no_rival(fits: dict[str, tuple[Observations, Fit]]) -> None:
     observations, eucm = fits["eucm"]
     small, large = (fit_model(observations, SIZE, camera_model("scaramuzza"), order) for order in (4, 6))
-    options = [Option("scaramuzza 6", large), Option("eucm", eucm)]
+    options = [FittedModel("scaramuzza 6", large), FittedModel("eucm", eucm)]
     likely = {"scaramuzza 6": 0.7, "eucm": 0.3}
     assert [one.rival.name for one in rival_fits(observations, small, options, likely)] == ["eucm"]
-    both = [*options, Option("scaramuzza 4", small)]
+    both = [*options, FittedModel("scaramuzza 4", small)]
     assert [one.rival.name for one in rival_fits(observations, small, both, likely)] == ["scaramuzza 6", "eucm"]
 
 
 def test_a_shape_of_the_board_that_predicts_about_as_well_is_a_rival(fits: dict[str, tuple[Observations, Fit]]) -> None:
-    flat, bent = lenses(fits, scatter(0.0, 0.1)).options
+    flat, bent = lenses(fits, scatter(0.0, 0.1))
     shapes = [replace(flat, name="scaramuzza 5"), replace(bent, name="board warp")]
     for chosen, other in (shapes, shapes[::-1]):
         (rival,) = rival_shapes(chosen, shapes)
@@ -256,12 +252,12 @@ def test_solutions_that_left_out_other_images_are_compared_on_those_of_both(
 ) -> None:
     observations, fit = fits["ucm"]
 
-    def found(images: np.ndarray, squares: np.ndarray) -> Solved:
-        return Solved(
+    def found(images: np.ndarray, squares: np.ndarray) -> ModelOutcome:
+        return ModelOutcome(
             observations=observations.subset(images),
             used=np.isin(np.arange(len(observations.views)), images),
             reasons=(),
-            chosen=Option("ucm", fit, squares[images]),
+            chosen=FittedModel("ucm", fit, squares[images]),
             candidates=[],
             beyond=[],
             sizes=[],

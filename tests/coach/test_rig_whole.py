@@ -21,8 +21,8 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import CHECKING, GuideOptions
 from rigkit.coach.look import Glance
 from rigkit.coach.rig import MAX_HELP, RigGuide
-from rigkit.coach.rig_whole import RigKnown, WholeRig, left_of_rig, whole_rig
-from rigkit.coach.whole import STEADY, Whole
+from rigkit.coach.rig_whole import RigKnown, left_of_rig, whole_rig
+from rigkit.coach.whole import STEADY, WholeCalibration
 from rigkit.core.errors import DegenerateError
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.planning.goal import projection_goal
@@ -65,7 +65,7 @@ class Later(Executor):
     """Has the lenses' calibrations at hand, sure of all; the rig's come when that is told."""
 
     rig: RigCalibration
-    asked: list[tuple[int, Future[WholeRig | None]]] = field(default_factory=list)
+    asked: list[tuple[int, Future[RigCalibration | None]]] = field(default_factory=list)
     begun: list[Any] = field(default_factory=list)
     lenses: list[Callable[[], None]] = field(default_factory=list)
     """Calibrations of lenses that are not done: those of so many as are `slow`."""
@@ -79,7 +79,7 @@ class Later(Executor):
         else:
             own = self.rig.single[NAMES.index(OTHER if args[0][0].image.startswith(OTHER) else NAMES[0])]
             known = f"begun {len(args[0])}"
-            found = Whole(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
+            found = WholeCalibration(own, Knowledge.beyond_model(own), uncertain_camera(own), known)  # type: ignore[arg-type]
             self.lenses.append(partial(future.set_result, found))
             if len(self.lenses) > self.slow:
                 self.lenses.pop()()
@@ -87,7 +87,7 @@ class Later(Executor):
 
     def tell(self, found: RigCalibration) -> int:
         count, future = self.asked[-1]
-        future.set_result(WholeRig(found))
+        future.set_result(found)
         return count
 
 
@@ -225,11 +225,11 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
     )
     views = [[glance.view for glance in seen] for seen in frames]
     found = whole_rig([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])
-    assert found is not None and found.rig.shared_count == FRAMES - 1
-    assert found.rig.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
+    assert found is not None and found.shared_count == FRAMES - 1
+    assert found.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
     never_both = [[left, None] if k % 2 else [None, right] for k, (left, right) in enumerate(views)]
     assert whole_rig(never_both, NAMES, [SIZE, SIZE]) is None
-    known = RigKnown.of(found.rig, GuideOptions(boards=(BOARD,), reach=REACH))
+    known = RigKnown.of(found, GuideOptions(boards=(BOARD,), reach=REACH))
     assert known.plan.views[-1].error < known.plan.error
 
 

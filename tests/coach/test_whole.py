@@ -20,7 +20,7 @@ from rigkit.coach.coach import Coach
 from rigkit.coach.guide import CHECKING, WORTH_GOING_ON, CaptureGuide, GuideOptions
 from rigkit.coach.keeper import Keeper
 from rigkit.coach.look import Glance
-from rigkit.coach.whole import STEADY, Whole, WholeCalibrations, whole_calibration
+from rigkit.coach.whole import STEADY, WholeCalibration, WholeCalibrations, whole_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.io.manifests.session import Session
@@ -40,7 +40,7 @@ def views() -> list[BoardView]:
 
 
 @pytest.fixture(scope="module")
-def whole(views: list[BoardView]) -> Whole:
+def whole(views: list[BoardView]) -> WholeCalibration:
     found = whole_calibration(views, SIZE)
     assert found is not None
     return found
@@ -56,7 +56,7 @@ class Later(Executor):
         self.asked.append((len(args[0]), Future()))
         return self.asked[-1][1]
 
-    def tell(self, found: Whole | None) -> int:
+    def tell(self, found: WholeCalibration | None) -> int:
         """Answer what was asked last; return of how many frames it was."""
         count, future = self.asked[-1]
         future.set_result(found)
@@ -70,7 +70,9 @@ def guide_of(views: Sequence[BoardView], executor: Executor, goal_px: float) -> 
     return guide
 
 
-def test_it_waits_for_all_of_calibrate_and_says_what_that_states(views: list[BoardView], whole: Whole) -> None:
+def test_it_waits_for_all_of_calibrate_and_says_what_that_states(
+    views: list[BoardView], whole: WholeCalibration
+) -> None:
     later = Later()
     guide = guide_of(views, later, goal_px=10.0)
     seen = Glance(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
@@ -89,7 +91,7 @@ def test_it_waits_for_all_of_calibrate_and_says_what_that_states(views: list[Boa
     assert after.waits and not after.enough and after.left[0].error < now.left[0].error
 
 
-def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardView], whole: Whole) -> None:
+def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardView], whole: WholeCalibration) -> None:
     stated = float(projection_goal(whole.stated.camera).error(whole.stated.covariance))
     # As with a rival that nobody has told apart yet.
     unsure = replace(whole, stated=UncertainCamera(whole.stated.camera, 9.0 * whole.stated.covariance))
@@ -105,7 +107,7 @@ def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardVi
     assert not now.enough or f"not {2.0 * stated:g} px" in now.words
 
 
-def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: Whole) -> None:
+def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: WholeCalibration) -> None:
     usual = whole.calibration.heldout_rms_px
     assert usual is not None
     worse = replace(whole.calibration, heldout_rms_px=(1.0 + 2.0 * STEADY) * usual)
@@ -119,8 +121,8 @@ def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView],
     assert not now.enough and not now.waits and now.words.startswith("One more, to see that it is steady: ")
 
 
-def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: Whole) -> None:
-    def calibrated(*_: object) -> Whole:
+def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: WholeCalibration) -> None:
+    def calibrated(*_: object) -> WholeCalibration:
         return whole
 
     class Ended(Executor):
@@ -138,7 +140,7 @@ def test_without_its_process_the_capture_goes_on(views: list[BoardView], whole: 
 
 
 def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
-    views: list[BoardView], whole: Whole, tmp_path: Path
+    views: list[BoardView], whole: WholeCalibration, tmp_path: Path
 ) -> None:
     """Photos come one by one: no look follows the last."""
     later = Later()
@@ -156,7 +158,7 @@ def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
 
 @pytest.mark.parametrize(("px", "mm"), [(2.0, 2.0), (0.5, 2.0), (2.0, 0.5)])
 def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted(
-    views: list[BoardView], whole: Whole, px: float, mm: float
+    views: list[BoardView], whole: WholeCalibration, px: float, mm: float
 ) -> None:
     def measured(cameras: Sequence[Camera], _: Sequence[Rigid3]) -> Sequence[Goal]:
         return [replace(projection_goal(cameras[0]), unit="mm")]
@@ -178,7 +180,7 @@ def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted
 
 
 def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
-    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: WholeCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session = Session(
         path=tmp_path / "session.toml", images=(), boards=(BOARD,), model="auto", degree=None, board_shape="auto"

@@ -12,10 +12,10 @@ from typing import Self
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import Option
-from rigkit.calibration.choosing.lens_choice import Lenses, lenses_on_boards, lenses_on_flat_boards
+from rigkit.calibration.choosing.choice import FittedModel, models_of
+from rigkit.calibration.choosing.lens_choice import lenses_on_boards, lenses_on_flat_boards
 from rigkit.calibration.choosing.models_tried import ModelInQuestion, Request, fit_all, wanted_models
-from rigkit.calibration.choosing.one_model import Solved, only, solved
+from rigkit.calibration.choosing.one_model import ModelOutcome, only, solved
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
@@ -45,7 +45,7 @@ def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Begun:
+class BegunCalibration:
     """A camera (`name` in messages, "" for one alone) with all models in question fitted to its `views`; `tried` are
     compared on flat boards where there are several. What each model comes to is found once."""
 
@@ -55,13 +55,13 @@ class Begun:
     dropped: tuple[tuple[str, str], ...]
     observations: Observations
     wanted: list[ModelInQuestion]
-    options: list[Option]
+    options: list[FittedModel]
     failed: list[Candidate]
-    tried: Lenses
-    _solved: dict[str, Solved] = field(default_factory=dict)
-    _on_boards: dict[str, dict[str, Option]] = field(default_factory=dict)
+    tried: list[FittedModel]
+    _solved: dict[str, ModelOutcome] = field(default_factory=dict)
+    _on_boards: dict[str, dict[str, FittedModel]] = field(default_factory=dict)
 
-    def solved(self, model: str) -> Solved:
+    def solved(self, model: str) -> ModelOutcome:
         """Return what a camera model comes to."""
         if model not in self._solved:
             with about_camera(self.name, self.observations.views):
@@ -69,7 +69,7 @@ class Begun:
                 self._solved[model] = solved(self.observations, own, wanted, self.failed, self.request)
         return self._solved[model]
 
-    def on_boards(self, model: str, names: Sequence[str]) -> Lenses:
+    def on_boards(self, model: str, names: Sequence[str]) -> list[FittedModel]:
         """Return the lenses tried, those of the `names`, on boards as a camera model found them."""
         done = self._on_boards.setdefault(model, {})
         return lenses_on_boards(self.solved(model), self.tried, names, self.request, done)
@@ -90,16 +90,16 @@ def _same(a: BoardView, b: BoardView) -> bool:
     return named and all(np.array_equal(x, y) for x, y in arrays)
 
 
-def begin(name: str, views: Sequence[BoardView], request: Request) -> Begun:
+def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalibration:
     """Return a camera with all models fitted that `request` asks for; errors as of `calibrate`, with its name."""
     with about_camera(name, views):
         wanted = wanted_models(request)
         used, dropped = usable_views(views, request.size_px)
         observations = Observations.from_views(used)
         options, failed = fit_all(observations, request.size_px, wanted, request.progress)
-        several = len({option.fit.state.camera.model for option in options}) > 1
-        tried = lenses_on_flat_boards(observations, options, request) if several else Lenses(observations, options)
-    return Begun(
+        several = len(models_of(options)) > 1
+        tried = lenses_on_flat_boards(observations, options, request) if several else options
+    return BegunCalibration(
         name=name,
         request=request,
         views=views,

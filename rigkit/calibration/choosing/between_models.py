@@ -24,7 +24,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.covariance import motion_of_world
 from rigkit.calibration.certainty.uncertainty import followed
-from rigkit.calibration.choosing.choice import HeldOut, Option
+from rigkit.calibration.choosing.choice import FittedModel, HeldOut
 from rigkit.calibration.result import Candidate, Rival
 from rigkit.calibration.solving.fit import Fit, fit_other_lens
 from rigkit.calibration.solving.poses import steps_between
@@ -50,7 +50,7 @@ class RivalFit:
 
 
 def rival_fits(
-    observations: Observations, chosen: Fit, options: Sequence[Option], likely: Mapping[str, float]
+    observations: Observations, chosen: Fit, options: Sequence[FittedModel], likely: Mapping[str, float]
 ) -> list[RivalFit]:
     """Return the `options` that are likely enough the better ones, fitted to the corners kept, with the boards as the
     chosen fit has them but for their warps."""
@@ -80,7 +80,7 @@ def same_model(one: Camera, other: Camera) -> bool:
     return one.model == other.model and one.parameters.size == other.parameters.size
 
 
-def rival_shapes(chosen: Option, shapes: Sequence[Option]) -> list[RivalFit]:
+def rival_shapes(chosen: FittedModel, shapes: Sequence[FittedModel]) -> list[RivalFit]:
     """Return the same lens as boards of the other `shapes` show it, of those that are likely enough the better ones."""
     likely = HeldOut.of([shapes]).likely()
     return [

@@ -27,13 +27,18 @@ CLEARLY = 2.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Option:
-    """A model, or a board shape, in the running: its name and how it fits."""
+class FittedModel:
+    """A camera model with boards of one shape, in the running: its name and how it fits."""
 
     name: str
     fit: Fit
     heldout: FloatArray | None = None
     """Squared held-out residuals of each image, px^2."""
+
+    @property
+    def model(self) -> str:
+        """The camera model, of whatever size."""
+        return self.fit.state.camera.model
 
     @property
     def heldout_px(self) -> float | None:
@@ -44,13 +49,18 @@ class Option:
         return int(self.fit.state.camera.parameters.size + self.fit.state.shape.count)
 
 
-def settled(options: Sequence[Option]) -> Sequence[Option]:
+def models_of(options: Sequence[FittedModel]) -> list[str]:
+    """Return the camera models among the options."""
+    return list(dict.fromkeys(option.model for option in options))
+
+
+def settled(options: Sequence[FittedModel]) -> Sequence[FittedModel]:
     """Return the options whose solver converged, where any did. The others creep along a ridge: a model with more
     numbers than the lens has (a double sphere for a lens without distortion) shows the images with many of them."""
     return [option for option in options if option.fit.convergence.converged] or options
 
 
-def choose(options: Sequence[Option], surely: float | None = None) -> Option:
+def choose(options: Sequence[FittedModel], surely: float | None = None) -> FittedModel:
     """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
     (if given) `surely` standard errors of the difference; with too few images for that, the one with the smallest BIC.
     One whose solver was stopped is taken only where all were; two images leave too much open to say that of it.
@@ -96,7 +106,7 @@ class HeldOut:
     alike: float = 0.0
 
     @classmethod
-    def of(cls, cameras: Sequence[Sequence[Option]]) -> HeldOut:
+    def of(cls, cameras: Sequence[Sequence[FittedModel]]) -> HeldOut:
         """Put the evidence of cameras with their options together."""
         known = [{o.name: o for o in settled(options) if o.heldout is not None} for options in cameras]
         names = [name for name in known[0] if all(name in own for own in known)]
@@ -142,14 +152,14 @@ class HeldOut:
         return dict(zip(self.names, share.tolist(), strict=True))
 
 
-def _bic(option: Option) -> float:
+def _bic(option: FittedModel) -> float:
     """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
     n = 2 * int(option.fit.kept.sum())
     error = option.fit.rms_px
     return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
 
 
-def described(options: list[Option], chosen: Option, *, rivals: bool = False) -> list[Candidate]:
+def described(options: list[FittedModel], chosen: FittedModel, *, rivals: bool = False) -> list[Candidate]:
     """Return what was tried, and why it was chosen or not; `rivals`: others than these were tried as well."""
     out = []
     for o in options:

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import SURELY, HeldOut, Option, choose, settled
+from rigkit.calibration.choosing.choice import SURELY, FittedModel, HeldOut, choose, models_of, settled
 from rigkit.calibration.choosing.heldout import heldout_squares
 from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, fit_of_views, reweighted
-from rigkit.calibration.choosing.one_model import Solved
+from rigkit.calibration.choosing.one_model import ModelOutcome
 from rigkit.calibration.solving.fit import fit_other_lens
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
@@ -26,45 +26,29 @@ SAME_FOCAL = 0.05
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Lenses:
-    """Camera models compared on the same corners of one camera."""
-
-    observations: Observations
-    options: list[Option]
-
-    @property
-    def models(self) -> list[str]:
-        """The camera models among them."""
-        return list(dict.fromkeys(option.fit.state.camera.model for option in self.options))
-
-    @property
-    def alone(self) -> Option:
-        """The option that this camera alone would choose."""
-        return choose(self.options, SURELY)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Choice:
+class ModelChoice:
     """The camera model chosen, and how likely each option is the best one, by name."""
 
     model: str
     likely: dict[str, float]
 
 
-def lenses_on_flat_boards(observations: Observations, options: list[Option], request: Request) -> Lenses:
+def lenses_on_flat_boards(
+    observations: Observations, options: list[FittedModel], request: Request
+) -> list[FittedModel]:
     """Return the options as they compare on the same corners of the views that agree with them."""
     keep, _ = agreeing(observations, options)
     seen = observations.subset(np.flatnonzero(keep))
     same = options if keep.all() else [replace(o, fit=fit_of_views(seen, o.fit, keep)) for o in options]
     seen = reweighted(seen, same)
-    return Lenses(seen, compared(seen, same, request.folds, request.progress))
+    return compared(seen, same, request.folds, request.progress)
 
 
-def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
+def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:
     """Return the name of the best size of each model, as flat boards tell well enough, of cameras that are alike."""
     sizes = []
-    for model in dict.fromkeys(model for lenses in cameras for model in lenses.models):
-        own = [[o for o in lenses.options if o.fit.state.camera.model == model] for lenses in cameras]
+    for model in models_of([option for options in cameras for option in options]):
+        own = [[option for option in options if option.model == model] for options in cameras]
         evidence = HeldOut.of(own)
         if evidence.names:
             sizes.append(evidence.chosen())
@@ -74,46 +58,50 @@ def best_sizes(cameras: Sequence[Lenses]) -> list[str]:
 
 
 def lenses_on_boards(
-    found: Solved, tried: Lenses, names: Sequence[str], request: Request, done: dict[str, Option] | None = None
-) -> Lenses:
+    found: ModelOutcome,
+    tried: Sequence[FittedModel],
+    names: Sequence[str],
+    request: Request,
+    done: dict[str, FittedModel] | None = None,
+) -> list[FittedModel]:
     """Return the lenses tried, those of the `names`, fitted to boards with their corners as they were found and warps
     that are free again. `done` are those that were fitted before, by name; what is fitted now comes to them."""
     observations, kept = found.observations, found.chosen.fit.kept
     state = found.chosen.fit.state.with_corners_held()
     done = {} if done is None else done
-    for option in tried.options:
+    for option in tried:
         if option.name in names and option.name not in done:
             start = replace(state, camera=option.fit.state.camera)
             fit = fit_other_lens(observations, start, kept)
             done[option.name] = replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None)
     # What does not even show the images that it was fitted to as well as another one predicts them is no better.
-    order = sorted((o.name for o in tried.options if o.name in names), key=lambda name: done[name].fit.rms_px)
-    judged: list[Option] = []
+    order = sorted((o.name for o in tried if o.name in names), key=lambda name: done[name].fit.rms_px)
+    judged: list[FittedModel] = []
     for name in order:
         if all(done[name].fit.rms_px <= (o.heldout_px or np.inf) for o in judged):
             if done[name].heldout is None:
                 done[name] = replace(done[name], heldout=heldout_squares(observations, done[name].fit, request.folds))
             judged.append(done[name])
-    return Lenses(observations, list(settled(judged)))
+    return list(settled(judged))
 
 
-def choose_lenses(cameras: Sequence[Lenses]) -> list[Choice]:
+def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:
     """Return the model of each of some cameras that are alike: what their images say is put together, and who clearly
     contradicts the others has a lens of its own."""
-    own = [lenses.alone for lenses in cameras]
-    each = [HeldOut.of([lenses.options]) for lenses in cameras]
-    out = [Choice(option.fit.state.camera.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
+    own = [choose(options, SURELY) for options in cameras]
+    each = [HeldOut.of([options]) for options in cameras]
+    out = [ModelChoice(option.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
     together = [k for k, evidence in enumerate(each) if evidence.names]
     while len(together) > 1:
-        evidence = HeldOut.of([cameras[k].options for k in together])
+        evidence = HeldOut.of([cameras[k] for k in together])
         if not evidence.names:
             break
         name = evidence.chosen()
         agree = [k for k in together if not each[k].contradicts(name, own[k].name)]
         if agree == together:
-            model = next(o for o in cameras[together[0]].options if o.name == name).fit.state.camera.model
+            model = next(o for o in cameras[together[0]] if o.name == name).model
             for k in together:
-                out[k] = Choice(model, evidence.likely())
+                out[k] = ModelChoice(model, evidence.likely())
             break
         together = agree
     return out

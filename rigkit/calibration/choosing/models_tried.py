@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import Option
+from rigkit.calibration.choosing.choice import FittedModel
 from rigkit.calibration.choosing.heldout import heldout_squares
 from rigkit.calibration.result import Candidate
 from rigkit.calibration.solving.fit import Fit, fit_kept, fit_model, identifiable, not_identifiable, robust_sigma
@@ -70,7 +70,7 @@ def wanted_models(request: Request) -> list[ModelInQuestion]:
     return out
 
 
-def larger_sizes(chosen: Option) -> list[ModelInQuestion]:
+def larger_sizes(chosen: FittedModel) -> list[ModelInQuestion]:
     """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
     camera = chosen.fit.state.camera
     tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
@@ -84,8 +84,8 @@ def fit_all(
     size_px: tuple[int, int],
     wanted: Sequence[ModelInQuestion],
     progress: Progress,
-    known: Sequence[Option] = (),
-) -> tuple[list[Option], list[Candidate]]:
+    known: Sequence[FittedModel] = (),
+) -> tuple[list[FittedModel], list[Candidate]]:
     """Return the options `known` and those `wanted`, fitted, and which could not be; raises where there is none."""
     options = list(known)
     failed: list[Candidate] = []
@@ -96,7 +96,7 @@ def fit_all(
             fit = fit_model(observations, size_px, cls, order)
             if not identifiable(fit):
                 raise not_identifiable(name)
-            options.append(Option(name, fit))
+            options.append(FittedModel(name, fit))
         except (DegenerateError, InputError) as caught:
             error = caught
             failed.append(Candidate(name, 0, float("nan"), None, False, str(caught)))
@@ -113,7 +113,7 @@ def fit_of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
     return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
 
 
-def agreeing(observations: Observations, options: list[Option]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
+def agreeing(observations: Observations, options: list[FittedModel]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
     """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
     best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
@@ -134,14 +134,14 @@ def enough_agree(kept: IntArray, total: IntArray) -> BoolArray:
     return np.asarray(kept >= np.maximum(MIN_KEPT_SHARE * total, 4))
 
 
-def _best(observations: Observations, options: list[Option]) -> Option:
+def _best(observations: Observations, options: list[FittedModel]) -> FittedModel:
     """Return the option with the least scatter."""
     if len(options) == 1:
         return options[0]
     return min(options, key=lambda o: robust_sigma(o.fit, observations))
 
 
-def reweighted(observations: Observations, options: list[Option]) -> Observations:
+def reweighted(observations: Observations, options: list[FittedModel]) -> Observations:
     """Return the observations with weights that count the error which the best model leaves to all corners alike."""
     if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
         return observations
@@ -150,7 +150,9 @@ def reweighted(observations: Observations, options: list[Option]) -> Observation
     return observations.with_common_error(squared, best.fit.kept)
 
 
-def compared(observations: Observations, options: list[Option], folds: int, progress: Progress) -> list[Option]:
+def compared(
+    observations: Observations, options: list[FittedModel], folds: int, progress: Progress
+) -> list[FittedModel]:
     """Return the options refitted to the same corners, with their held-out errors, where they are not yet."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choosing.board_orientation import turned_views, with_views_turned
-from rigkit.calibration.choosing.choice import SURELY, Option, choose, described
+from rigkit.calibration.choosing.choice import SURELY, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import (
     ModelInQuestion,
     Request,
@@ -29,7 +29,7 @@ from rigkit.core.progress import Progress
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Solved:
+class ModelOutcome:
     """What one camera model came to: the observations used, which of all views (V,) these are and why others were left
     out, the size and board shape chosen, what was tried, which larger sizes were, the sizes compared on flat boards,
     and the board shapes compared."""
@@ -37,57 +37,73 @@ class Solved:
     observations: Observations
     used: BoolArray
     reasons: tuple[tuple[str, str], ...]
-    chosen: Option
+    chosen: FittedModel
     candidates: list[Candidate]
-    beyond: list[ModelInQuestion]
-    sizes: list[Option]
-    shapes: list[Option]
+    beyond: Sequence[ModelInQuestion]
+    sizes: list[FittedModel]
+    shapes: list[FittedModel]
 
 
 def only(
-    options: list[Option], wanted: Sequence[ModelInQuestion], model: str
-) -> tuple[list[Option], list[ModelInQuestion]]:
+    options: list[FittedModel], wanted: Sequence[ModelInQuestion], model: str
+) -> tuple[list[FittedModel], list[ModelInQuestion]]:
     """Return the options and what was wanted of one camera model."""
-    own = [option for option in options if option.fit.state.camera.model == model]
+    own = [option for option in options if option.model == model]
     return own, [one for one in wanted if one.camera.model == model]
 
 
 def solved(
     observations: Observations,
-    options: list[Option],
+    options: list[FittedModel],
     wanted: Sequence[ModelInQuestion],
     failed: list[Candidate],
     request: Request,
-) -> Solved:
+) -> ModelOutcome:
     """Return what one camera model comes to; what else was tried changes nothing."""
-    size_px, board, folds, progress = request.size_px, request.board, request.folds, request.progress
+    size_px, folds, progress = request.size_px, request.folds, request.progress
     keep, reasons = agreeing(observations, options)
     if reasons:
         observations = observations.subset(np.flatnonzero(keep))
         options, failed = fit_all(observations, size_px, wanted, progress)
     observations = reweighted(observations, options)
     options = compared(observations, options, folds, progress)
-    chosen = choose(options, SURELY)
-    beyond = [] if request.degree is not None else larger_sizes(chosen)
+    beyond = [] if request.degree is not None else larger_sizes(choose(options, SURELY))
     if beyond:
         options, unfit = fit_all(observations, size_px, beyond, progress, options)
         options = compared(observations, options, folds, progress)
-        chosen, failed = choose(options, SURELY), [*failed, *unfit]
-    candidates = [*described(options, chosen, rivals=request.model == "auto"), *failed]
-    observations, chosen, shapes, tried = with_board_shape(observations, chosen, board, folds, progress)
-    return Solved(
+        failed = [*failed, *unfit]
+    return chosen_of_sizes(observations, options, request, used=keep, reasons=reasons, failed=failed, beyond=beyond)
+
+
+def chosen_of_sizes(
+    observations: Observations,
+    sizes: list[FittedModel],
+    request: Request,
+    *,
+    used: BoolArray,
+    reasons: tuple[tuple[str, str], ...],
+    failed: Sequence[Candidate] = (),
+    beyond: Sequence[ModelInQuestion] = (),
+) -> ModelOutcome:
+    """Return a camera model with the best of its `sizes`, compared on flat boards, and then the best shape of those."""
+    chosen = choose(sizes, SURELY)
+    candidates = [*described(sizes, chosen, rivals=request.model == "auto"), *failed]
+    observations, chosen, shapes, tried = with_board_shape(
+        observations, chosen, request.board, request.folds, request.progress
+    )
+    return ModelOutcome(
         observations=observations,
-        used=keep,
+        used=used,
         reasons=reasons,
         chosen=chosen,
         candidates=[*candidates, *tried],
         beyond=beyond,
-        sizes=options,
+        sizes=sizes,
         shapes=shapes,
     )
 
 
-def on_same_images(found: Solved, again: Solved, names: tuple[str, str]) -> list[Option]:
+def on_same_images(found: ModelOutcome, again: ModelOutcome, names: tuple[str, str]) -> list[FittedModel]:
     """Return what two solutions of a camera chose, judged on the images that both have: each leaves out those that
     disagree with its own model. They are called `names`."""
     images = [list(dict.fromkeys(one.observations.images)) for one in (found, again)]
@@ -99,8 +115,8 @@ def on_same_images(found: Solved, again: Solved, names: tuple[str, str]) -> list
 
 
 def with_board_shape(
-    observations: Observations, flat: Option, board: str, folds: int, progress: Progress
-) -> tuple[Observations, Option, list[Option], list[Candidate]]:
+    observations: Observations, flat: FittedModel, board: str, folds: int, progress: Progress
+) -> tuple[Observations, FittedModel, list[FittedModel], list[Candidate]]:
     """Return the fit with boards of the shape asked for, `board`, from that with `flat` ones, the shapes compared, and
     what was tried: with "auto" the shape that predicts other images best. The views are those with boards that look the
     same turned numbered from one end."""
@@ -114,7 +130,9 @@ def with_board_shape(
     return observations, flat if chosen.name == flat.name else chosen, shapes, candidates
 
 
-def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[Observations, Option, dict[str, Fit]]:
+def _fit_shapes(
+    observations: Observations, flat: FittedModel, board: str
+) -> tuple[Observations, FittedModel, dict[str, Fit]]:
     """Return the shapes fitted, and views and flat boards with every board that looks the same turned numbered from the
     same end, where the shapes tell."""
     fits = fit_shapes(observations, flat.fit, board)
@@ -130,10 +148,10 @@ def _fit_shapes(observations: Observations, flat: Option, board: str) -> tuple[O
 
 
 def _shapes(
-    observations: Observations, flat: Option, fits: dict[str, Fit], board: str, folds: int, progress: Progress
-) -> tuple[list[Option], list[Candidate]]:
+    observations: Observations, flat: FittedModel, fits: dict[str, Fit], board: str, folds: int, progress: Progress
+) -> tuple[list[FittedModel], list[Candidate]]:
     """Return the shapes in the running, compared on the same corners, and what was not tried."""
-    options = [Option(f"board {kind}", fit) for kind, fit in fits.items()]
+    options = [FittedModel(f"board {kind}", fit) for kind, fit in fits.items()]
     options = [flat, *options] if board == "auto" else options
     spared = []
     if board == "auto" and "released" not in fits:

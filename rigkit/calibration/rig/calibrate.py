@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from rigkit.calibration.calibrate import FOLDS, calibrate_together
-from rigkit.calibration.choosing.begun import Begun
+from rigkit.calibration.choosing.begun import BegunCalibration
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
@@ -47,7 +47,7 @@ def calibrate_rig(
     known: KnownCameras | None = None,
     folds: int = FOLDS,
     pupil: str = "auto",
-    begun: Sequence[Begun] = (),
+    begun: Sequence[BegunCalibration] = (),
     progress: Progress = silent,
 ) -> RigCalibration:
     """Return the calibration of a rig.
@@ -191,7 +191,7 @@ class _Options:
     folds: int
     known: KnownCameras | None
     pupil: str
-    begun: Sequence[Begun]
+    begun: Sequence[BegunCalibration]
 
     @property
     def in_force(self) -> list[str]:
