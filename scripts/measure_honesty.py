@@ -6,7 +6,7 @@ that none of the models is. Everything goes the way of a user's images: boards a
 pairs are reconstructed. Each angle, baseline and normal is then held against the exact truth in its stated sigmas: 68
 and 95 % of them should lie within one and two.
 
-    python scripts/measure_honesty.py [--labs 0:20] [--json FILE] [--model MODEL] [--views 14]
+    python scripts/measure_honesty.py [--labs 0:20] [--odd] [--json FILE] [--model MODEL] [--views 14]
     python scripts/measure_honesty.py --sessions 20 [--moving] [--images 3,4,5,7,10,20]
 
 One laboratory takes 20 to 40 s. With --json, laboratories that the file has are not made again: run it in pieces, the
@@ -22,21 +22,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from honesty.laboratories import Laboratory
 from honesty.moving import moving_sessions
 from honesty.sessions import IMAGES, sessions
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.views.usable import views_of_image
 from rigkit.cameras.base import Camera
-from rigkit.cameras.kannala_brandt import KannalaBrandt
 from rigkit.core.boards import Board
-from rigkit.core.detections import BoardView
-from rigkit.core.errors import DegenerateError, RigkitError
+from rigkit.core.errors import RigkitError
 from rigkit.core.posetype import PoseType
 from rigkit.detection.detect import detect_boards
-from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between
 from rigkit.reconstruction.board_planes import BoardPlanes
 from rigkit.reconstruction.calibration_shifts import calibration_shifts
@@ -46,64 +43,13 @@ from rigkit.reconstruction.lattice_planes import lattice_planes
 from rigkit.reconstruction.pairing import match_pair
 from rigkit.reconstruction.reconstruct import reconstruct_from
 from rigkit.synthetic.pairs import StereoScene, trihedral_pair
-from rigkit.synthetic.photometry import Photometry
-from rigkit.synthetic.render import Optics, render
-from rigkit.synthetic.scene import PlacedBoard, place_board, sees_paper
 from rigkit.validation.measure import Measured, measure
 
-SIZE_PX = (960, 720)
 PLANES = (Board("plane1", 8, 6, 50.0, 50.0), Board("plane2", 7, 6, 50.0, 50.0), Board("plane3", 6, 9, 50.0, 50.0))
-TARGET = Board("target", 9, 6, 30.0, 30.0)
 FACES = ((0, 1), (0, 2), (1, 2))
-LENSES = {"regular": (800.0, (55.0, 75.0)), "fisheye": (330.0, (170.0, 190.0))}
-"""Focal length about, px, and the range of the field of view, degrees."""
 TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 BASELINE_MM = {PoseType.PLANAR: 200.0, PoseType.STANDARD: 250.0, PoseType.FORWARD: 150.0}
 LEVEL_DEG = 0.1
-TARGET_TRIES = 2000
-
-
-def drawn_lens(kind: str, rng: np.random.Generator) -> Camera:
-    """Return a lens whose image radius is f (theta + k theta^3 + m theta^5 + ...), its centre off the middle."""
-    focal = LENSES[kind][0] * rng.uniform(0.95, 1.05)
-    centre = np.array(SIZE_PX) / 2.0 + rng.normal(0.0, 8.0, 2)
-    curvatures = (
-        rng.normal(0.0, [0.03, 0.006, 0.0, 0.0]) if kind == "fisheye" else [-0.2 + rng.normal(0.0, 0.05), 0.05, 0, 0]
-    )
-    return KannalaBrandt(SIZE_PX, np.array([focal, focal * (1.0 + rng.normal(0.0, 1e-3)), *centre, *curvatures]))
-
-
-def drawn_light(rng: np.random.Generator) -> Photometry:
-    return Photometry(
-        exposure=rng.uniform(0.8, 1.0),
-        vignetting=rng.uniform(0.0, 0.4),
-        gradient=tuple(rng.normal(0.0, 0.08, 2).tolist()),
-        noise_levels=2.0,
-    )
-
-
-def target_in_view(camera: Camera, index: int, rng: np.random.Generator) -> PlacedBoard:
-    """Return the board where the image has not had one: in turn in the middle and towards the rim, all round."""
-    width, height = SIZE_PX
-    for attempt in range(TARGET_TRIES):
-        radius = (0.1, 0.3, 0.42)[index % 3] * rng.uniform(0.8, 1.2)
-        angle = 2.4 * index + rng.normal(0.0, 0.4)
-        spot = np.array([width * (0.5 + radius * np.cos(angle)), height * (0.5 + radius * np.sin(angle))])
-        square = height * rng.uniform(0.05, 0.09) * (1.0 - 0.7 * attempt / TARGET_TRIES)
-        placed = place_board(TARGET, camera, spot, square, 50.0, rng)
-        if placed is not None and sees_paper(placed, camera, (0.0, 0.0), SIZE_PX):
-            return placed
-    raise DegenerateError("honesty: no view of the whole board was found")
-
-
-def calibrated(camera: Camera, optics: Optics, count: int, model: str, rng: np.random.Generator) -> Calibration:
-    """Return the camera as a user's images of a board give it."""
-    views: list[BoardView] = []
-    for k in range(count):
-        placed = target_in_view(camera, k, rng)
-        image = render([placed], camera, Rigid3.identity(), optics=optics, photometry=drawn_light(rng), rng=rng)
-        views += views_of_image(f"{k:02d}.png", detect_boards(image, [TARGET]), [TARGET])[0]
-    return calibrate(views, SIZE_PX, model=model)
 
 
 def scene_of(camera: Camera, kind: PoseType, rng: np.random.Generator) -> StereoScene:
@@ -119,11 +65,9 @@ def scene_of(camera: Camera, kind: PoseType, rng: np.random.Generator) -> Stereo
     )
 
 
-def geometry_seen(
-    scene: StereoScene, camera: Camera, optics: Optics, light: Photometry, rng: np.random.Generator
-) -> PairGeometry:
+def geometry_seen(scene: StereoScene, camera: Camera, lab: Laboratory, rng: np.random.Generator) -> PairGeometry:
     """Return the geometry of a pair from its images through the calibrated camera."""
-    first, second = scene.images(optics=optics, photometry=light, rng=rng)
+    first, second = scene.images(optics=lab.optics, photometry=lab.light(rng), rng=rng)
     found1, found2 = (detect_boards(image, PLANES, camera=camera) for image in (first, second))
     matched = match_pair("made", camera, camera, found1, found2, PLANES)
     level = None if scene.pose_type is PoseType.GENERAL else float(np.radians(LEVEL_DEG))
@@ -176,23 +120,22 @@ def in_sigmas(scene: StereoScene, geometry: PairGeometry, found: Calibration) ->
         yield from (("normals of the cloud (rms angle)", k) for k in each.tolist())
 
 
-def laboratory(seed: int, model: str, views: int) -> list[tuple[str, str, str, float]]:
+def laboratory(seed: int, model: str, views: int, odd: bool) -> list[tuple[str, str, str, float]]:
     """Return (lens, pose type, what, error in sigmas) of everything in one laboratory."""
     rng = np.random.default_rng([20261122, seed])
-    kind = list(LENSES)[seed % 2]
-    camera = drawn_lens(kind, rng)
-    optics = Optics(rng.uniform(0.5, 0.9), field_deg=rng.uniform(*LENSES[kind][1]) if kind == "fisheye" else None)
-    found = calibrated(camera, optics, views, model, rng)
+    lab = Laboratory.odd(rng) if odd else Laboratory.ordinary(seed, views, rng)
+    found = calibrate(lab.views(rng), lab.camera.size_px, model=model)
+    print(f"laboratory {seed}: {lab.kind}, {lab.camera.size_px}, {lab.optics.field_deg or 0.0:.0f} degrees, "
+          f"{len(found.views)} images, {found.camera.model}, {found.boards[0].kind}, freedom {found.freedom:.1f}, "
+          f"x{found.overdispersion:.2f}, rms {found.rms_px:.4f} px", flush=True)  # fmt: skip
     out = []
     for pose_type in TYPES:
         try:
-            scene = scene_of(camera, pose_type, rng)
-            geometry = geometry_seen(scene, found.camera, optics, drawn_light(rng), rng)
-            out += [(kind, str(pose_type), *one) for one in in_sigmas(scene, geometry, found)]
+            scene = scene_of(lab.camera, pose_type, rng)
+            geometry = geometry_seen(scene, found.camera, lab, rng)
+            out += [(lab.kind, str(pose_type), *one) for one in in_sigmas(scene, geometry, found)]
         except RigkitError as error:
-            print(f"laboratory {seed}, {kind}, {pose_type}: {error}", flush=True)
-    print(f"laboratory {seed}: {kind}, {found.camera.model}, {found.boards[0].kind}, freedom {found.freedom:.1f}, "
-          f"x{found.overdispersion:.2f}, rms {found.rms_px:.4f} px", flush=True)  # fmt: skip
+            print(f"laboratory {seed}, {lab.kind}, {pose_type}: {error}", flush=True)
     return out
 
 
@@ -225,6 +168,7 @@ def print_sessions(seeds: int, images: list[int], moving: bool) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--labs", default="0:20", help="first:beyond the last")
+    parser.add_argument("--odd", action="store_true", help="of 320 to 2400 px, 45 to 200 degrees, 6 to 24 images")
     parser.add_argument("--model", default="scaramuzza")
     parser.add_argument("--views", type=int, default=14, help="images of the board that a lens is calibrated from")
     parser.add_argument("--json", type=Path, help="results so far; new laboratories are added")
@@ -240,7 +184,7 @@ def main() -> None:
         if str(seed) in known:
             continue
         try:
-            known[str(seed)] = laboratory(seed, args.model, args.views)
+            known[str(seed)] = laboratory(seed, args.model, args.views, args.odd)
         except RigkitError as error:
             print(f"laboratory {seed}: {error}", flush=True)
             continue

@@ -49,7 +49,7 @@ def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
 
 
 def test_boards_that_face_a_fisheye_from_all_sides_are_tilted_enough(rng: np.random.Generator) -> None:
-    views, _, _ = random_views(lens("fish"), 20, rng, reach_deg=92.5, tilt_deg=(0.0, 5.0))
+    views, _, _ = random_views(lens("fish"), 40, rng, reach_deg=92.5, tilt_deg=(0.0, 5.0))
     assert calibrate(views, SIZE, model="kannala_brandt", board="flat").verdicts[0].severity is Severity.GOOD
 
 

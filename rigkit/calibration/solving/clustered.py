@@ -13,14 +13,18 @@ independent corners where corners are independent ("CR2").
 So few images know the size of the second moments, and hardly their shape in ten or twenty directions. They are shrunk
 towards a multiple of what independent corners would have, by as much as their own noise asks ("oracle approximating
 shrinkage"): with few images one number scales the covariance of independent corners, with many each direction has its
-own. What they say has as many degrees of freedom as there are images but one, or fewer where some images weigh more
-than others: quantiles are Student's. What counts these (bounds, chances) takes the covariance as it is; standard
-deviations that are quoted are widened (`widening`), so that two hold 95 % of errors after four images as after forty.
+own. What corners of an image have in common adds to their scatter, a component of variance that is not negative: where
+that number is below one, it is so by chance, and one is taken, as Birge's ratio for measurements that agree too well.
+
+What images say has as many degrees of freedom as there are images but one, or fewer where some images weigh more than
+others: quantiles are Student's. What counts these (bounds, chances) takes the covariance as it is; standard deviations
+that are quoted are widened (`widening`), so that two hold 95 % of errors after four images as after forty.
 
 References: R. M. Bell, D. F. McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
 samples", Survey Methodology 28, 2002. J. G. MacKinnon, M. D. Webb, "Cluster-robust inference: a guide to empirical
 practice", Journal of Econometrics 232, 2023. Y. Chen, A. Wiesel, Y. C. Eldar, A. O. Hero, "Shrinkage algorithms for
-MMSE covariance estimation", IEEE Trans. Signal Processing 58, 2010, eq. 23.
+MMSE covariance estimation", IEEE Trans. Signal Processing 58, 2010, eq. 23. R. T. Birge, "The calculation of errors by
+the method of least squares", Physical Review 40, 1932.
 """
 
 from __future__ import annotations
@@ -57,8 +61,8 @@ RANK = 1e-12
 @dataclass(frozen=True, eq=False, slots=True)
 class Clustered:
     """Covariance (n, n) of shared unknowns; `overdispersion`, by how much more (as a ratio of standard deviations) the
-    clusters disagree than independent corners would; `freedom`, the degrees of freedom of the covariance (infinite
-    where it rests on the scatter of corners, with too few clusters to know better)."""
+    clusters disagree than independent corners would, at least 1; `freedom`, the degrees of freedom of the covariance
+    (infinite where it rests on the scatter of corners, with too few clusters to know better)."""
 
     covariance: FloatArray
     overdispersion: float
@@ -145,6 +149,7 @@ def clustered_covariance(
     freedom = max((freedom + 1.0) / alike - 1.0, 1.0)
     found = _shrunk(moments, expected, freedom)
     factor = float(np.trace(found) / np.trace(expected))
+    found, factor = found + max(0.0, 1.0 - factor) * expected, max(1.0, factor)
     covariance = root @ (found + np.eye(len(found)) - expected) @ root.T
     covariance += factor * (unit - root @ root.T)
     covariance *= sigma_px**2
