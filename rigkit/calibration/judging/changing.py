@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.assemble import board_shapes, view_results
-from rigkit.calibration.judging.turned import turned_pictures
+from rigkit.calibration.judging.turned import flipped_pictures
 from rigkit.calibration.judging.two_kinds import two_kinds
 from rigkit.calibration.judging.view_evidence import NO_CHANGE, ViewChange, ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
@@ -105,10 +105,11 @@ def changing(
     changes = evidence.changes() if evidence is not None else {}
     if evidence is None or not changes:
         return []
-    if solved is not None and changes["shift"].ratio >= MIN_VARIANCE_RATIO:
-        turned = turned_pictures(calibration, evidence, *solved, clusters)
-        if turned is not None:
-            return [turned]
+    if solved is not None:
+        shifted = changes["shift"].ratio >= MIN_VARIANCE_RATIO
+        flipped = flipped_pictures(calibration, evidence, *solved, clusters, shifted=shifted)
+        if flipped is not None:
+            return [flipped]
     if not but and changes["lens"].ratio >= MIN_VARIANCE_RATIO and (kinds := two_kinds(calibration, evidence)):
         return [kinds]
     if solved is not None and changes["lens"].ratio >= MIN_VARIANCE_RATIO and changes["lens"].share >= MIN_SHARE_TRIED:

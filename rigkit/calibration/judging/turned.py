@@ -1,12 +1,15 @@
-"""Images of one camera of which some were turned by half a turn, as viewers do that follow a tag of the file.
+"""Images of one camera of which a program turned some by half a turn, or mirrored some.
 
-A turned picture is one of the same lens whose principal point lies on the other side of its middle. No number is free
-but which ones were turned: so nobody need see two clusters of principal points, which few images, or boards that are
-tilted the other way once they are turned, do not show surely.
+Viewers turn pictures that follow a tag of their file; conferencing programs mirror them. Such a picture is one of the
+same lens whose principal point lies on the other side of its middle, and a mirrored one shows a mirrored board. No
+number is free but which ones were flipped: so nobody need see two clusters of principal points, which few images, or
+boards that are tilted the other way once they are turned, do not show surely. Each image is asked: with lens and board
+as they are, is it shown better as it is, or put back? Then lens and board are solved for again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,113 +20,174 @@ from rigkit.calibration.judging.two_kinds import MIN_LEAD, split_in_two
 from rigkit.calibration.judging.view_evidence import ViewEvidence, columns_of, view_evidence
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import Fit
-from rigkit.calibration.solving.normal_equations import Residuals
+from rigkit.calibration.solving.poses import START_TOLERANCE, refine_poses
 from rigkit.calibration.solving.solver import solve
-from rigkit.calibration.solving.state import State
+from rigkit.calibration.solving.state import State, evaluate, weighted_squares
 from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.core.findings import Finding
 
 TOLERANCE = 1e-4
-"""Relative to the cost: turned back, the squares of the residuals fall by a factor, if that was the cause."""
+"""Relative to the cost: put back, the squares of the residuals fall by a factor, if that was the cause."""
 MAX_STILL_SHIFTED = 0.2
-"""What a shifted picture explains once pictures are turned back is less than this part of what turning them explains.
+"""What a shifted picture explains once pictures are put back is less than this part of what putting them back explains.
 Shifts anywhere between two ends, cut in two, leave a third, normal ones more than half; REAL sessions of which half
 was turned leave 0.003 to 0.1."""
-ROUNDS = 3
+ROUNDS = 4
 """Images change sides in so many rounds at most."""
+MIN_FIRST_GAIN = 0.1
+"""Views put back, lens and boards held, take so much off the squares, or they are not worth solving for. Of REAL and
+SIMULATED sessions of which every fourth picture was mirrored 0.4 to 0.6, of the same as they are 0 to 0.01."""
+WAYS = {
+    "turned by half a turn": np.array([-1.0, -1.0]),
+    "mirrored left to right": np.array([-1.0, 1.0]),
+    "mirrored top to bottom": np.array([1.0, -1.0]),
+}
+"""What is done to a picture, as signs of how far a pixel lies from its middle, (right, down)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Back:
-    """Observations whose pictures of the views `at` (V,) are turned back, what they are solved to, and the sum of the
-    squared residuals."""
+    """Observations whose pictures of the views `at` (V,) are put back in one of the `WAYS`, what they are solved to,
+    and the sum of the squared residuals."""
 
+    way: str
     at: BoolArray
     observations: Observations
     state: State
-    residuals: Residuals
     squares: float
 
 
-def turned_pictures(
+def flipped_pictures(
     calibration: Calibration,
     evidence: ViewEvidence,
     observations: Observations,
     fit: Fit,
     clusters: IntArray | None = None,
+    *,
+    shifted: bool = True,
 ) -> Finding | None:
-    """Return a finding where some of the pictures were turned by half a turn; None where that is no cause.
+    """Return a finding where some of the pictures were turned by half a turn or mirrored; None where that is no cause.
 
-    `clusters` are as for `view_evidence`, whose `evidence` is of the calibration as it is.
+    `clusters` are as for `view_evidence`, whose `evidence` is of the calibration as it is; `shifted` says whether it
+    is worth while to look for two principal points.
     """
-    shift = columns_of(evidence.own.shape[1])["shift"]
-    kinds = split_in_two(evidence, shift, evidence.common_covariance())
-    before = float((fit.weight(observations) ** 2 * (fit.residuals.px**2).sum(axis=-1)).sum())
-    if kinds is None or not before > 0.0:
+    before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
+    tried = [
+        _put_back_in_turn(way, at, turns, observations, fit)
+        for way in WAYS
+        for at, turns in _first_guesses(way, evidence if shifted else None, observations, fit)
+    ]
+    if not tried or not before > 0.0:
         return None
-    at = np.zeros(len(observations.views), dtype=bool)
-    at[np.array(evidence.views)[kinds.second]] = True
+    back = min(tried, key=lambda one: one.squares)
+    solved = replace(
+        calibration.with_near(back.state.camera),
+        views=view_results(back.observations, back.state, evaluate(back.state, back.observations), fit.kept),
+        boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
+    )
+    now = view_evidence(solved, clusters)
+    return None if now is None else _judged(back, before, now)
+
+
+def _first_guesses(
+    way: str, evidence: ViewEvidence | None, observations: Observations, fit: Fit
+) -> Iterator[tuple[BoolArray, IntArray]]:
+    """Yield which views (V,) may be flipped, and from which end their boards are numbered then: those that lens and
+    boards as they are show better put back (lens and boards are those of the many, where these are), and those of one
+    of two principal points."""
+    better, gain, turns = _better_put_back(way, observations, fit.state, fit)
+    if gain > MIN_FIRST_GAIN and not better.all():
+        yield better, turns
+    kinds = evidence and split_in_two(
+        evidence, columns_of(evidence.own.shape[1])["shift"], evidence.common_covariance()
+    )
+    if evidence and kinds:
+        at = np.zeros(len(turns), dtype=bool)
+        at[np.array(evidence.views)[kinds.second]] = True
+        yield at, turns
+
+
+def _put_back_in_turn(way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit) -> _Back:
+    """Return what is found from a first guess of which views are flipped: solved for, and asked again."""
+    begun, state = _put_back(way, at, turns, observations, fit.state)
+    state, _ = refine_poses(begun, state, fit.weight(observations), tolerance=START_TOLERANCE)
     for _ in range(ROUNDS):
-        back = _turned_back(observations, fit, at)
-        solved = replace(
-            calibration.with_near(back.state.camera),
-            views=view_results(back.observations, back.state, back.residuals, fit.kept),
-            boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
-        )
-        now = view_evidence(solved, clusters)
-        if now is None:
-            return None
-        evidence = now
-        # A picture on the wrong side has its principal point where the turned one has it.
-        off = np.array(calibration.camera.size_px) - 1.0 - 2.0 * back.state.camera.axis_px
-        wrong = evidence.along[:, shift] @ off > 0.5 * (evidence.own[:, shift, shift] @ off) @ off
-        if not wrong.any():
+        found = _solved(way, at, begun, state, fit)
+        wrong, _, turns = _better_put_back(way, found.observations, found.state, fit)
+        at = at ^ wrong
+        if not wrong.any() or at.all() or not at.any():
             break
-        at[np.array(evidence.views)[wrong]] ^= True
-    return _judged(back, before, evidence)
+        begun, state = _put_back(way, wrong, turns, found.observations, found.state)
+    return found
+
+
+def _solved(way: str, at: BoolArray, observations: Observations, state: State, fit: Fit) -> _Back:
+    weight = fit.weight(observations)
+    state = solve(observations, state, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=TOLERANCE).state
+    return _Back(way, at, observations, state, float(weighted_squares(state, observations, weight).sum()))
+
+
+def _better_put_back(way: str, observations: Observations, state: State, fit: Fit) -> tuple[BoolArray, float, IntArray]:
+    """Return which views (V,) lens and boards as they are show better put back, the part of all squares that this takes
+    away, and by how many quarter turns (V,) the boards are numbered otherwise then: a mirrored one is numbered from
+    either end; one that looks the same turned may be."""
+    every, weight = np.ones(len(observations.views), dtype=bool), fit.weight(observations)
+    now, costs = weighted_squares(state, observations, weight), []
+    for turns in (0, 2):
+        flipped, start = _put_back(way, every, np.full(len(every), turns), observations, state)
+        cost = refine_poses(flipped, start, weight, tolerance=START_TOLERANCE)[1]
+        told = turns == 2 and WAYS[way].prod() > 0.0
+        costs.append(np.where([told and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
+    best = np.min(costs, axis=0)
+    better = best < now
+    gain = float((now - best)[better].sum() / max(float(now.sum()), np.finfo(float).tiny))
+    return better, gain, 2 * np.argmin(costs, axis=0)
+
+
+def _put_back(
+    way: str, at: BoolArray, turns: IntArray, observations: Observations, state: State
+) -> tuple[Observations, State]:
+    """Return observations and poses with the pictures of the views `at` (V,) flipped in one of the `WAYS`, their boards
+    numbered from an end that lies so many quarter `turns` (V,) further."""
+    signs, middle = WAYS[way], 0.5 * (np.array(state.camera.size_px) - 1.0)
+    pixels, corner, views = observations.pixels.copy(), observations.corner.copy(), list(observations.views)
+    pixels[at] = middle + signs * (pixels[at] - middle)
+    rotation, translation = state.rotation.copy(), state.translation_mm.copy()
+    for k in np.flatnonzero(at).tolist():
+        view, picture = views[k], np.append(signs, 1.0)
+        grid, board = view.grid, np.ones(3)
+        if signs.prod() < 0.0:
+            # To stay right-handed, a board in a mirror is counted backwards along its columns.
+            grid, board = np.stack([view.board.columns - 1 - grid[:, 0], grid[:, 1]], axis=-1), np.array([-1.0, 1, 1])
+            across = (view.board.columns - 1) * view.board.square_x_mm
+            translation[k] += rotation[k] @ np.array([across, 0.0, 0.0])
+        views[k] = replace(view, grid=grid, pixels=middle + signs * (view.pixels - middle))
+        corner[k, : len(grid)] = observations.first_row[observations.board[k]] + view.board.index(grid)
+        rotation[k], translation[k] = picture[:, None] * rotation[k] * board, picture * translation[k]
+    out = replace(observations, pixels=pixels, corner=corner, views=tuple(views))
+    state = replace(state, rotation=rotation, translation_mm=translation)
+    return with_views_turned(out, state, at & (turns == 2), 2)
 
 
 def _judged(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
-    """Return the finding, where turning pictures back explains the residuals, and nothing like it is left in them."""
+    """Return the finding, where putting pictures back explains the residuals, and nothing like it is left in them."""
     at, changes = back.at, evidence.changes()
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())
     if not 0.0 < part < 1.0 or not changes:
         return None
-    # Which pictures were turned is known from the residuals alone, and costs its entropy.
+    # Which pictures were flipped is known from the residuals alone, and costs its entropy.
     entropy = -2.0 * len(at) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
     # Corners of an image err together; each image says two numbers of where its principal point lies.
     if 2.0 * len(at) * np.log(left) + entropy > -MIN_LEAD:
         return None
-    # A picture that moves on the sensor by any way moves on, whatever was turned.
+    # A picture that moves on the sensor by any way moves on, whatever was flipped.
     if left * max(changes[way].share for way in ("shift", "lens")) > MAX_STILL_SHIFTED * (1.0 - left):
         return None
     names = [view.image for view in back.observations.views]
-    turned = list(dict.fromkeys(name for name, of in zip(names, at, strict=True) if of == (part <= 0.5)))
+    flipped = list(dict.fromkeys(name for name, of in zip(names, at, strict=True) if of == (part <= 0.5)))
     return Finding.bad(
-        f"{len(turned)} of {len(set(names))} images are turned by half a turn, like '{turned[0]}', or all but these: "
-        f"turned back they are of one lens, and {100.0 * (1.0 - left):.0f} % of the squares of all residuals are gone",
+        f"{len(flipped)} of {len(set(names))} images are {back.way}, like '{flipped[0]}', or all but these: "
+        f"put back they are of one lens, and {100.0 * (1.0 - left):.0f} % of the squares of all residuals are gone",
         "take them as the camera wrote them, and calibrate again",
     )
-
-
-def _turned_back(observations: Observations, fit: Fit, at: BoolArray) -> _Back:
-    """Return what is found with the pictures of the views `at` (V,) turned back: the better of two where a board looks
-    the same turned, and may be counted from either end."""
-    state, pixels = fit.state, observations.pixels.copy()
-    pixels[at] = np.array(state.camera.size_px) - 1.0 - pixels[at]
-    half = np.where(at[:, None], [-1.0, -1.0, 1.0], 1.0)
-    views = tuple(
-        replace(view, pixels=np.array(state.camera.size_px) - 1.0 - view.pixels) if of else view
-        for view, of in zip(observations.views, at, strict=True)
-    )
-    back = replace(observations, pixels=pixels, views=views)
-    start = replace(state, rotation=half[:, :, None] * state.rotation, translation_mm=half * state.translation_mm)
-    same = at & np.array([2 in view.board.turns for view in views])
-    weight, found = fit.weight(observations), []
-    for trial, begun in [(back, start), *([with_views_turned(back, start, same, 2)] if same.any() else [])]:
-        solution = solve(trial, begun, weight=weight, prior_sigma_px=fit.sigma_px, cost_tolerance=TOLERANCE)
-        residuals = solution.data.residuals[0]
-        squares = float((weight**2 * (residuals.px**2).sum(axis=-1)).sum())
-        found.append(_Back(at.copy(), trial, solution.state, residuals, squares))
-    return min(found, key=lambda one: one.squares)

@@ -39,10 +39,6 @@ SIDES_ROUNDS = 8
 """Images change sides in so many rounds at most."""
 RIDGE_OF_STEP = 1e-9
 """Part of its own (or all) information that keeps what the images leave open at rest."""
-SAME = 0.15
-"""A principal point lies where another one is after a turn within this part of the way between both."""
-MIN_APART_PX = 1.0
-"""Principal points nearer to each other are one: nobody sees that a picture was turned, nor does it matter."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,9 +79,7 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
         return None
     if best.cost > _otherwise(calibration, evidence, best) - MIN_LEAD:
         return None
-    how = _turned(calibration, evidence, best.second)
-    if not how and name in ("focus", "lens"):
-        how = f" (focal lengths {100.0 * abs(best.step[0]):.1f} % apart)"
+    how = f" (focal lengths {100.0 * abs(best.step[0]):.1f} % apart)" if name in ("focus", "lens") else ""
     views = [calibration.views[k] for k in evidence.views]
     sides = [[v.image for v, of in zip(views, best.second, strict=True) if of == kind] for kind in (False, True)]
     like = " and ".join(f"{len(set(images))} like '{images[0]}'" for images in sides)
@@ -175,27 +169,6 @@ def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -
     line = _explained(kinds.amounts, kinds.weight, places).min() + np.log(len(at))
     step = _explained(kinds.amounts, kinds.weight, steps.reshape(-1, len(at)).astype(float)).min()
     return float(min(line, step + 2.0 * np.log(len(at))))
-
-
-def _turned(calibration: Calibration, evidence: ViewEvidence, second: BoolArray) -> str:
-    """Say in words whether the principal points of the two kinds are as a turned or mirrored picture has them."""
-    camera = _camera_rows(evidence)
-    own, across, along = evidence.own[:, camera, camera], evidence.own[:, camera, COMMON], evidence.along[:, camera]
-    follow = across @ evidence.common_covariance()
-    step = _best_steps(own, across, follow, along, second[None])[0][0]
-    common = -np.tensordot(second.astype(np.float64), follow, axes=1).T @ step
-    d_pixels_d_point, d_pixels_d_parameters = np.zeros((2, 3, 1)), np.zeros((2, len(step), 1))
-    u, v, _ = calibration.near.derivatives(
-        np.zeros(1), np.zeros(1), np.ones(1), d_pixels_d_point, d_pixels_d_parameters
-    )
-    one = np.array([u[0], v[0]]) + d_pixels_d_parameters[..., 0] @ common[: len(step)]
-    way = d_pixels_d_parameters[..., 0] @ step
-    apart = max(float(np.linalg.norm(way)), MIN_APART_PX)
-    # Half a turn, and each mirror, takes a principal point through the middle of the picture.
-    off = 2.0 * one + way - (np.array(calibration.camera.size_px) - 1.0)
-    over = {"turned by half a turn": off, "mirrored": np.array([off[0], way[1]]), "flipped": np.array([way[0], off[1]])}
-    what = min(over, key=lambda name: float(np.linalg.norm(over[name])))
-    return f" (as if some were {what})" if np.linalg.norm(over[what]) <= SAME * apart else ""
 
 
 def _camera_rows(evidence: ViewEvidence) -> slice:
