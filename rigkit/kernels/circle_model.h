@@ -19,8 +19,8 @@ enum { OFF = PARAMETERS, COLUMNS };
 /* Beside them, what the circle's own growth changes (that of the circles beside it is in E1 to S, too), and what a blur that
  * differs with the direction changes. */
 enum { OWN = COLUMNS, Q1, Q2, ROWS };
-/* Further from an edge than this, in blurs, it is all one brightness. */
-static const float FAR = 12.0f;
+/* Further from an edge than this, in blurs, it is all one brightness: but for a part in 10^12. */
+static const float FAR = 7.0f;
 /* Nearer to the centre than this, in px, the way to the edge turns round with the centre, and fits do not settle. */
 static const double NO_DIRECTION = 1.0;
 /* Further than so many radii from a circle beside it pixels have none of its light: there its map may not be inverted. */
@@ -107,14 +107,22 @@ INLINE void shares(const double z[BLOCK], double share[BLOCK], double slope[BLOC
 }
 
 /* The blur towards the edges of a block: its variance is s^2 + q . (cos, sin) of twice the angle of the edge's normal, as that
- * of motion is; and its derivatives by s and q. */
+ * of motion is; and its derivatives by s and, where `all` are wanted, by q. */
 typedef struct {
     double s[BLOCK], per_s[BLOCK], by_s[BLOCK], by_q[2][BLOCK];
 } blurs_t;
 
-INLINE void towards(const double q[2], double s, const places_t *places, blurs_t *out)
+INLINE void towards(const double q[2], double s, const places_t *places, const int all, blurs_t *out)
 {
-    const double least = 0.01 * s * s;
+    const double least = 0.01 * s * s, per_even = 1.0 / s;
+    const int even = q[0] == 0.0 && q[1] == 0.0;
+    for (int k = 0; k < BLOCK && even; k++) {
+        out->s[k] = s;
+        out->per_s[k] = per_even;
+        out->by_s[k] = 1.0;
+    }
+    if (even && !all)
+        return;
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double c = places->nu[k] * places->nu[k] - places->nv[k] * places->nv[k], d = 2.0 * places->nu[k] * places->nv[k];
@@ -153,28 +161,36 @@ INLINE int inverted(circle_t *at)
 }
 
 /* Add the light of a circle beside it to the block's share of discs and, for growth and blur, to its rows: derivatives of the
- * share. */
+ * share. Most blocks have none of it. */
 INLINE void add_beside(
-    const circle_t *at, const circle_t *from, const double du[BLOCK], const double dv[BLOCK], double total[BLOCK],
+    const circle_t *at, const circle_t *from, const double du[BLOCK], const double dv[BLOCK], const int all, double total[BLOCK],
     double rows[ROWS][BLOCK])
 {
-    double u[BLOCK], v[BLOCK], z[BLOCK], share[BLOCK], slope[BLOCK];
+    double u[BLOCK], v[BLOCK], from_it[BLOCK], z[BLOCK], share[BLOCK], slope[BLOCK], nearest = NO_LIGHT * NO_LIGHT;
+    double deepest = -(double)FAR;
     places_t places;
     blurs_t blur;
     const double off_u = from->c[0] - at->c[0], off_v = from->c[1] - at->c[1];
-#pragma omp simd
+#pragma omp simd reduction(min : nearest)
     for (int k = 0; k < BLOCK; k++) {
         u[k] = du[k] + off_u;
         v[k] = dv[k] + off_v;
-    }
-    place(at, u, v, &places);
-    towards(from->q, from->s, &places, &blur);
-#pragma omp simd
-    for (int k = 0; k < BLOCK; k++) {
         const double x = at->inverse[0] * u[k] + at->inverse[1] * v[k], y = at->inverse[2] * u[k] + at->inverse[3] * v[k];
-        const double inside = -places.d[k] * blur.per_s[k] - 0.5 * places.curvature[k] * blur.s[k];
-        z[k] = x * x + y * y < NO_LIGHT * NO_LIGHT ? inside : -(double)FAR;
+        from_it[k] = x * x + y * y;
+        nearest = from_it[k] < nearest ? from_it[k] : nearest;
     }
+    if (!(nearest < NO_LIGHT * NO_LIGHT))
+        return;
+    place(at, u, v, &places);
+    towards(from->q, from->s, &places, all, &blur);
+#pragma omp simd reduction(max : deepest)
+    for (int k = 0; k < BLOCK; k++) {
+        const double inside = -places.d[k] * blur.per_s[k] - 0.5 * places.curvature[k] * blur.s[k];
+        z[k] = from_it[k] < NO_LIGHT * NO_LIGHT ? inside : -(double)FAR;
+        deepest = z[k] > deepest ? z[k] : deepest;
+    }
+    if (!(deepest > -(double)FAR))
+        return;
     shares(z, share, slope);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
@@ -186,22 +202,25 @@ INLINE void add_beside(
         rows[E2][k] += (grown - 3.0 * bent) * (c * c - s * s);
         rows[E3][k] += (grown - 3.0 * bent) * 2.0 * c * s;
         rows[S][k] += wider * blur.by_s[k];
-        rows[Q1][k] += wider * blur.by_q[0][k];
-        rows[Q2][k] += wider * blur.by_q[1][k];
+        if (all) {
+            rows[Q1][k] += wider * blur.by_q[0][k];
+            rows[Q2][k] += wider * blur.by_q[1][k];
+        }
     }
 }
 
-/* Set the places of a block, and its rows: derivatives of the brightness by the parameters, and residuals. */
+/* Set the places of a block, and its rows: derivatives of the brightness by the parameters, and residuals; and what else there
+ * is a row of, where `all` are wanted. */
 INLINE void differentiate(
-    const group_t *group, const double du[BLOCK], const double dv[BLOCK], const double value[BLOCK], places_t *places,
-    double rows[ROWS][BLOCK])
+    const group_t *group, const double du[BLOCK], const double dv[BLOCK], const double value[BLOCK], const int all,
+    places_t *places, double rows[ROWS][BLOCK])
 {
     const circle_t *at = &group->own;
     double z[BLOCK], share[BLOCK], slope[BLOCK], total[BLOCK];
     const double per_size = 1.0 / at->size;
     blurs_t blur;
     place(at, du, dv, places);
-    towards(at->q, at->s, places, &blur);
+    towards(at->q, at->s, places, all, &blur);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++)
         z[k] = -places->d[k] * blur.per_s[k] - 0.5 * places->curvature[k] * blur.s[k];
@@ -216,23 +235,25 @@ INLINE void differentiate(
         total[k] = share[k];
         rows[X][k] = edge * places->nu[k];
         rows[Y][k] = edge * places->nv[k];
-        rows[OWN][k] = grown;
         rows[E1][k] = grown + bent;
         rows[E2][k] = (grown - 3.0 * bent) * (c * c - s * s);
         rows[E3][k] = (grown - 3.0 * bent) * 2.0 * c * s;
         rows[S][k] = wider * blur.by_s[k];
-        rows[Q1][k] = wider * blur.by_q[0][k];
-        rows[Q2][k] = wider * blur.by_q[1][k];
+        if (all) {
+            rows[OWN][k] = grown;
+            rows[Q1][k] = wider * blur.by_q[0][k];
+            rows[Q2][k] = wider * blur.by_q[1][k];
+        }
     }
     for (int j = 0; j < group->count; j++)
-        add_beside(group->beside + j, at, du, dv, total, rows);
+        add_beside(group->beside + j, at, du, dv, all, total, rows);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double x = du[k] * per_size, y = dv[k] * per_size, light = 1.0 + at->g[0] * x + at->g[1] * y;
         const double level = at->a + at->b * total[k], steep = light * at->b;
         for (int i = X; i <= S; i++)
             rows[i][k] *= steep;
-        for (int i = OWN; i <= Q2; i++)
+        for (int i = OWN; i < ROWS && all; i++)
             rows[i][k] *= steep;
         rows[A][k] = light;
         rows[B][k] = light * total[k];

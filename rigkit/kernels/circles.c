@@ -9,9 +9,10 @@
 /* Steps are taken no shorter or longer than this: where two of them are nearly alike, or opposite, noise decides the ratio. */
 static const double MIN_TIMES = 0.3, MAX_TIMES = 4.0;
 
-/* Gather the pixels near the edge and within `reach` radii, at most `capacity`. */
-INLINE void gather(
-    const circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t capacity,
+/* Gather the pixels near the edge and within `reach` radii, at most `capacity`, and set the circle's brightness to their means
+ * inside and outside; return whether there are pixels of both. */
+INLINE int gather(
+    circle_t *at, const void *grey, int64_t bytes, int64_t width, int64_t height, double reach, double band, int64_t capacity,
     spots_t *spots)
 {
     const double bend_u = fabs(at->H[0]) + fabs(at->H[1]) + fabs(at->H[2]);
@@ -22,14 +23,15 @@ INLINE void gather(
     high = (high < near_v ? high : near_v) + bend_v;
     spots->count = 0;
     if (!isfinite(wide + high + at->c[0] + at->c[1]))
-        return;
+        return 0;
     int64_t left = (int64_t)ceil(at->c[0] - wide), right = (int64_t)floor(at->c[0] + wide);
     int64_t top = (int64_t)ceil(at->c[1] - high), bottom = (int64_t)floor(at->c[1] + high);
     left = left > 0 ? left : 0;
     top = top > 0 ? top : 0;
     right = right < width - 1 ? right : width - 1;
     bottom = bottom < height - 1 ? bottom : height - 1;
-    double du[BLOCK], dv[BLOCK];
+    double du[BLOCK], dv[BLOCK], total[2] = {0.0, 0.0};
+    int64_t parts[2] = {0, 0};
     places_t here;
     for (int64_t v = top; v <= bottom; v++)
         for (int64_t u = left; u <= right; u += BLOCK) {
@@ -45,32 +47,63 @@ INLINE void gather(
                 spots->u[to] = (double)(u + k);
                 spots->v[to] = (double)v;
                 spots->value[to] = bytes ? (double)((const uint8_t *)grey)[from] : (double)((const float *)grey)[from];
+                const int inside = here.d[k] < 0.0;
+                total[inside] += spots->value[to];
+                parts[inside]++;
             }
         }
+    if (!(parts[0] > 0 && parts[1] > 0))
+        return 0;
+    at->a = total[0] / (double)parts[0];
+    at->b = total[1] / (double)parts[1] - at->a;
+    return 1;
 }
 
-/* Differentiate a block of spots from `first` on; return how many of them there are. */
-INLINE int64_t differentiated(const group_t *at, const spots_t *spots, int64_t first, places_t *places, double rows[ROWS][BLOCK])
+/* Add how the residuals of a block go on round the circle: weighted as a change of radius, times cosine and sine of 3 to 6
+ * times the angle in the plane. */
+INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], const double off[BLOCK], double out[8])
 {
-    double du[BLOCK], dv[BLOCK], value[BLOCK];
-    const int64_t here = offsets(&at->own, spots, first, du, dv);
-    for (int64_t k = 0; k < BLOCK; k++)
-        value[k] = spots->value[first + (k < here ? k : 0)];
-    differentiate(at, du, dv, value, places, rows);
-    return here;
+    double c[BLOCK], s[BLOCK], cn[BLOCK], sn[BLOCK];
+#pragma omp simd
+    for (int k = 0; k < BLOCK; k++) {
+        const double per_r = 1.0 / (places->r[k] > 1e-9 ? places->r[k] : 1e-9);
+        c[k] = places->x[k] * per_r;
+        s[k] = places->y[k] * per_r;
+        cn[k] = grown[k] * off[k] * (c[k] * c[k] - s[k] * s[k]);
+        sn[k] = grown[k] * off[k] * 2.0 * c[k] * s[k];
+    }
+    for (int n = 0; n < 4; n++) {
+        double cosines = 0.0, sines = 0.0;
+#pragma omp simd reduction(+ : cosines, sines)
+        for (int k = 0; k < BLOCK; k++) {
+            const double next = cn[k] * c[k] - sn[k] * s[k];
+            sn[k] = sn[k] * c[k] + cn[k] * s[k];
+            cn[k] = next;
+            cosines += cn[k];
+            sines += sn[k];
+        }
+        out[2 * n] += cosines;
+        out[2 * n + 1] += sines;
+    }
 }
 
-/* Fill the normal equations; return the sum of squared residuals. */
-INLINE double linearise(const group_t *at, const spots_t *spots, double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
+/* Write the products of rows, the lower triangle of `sums`; where `all` of them are wanted, the harmonics of residuals, too. */
+INLINE void sum_products(
+    const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[8])
 {
-    double rows[ROWS][BLOCK], sums[COLUMNS][COLUMNS] = {{0.0}};
+    const int count = all ? ROWS : COLUMNS;
+    double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK];
     places_t places;
+    memset(sums, 0, ROWS * sizeof *sums);
     for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = differentiated(at, spots, first, &places, rows);
-        for (int i = 0; i < COLUMNS; i++)
+        const int64_t here = offsets(&at->own, spots, first, du, dv);
+        for (int64_t k = 0; k < BLOCK; k++)
+            value[k] = spots->value[first + (k < here ? k : 0)];
+        differentiate(at, du, dv, value, all, &places, rows);
+        for (int i = 0; i < count; i++)
             for (int64_t k = here; k < BLOCK; k++)
                 rows[i][k] = 0.0;
-        for (int i = 0; i < COLUMNS; i++)
+        for (int i = 0; i < count; i++)
             for (int j = 0; j <= i; j++) {
                 double sum = 0.0;
 #pragma omp simd reduction(+ : sum)
@@ -78,7 +111,14 @@ INLINE double linearise(const group_t *at, const spots_t *spots, double N[PARAME
                     sum += rows[i][k] * rows[j][k];
                 sums[i][j] += sum;
             }
+        if (all)
+            add_harmonics(&places, rows[OWN], rows[OFF], harmonics);
     }
+}
+
+/* Fill the normal equations; return the sum of squared residuals. */
+INLINE double equations(double sums[ROWS][ROWS], double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
+{
     for (int i = 0; i < PARAMETERS; i++) {
         right[i] = sums[OFF][i];
         memcpy(N + i * PARAMETERS, sums[i], PARAMETERS * sizeof(double));
@@ -139,62 +179,24 @@ static int moved(group_t *group, const double step[PARAMETERS], const circle_rul
     return fine;
 }
 
-/* Write how the residuals go on round the circle: their means weighted as a change of radius, for harmonics 3 to 6 of the
- * angle in the plane, in radii (cosine and sine each). A disc has none; a square has the fourth. */
-INLINE void harmonics(const group_t *at, const spots_t *spots, double out[8])
-{
-    double rows[ROWS][BLOCK], weight = 0.0;
-    places_t places;
-    memset(out, 0, 8 * sizeof(double));
-    for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = differentiated(at, spots, first, &places, rows);
-        for (int64_t k = 0; k < here; k++) {
-            const double grown = rows[OWN][k], per_r = 1.0 / (places.r[k] > 1e-9 ? places.r[k] : 1e-9);
-            const double c = places.x[k] * per_r, s = places.y[k] * per_r;
-            double cn = c * c - s * s, sn = 2.0 * c * s;
-            weight += grown * grown;
-            for (int n = 0; n < 4; n++) {
-                const double next = cn * c - sn * s;
-                sn = sn * c + cn * s;
-                cn = next;
-                out[2 * n] += grown * rows[OFF][k] * cn;
-                out[2 * n + 1] += grown * rows[OFF][k] * sn;
-            }
-        }
-    }
-    for (int n = 0; n < 8; n++)
-        out[n] *= 2.0 / (weight > 1e-12 ? weight : 1e-12);
-}
-
 /* Write what residuals say of a blur that differs with the direction: their products with its two columns, and the normal
  * equations of these (3) once all else is solved for, from the factor `N` of those of the rest. */
-static void unevenness(const group_t *at, const spots_t *spots, const double *N, double out[5])
+static void unevenness(double sums[ROWS][ROWS], const double *N, double out[5])
 {
-    double rows[ROWS][BLOCK], with[2][PARAMETERS] = {{0.0}}, solved[2][PARAMETERS];
-    places_t places;
-    memset(out, 0, 5 * sizeof(double));
-    for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = differentiated(at, spots, first, &places, rows);
-        for (int64_t k = 0; k < here; k++) {
-            const double one = rows[Q1][k], two = rows[Q2][k];
-            out[0] += one * rows[OFF][k];
-            out[1] += two * rows[OFF][k];
-            out[2] += one * one;
-            out[3] += one * two;
-            out[4] += two * two;
-            for (int i = 0; i < PARAMETERS; i++) {
-                with[0][i] += one * rows[i][k];
-                with[1][i] += two * rows[i][k];
-            }
-        }
-    }
-    memcpy(solved, with, sizeof solved);
+    double solved[2][PARAMETERS];
+    out[0] = sums[Q1][OFF];
+    out[1] = sums[Q2][OFF];
+    out[2] = sums[Q1][Q1];
+    out[3] = sums[Q2][Q1];
+    out[4] = sums[Q2][Q2];
+    memcpy(solved[0], sums[Q1], sizeof solved[0]);
+    memcpy(solved[1], sums[Q2], sizeof solved[1]);
     cholesky_solve(N, PARAMETERS, solved[0]);
     cholesky_solve(N, PARAMETERS, solved[1]);
     for (int i = 0; i < PARAMETERS; i++) {
-        out[2] -= with[0][i] * solved[0][i];
-        out[3] -= with[0][i] * solved[1][i];
-        out[4] -= with[1][i] * solved[1][i];
+        out[2] -= sums[Q1][i] * solved[0][i];
+        out[3] -= sums[Q1][i] * solved[1][i];
+        out[4] -= sums[Q2][i] * solved[1][i];
     }
 }
 
@@ -217,30 +219,11 @@ static circle_t guessed(const double *pixel, const double *map, const double *be
     return at;
 }
 
-/* Set the brightness to the means inside and outside; return whether there are pixels of both. */
-INLINE int set_brightness(circle_t *at, const spots_t *spots)
-{
-    double du[BLOCK], dv[BLOCK], total[2] = {0.0, 0.0};
-    int64_t parts[2] = {0, 0};
-    places_t places;
-    for (int64_t first = 0; first < spots->count; first += BLOCK) {
-        const int64_t here = offsets(at, spots, first, du, dv);
-        place(at, du, dv, &places);
-        for (int64_t k = 0; k < here; k++) {
-            const int inside = places.d[k] < 0.0;
-            total[inside] += spots->value[first + k];
-            parts[inside]++;
-        }
-    }
-    if (!(parts[0] > 0 && parts[1] > 0))
-        return 0;
-    at->a = total[0] / (double)parts[0];
-    at->b = total[1] / (double)parts[1] - at->a;
-    return 1;
-}
-
-/* Write the fitted circle with `N`, the normal equations' factor. */
-static void write_circle(const circle_t *at, const double *N, double squares, int64_t seen, int settled, double *result)
+/* Write the fitted circle with `N`, the normal equations' factor. Its `harmonics` are the means of the residuals, weighted as a
+ * change of radius, times those of the angle, in radii: a disc has none, a square the fourth. */
+static void write_circle(
+    const circle_t *at, const double *N, double sums[ROWS][ROWS], const double harmonics[8], int64_t seen, int settled,
+    double *result)
 {
     double cov[2][PARAMETERS] = {{0.0}}, growth[PARAMETERS];
     cov[0][X] = cov[1][Y] = 1.0;
@@ -254,7 +237,7 @@ static void write_circle(const circle_t *at, const double *N, double squares, in
     result[9] = at->s;
     result[10] = at->a;
     result[11] = at->b;
-    result[12] = sqrt(squares / (double)(seen > PARAMETERS ? seen - PARAMETERS : 1));
+    result[12] = sqrt(sums[OFF][OFF] / (double)(seen > PARAMETERS ? seen - PARAMETERS : 1));
     result[13] = (double)seen;
     result[14] = (double)settled;
     for (int i = E1; i <= E3; i++) {
@@ -263,6 +246,9 @@ static void write_circle(const circle_t *at, const double *N, double squares, in
         cholesky_solve(N, PARAMETERS, growth);
         result[15 + i - E1] = growth[i];
     }
+    for (int n = 0; n < 8; n++)
+        result[18 + n] = 2.0 * harmonics[n] / (sums[OWN][OWN] > 1e-12 ? sums[OWN][OWN] : 1e-12);
+    unevenness(sums, N, result + 26);
 }
 
 /* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
@@ -300,14 +286,15 @@ void fit_circles(
         const double band = rules->near_sigmas * at->s + rules->near_px;
         if (!inverted(at))
             continue;
-        gather(at, grey, bytes, width, height, reach[n], band, capacity, &spots);
-        double N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
-        if (!(spots.count >= rules->min_pixels) || !set_brightness(at, &spots))
+        const int both = gather(at, grey, bytes, width, height, reach[n], band, capacity, &spots);
+        double sums[ROWS][ROWS], harmonics[8] = {0.0}, N[PARAMETERS * PARAMETERS], right[PARAMETERS], step[PARAMETERS];
+        if (!both || !(spots.count >= rules->min_pixels))
             continue;
         double before[PARAMETERS] = {0.0}, times = 1.0, moved_before = 0.0;
         int solved = 1, settled = 0, still = 0;
         for (int64_t k = 0; k < rules->iterations && solved && !settled; k++) {
-            const double variance = linearise(&group, &spots, N, right) / (double)(spots.count - PARAMETERS);
+            sum_products(&group, &spots, 0, sums, harmonics);
+            const double variance = equations(sums, N, right) / (double)(spots.count - PARAMETERS);
             for (int i = 0; i < PARAMETERS; i++)
                 N[i * PARAMETERS + i] *= 1.0 + 1e-9;
             if (at->s <= rules->min_blur && right[S] < 0.0)
@@ -338,11 +325,9 @@ void fit_circles(
         }
         if (!solved)
             continue;
-        const double squares = linearise(&group, &spots, N, step);
-        if (!cholesky(N, PARAMETERS))
-            continue;
-        write_circle(at, N, squares, spots.count, still, result);
-        harmonics(&group, &spots, result + 18);
-        unevenness(&group, &spots, N, result + 26);
+        sum_products(&group, &spots, 1, sums, harmonics);
+        equations(sums, N, right);
+        if (cholesky(N, PARAMETERS))
+            write_circle(at, N, sums, harmonics, spots.count, still, result);
     }
 }

@@ -46,13 +46,13 @@ SURE_GAIN = 1.5
 """Of circles in the middle of others: these tell whether a lattice is a smooth image of a plane."""
 BLUR_ROUNDS = 3
 """The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
-blur 3 px); the third, where the blur differs with the direction, has that from what the neighbours' light leaves, and
-circles that this light had hidden."""
+blur 3 px); the third, where that changed by how much the blur differs with the direction, has it from what the
+neighbours' light leaves, and circles that this light had hidden."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
-"""Of the variance of the blur. Below the first the centres of circles that lie apart are the same. The second is a blur
-four times as wide in one direction as across it."""
+"""Of the variance of the blur. A change below the first leaves centres where they are (REAL, hexagonal: within
+0.0003 px). The second is a blur four times as wide in one direction as across it."""
 MAX_NEW_RINGS = 40
 """Rings of circles that a grid may grow by."""
 
@@ -281,8 +281,9 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
         half_gap_px = (0.5 / draft.radius - 1.0) * np.sqrt(np.abs(np.linalg.det(draft.fit.maps)))
         beside = bool((half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any())
         uneven = _uneven(draft)
-        even = bool(np.linalg.norm(uneven) < MIN_UNEVEN * np.median(draft.fit.blur_px) ** 2)
-        if even and (not beside or (done == BLUR_ROUNDS - 1 and not grown)):
+        change = float(np.linalg.norm(uneven - draft.uneven_px2))
+        told = change < MIN_UNEVEN * float(np.median(draft.fit.blur_px)) ** 2
+        if told and not grown and (not beside or done == BLUR_ROUNDS - 1):
             break
         fitted = _again(grey, replace(draft, uneven_px2=uneven), beside=beside)
         if not _enough(fitted):
@@ -314,6 +315,8 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
         return None
     tried = _tried(grey, draft, places, around, beside=beside)
     near = np.linalg.norm(tried.pixels - around.pixels, axis=1) < OFF_PLACE * _spacing(around)
+    if not near.any():
+        return None
     joined = replace(
         draft,
         label=np.concatenate([draft.label, places[near]]),

@@ -93,14 +93,13 @@ def local_maps(
     ridge = np.array([(sigma_px / (pitch * TYPICAL_DERIVATIVES[i + j])) ** 2 for i, j in POWERS]) + MIN_RIDGE
     homography, own = _homographies(plane, values, weight)
     rest = np.where(known[..., None], values - homography, 0.0)
-    normal = _sums(weight, terms, terms) + np.diag(ridge)
-    # Beside the terms, what the first three of them, the place itself and its sides, take from each of the circles.
-    right = np.zeros((len(places), len(POWERS), 5))
-    right[:, :, :2] = np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2)
-    right[:, [0, 1, 2], [2, 3, 4]] = 1.0
-    solved = np.linalg.solve(normal, right)
-    parts = solved[:, :, :2] + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
-    gain, *sides = (np.linalg.norm(weight * (solved[:, :, k] @ terms.T), axis=1) for k in (2, 3, 4))
+    # Which neighbours there are is alike in many places, and with it all but the right-hand sides.
+    _, first, kind = np.unique(known @ (1 << np.arange(len(offset))), return_index=True, return_inverse=True)
+    inverse = np.linalg.inv(_sums(weight[first], terms, terms) + np.diag(ridge))
+    solved = inverse[kind] @ np.swapaxes((weight[..., None] * rest).swapaxes(1, 2) @ terms, 1, 2)
+    parts = solved + np.pad(own, ((0, 0), (0, len(POWERS) - own.shape[1]), (0, 0)))
+    # What the first three terms, the place itself and its sides, take from each of the circles.
+    gain, *sides = np.linalg.norm(weight[first, None] * (inverse[:, :3] @ terms.T), axis=2)[kind].T
     return PlaneMap(
         pixels=parts[:, 0] + middle,
         first=np.swapaxes(parts[:, 1:3], 1, 2),
