@@ -47,6 +47,9 @@ MIN_PART_CORNERS = 6
 MIN_BOARD_CORNERS = 9
 """Fewer than 3 x 3 corners are too often no board."""
 
+Vouched = Callable[[GreyImage, Lattice], bool]
+"""Says whether marks in the squares of a lattice, on the image, make it a board whatever its corners say."""
+
 SMEARED_CORNERS = 12
 """From so many corners that only motion explains, an image without a board is searched once more with them."""
 
@@ -54,24 +57,40 @@ SAME_PX = 4.0
 """Corners of one board placed in two ways lie nearer than this, px: strong blur moves them so much at most."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sought:
+    """What is looked for: boards of `min_corners`; (columns, rows) of all that may be there, if known; and what makes a
+    lattice one of them beyond doubt."""
+
+    min_corners: int
+    sizes: Sequence[tuple[int, int]] = ()
+    vouched: Vouched | None = None
+
+
 def find_lattices(
-    image: NDArray[np.generic], min_corners: int, sizes: Sequence[tuple[int, int]] = (), *, marked: bool = False
+    image: NDArray[np.generic],
+    min_corners: int,
+    sizes: Sequence[tuple[int, int]] = (),
+    *,
+    vouched: Vouched | None = None,
 ) -> list[RefinedLattice]:
     """Return the lattices of all boards of `image`, refined, in no particular order and orientation.
 
     `sizes` : (columns, rows) of all boards that may be in it, if known.
-    `marked` : whether some of them may have markers in their squares, into which blur takes the edges: lattices with
-    edges aside of their corners (`has_edge_offset`) are then among those returned.
+    `vouched` : given where some of them have markers in their squares, into which blur takes the edges, and whose ink
+    spoils the fit: lattices with edges aside of their corners (`has_edge_offset`) are then among those returned, and
+    those of which it is true, whatever the evidence of their corners.
     """
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
-    seen, promising = Seen.of(grey), _Counting(_sampled if marked else _promising)
+    sought = Sought(min_corners, sizes, vouched)
+    seen, promising = Seen.of(grey), _Counting(_promising if vouched is None else _or_vouched(vouched))
 
     def looked(at: Seen, more_than: int = 0) -> list[RefinedLattice]:
         boards = candidates(at, min_corners, promising)
         if sum(item.count for item in boards) <= more_than:
             return []
-        out = fitted(grey, boards, min_corners, sizes)
+        out = fitted(grey, boards, sought)
         promising.in_vain += 0 if out else len(boards)
         return out
 
@@ -175,15 +194,13 @@ def candidates(seen: Seen, min_corners: int, promising: Promising) -> list[Latti
     return [board for board in join_parts(parts) if large(board, min_corners)]
 
 
-def fitted(
-    grey: GreyImage, boards: Sequence[Lattice], min_corners: int, sizes: Sequence[tuple[int, int]]
-) -> list[RefinedLattice]:
+def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[RefinedLattice]:
     """Return those of `boards` that the fit confirms, refined, without what belongs to others that they touch.
 
     Those whose blur is uneven are fitted where it is made even (`RefinedLattice.picture`).
     """
-    refined = refine(grey, boards, _promise(sizes, min_corners))
-    found = _fitted(grey, boards, refined, min_corners, sizes)
+    refined = refine(grey, boards, _promise(grey, sought))
+    found = _fitted(grey, boards, refined, sought)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
         # What is blurred beside a board that is sharp lies in the background.
         return found
@@ -192,24 +209,25 @@ def fitted(
         if picture is None:
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
-        room = sizes if len(found) < len(sizes) else ()
-        again = refine(picture.grey, there, _promise(room, min_corners), radius_px=picture.radius_px)
-        found = _with_better(
-            found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, min_corners, room)]
-        )
+        room = replace(sought, sizes=sought.sizes if len(found) < len(sought.sizes) else ())
+        again = refine(picture.grey, there, _promise(picture.grey, room), radius_px=picture.radius_px)
+        found = _with_better(found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, room)])
     return found
 
 
-def _promise(sizes: Sequence[tuple[int, int]], min_corners: int) -> Promise:
+def _promise(grey: GreyImage, sought: Sought) -> Promise:
     """Return the score that the evidence for a lattice is judged by, beside those that are placed (`_confirmed`)."""
+    sizes = sought.sizes
     every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
 
     def score(item: RefinedLattice, placed: Sequence[tuple[Lattice, RefinedLattice]]) -> float:
         own, (columns, rows) = Evidence.of(item).score, item.lattice.size
+        if own <= 0.0 and sought.vouched is not None and sought.vouched(grey, item.lattice):
+            return np.inf
         # Rows and columns may be too many for a board (`known_part`), but no more are found.
         if own > 0.0 or not any(columns >= c and rows >= r for both in every for c, r in both):
             return own
-        sure = sum(trustworthy(after, before.count, min_corners) for before, after in placed)
+        sure = sum(trustworthy(after, before.count, sought.min_corners) for before, after in placed)
         return own + OF_EXPECTED_SIZE if sure < len(sizes) else own
 
     return score
@@ -231,29 +249,25 @@ def _with_better(found: list[RefinedLattice], others: Sequence[RefinedLattice]) 
 
 
 def _fitted(
-    grey: GreyImage,
-    boards: Sequence[Lattice],
-    refined: Sequence[RefinedLattice],
-    min_corners: int,
-    sizes: Sequence[tuple[int, int]],
+    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
 ) -> list[RefinedLattice]:
     """Return those of `refined` (what the fit left of `boards`) that are boards, each by itself."""
     size_px = (grey.shape[1], grey.shape[0])
     out = []
-    for item in _confirmed(grey, boards, refined, min_corners, sizes):
+    for item in _confirmed(grey, boards, refined, sought):
         own = without_outliers(item, size_px)
         parts = (
-            split_at_discontinuities(own, several=too_large(own.lattice, sizes))
+            split_at_discontinuities(own, several=too_large(own.lattice, sought.sizes))
             if may_be_discontinuous(item, size_px)
             else [own]
         )
         if len(parts) == 1:
-            out += [_scattered(placed_together(grey, own))] if large(own.lattice, min_corners) else []
+            out += [_scattered(placed_together(grey, own))] if large(own.lattice, sought.min_corners) else []
             continue
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
-        own_parts = [part for part in alone if large(part, min_corners)]
-        out += _fitted(grey, own_parts, refine(grey, own_parts, _promise(sizes, min_corners)), min_corners, sizes)
+        own_parts = [part for part in alone if large(part, sought.min_corners)]
+        out += _fitted(grey, own_parts, refine(grey, own_parts, _promise(grey, sought)), sought)
     return out
 
 
@@ -264,11 +278,7 @@ def _scattered(item: RefinedLattice) -> RefinedLattice:
 
 
 def _confirmed(
-    grey: GreyImage,
-    boards: Sequence[Lattice],
-    refined: Sequence[RefinedLattice],
-    min_corners: int,
-    sizes: Sequence[tuple[int, int]],
+    grey: GreyImage, boards: Sequence[Lattice], refined: Sequence[RefinedLattice], sought: Sought
 ) -> list[RefinedLattice]:
     """Return those of `refined` (what the fit left of `boards`) that are boards.
 
@@ -276,8 +286,12 @@ def _confirmed(
     more if they are seen to end there; their corners may be uncertain, and their sigmas say so. Beside boards that are
     sure such a lattice would be something else: a board in the background, or a mirror image.
     """
-    every = list(zip(boards, refined, strict=True))
-    sure = [after for before, after in every if trustworthy(after, before.count, min_corners)]
+    every, sizes, min_corners = list(zip(boards, refined, strict=True)), sought.sizes, sought.min_corners
+    sure = [
+        after
+        for before, after in every
+        if trustworthy(after, before.count, min_corners) or _marked(grey, before, after, sought)
+    ]
     room = len(sizes) - len(sure)
     if room <= 0:
         return sure
@@ -292,6 +306,13 @@ def _confirmed(
     return sure + sorted(likely, key=lambda item: -Evidence.of(item).score)[:room]
 
 
+def _marked(grey: GreyImage, before: Lattice, after: RefinedLattice, sought: Sought) -> bool:
+    """Return whether what the fit left of a lattice is a board because marks in its squares say so."""
+    if sought.vouched is None or not trustworthy(after, before.count, sought.min_corners, np.inf):
+        return False
+    return sought.vouched(grey, after.lattice)
+
+
 def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether `lattice` has the rows and columns of one of `sizes`, and corners enough for that to mean much."""
     return lattice.count >= MIN_EXPECTED_CORNERS and frozenset(lattice.size) in {frozenset(size) for size in sizes}
@@ -302,12 +323,17 @@ def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     return not (lattice.solid and has_edge_offset(lattice, finest)) and _sampled(grey, finest, lattice)
 
 
+def _or_vouched(vouched: Vouched) -> Promising:
+    """Return the judgement of lattices that may have markers in their squares."""
+    return lambda grey, finest, lattice: _sampled(grey, finest, lattice) or vouched(grey, lattice)
+
+
 def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, as far as a sample of it tells."""
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], _promise((), 0))
+    (refined,) = refine(grey, [sample], _promise(grey, Sought(0)))
     if trustworthy(refined, sample.count, 0):
         return True
     # Clutter leaves few corners.
@@ -315,5 +341,5 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
-    (again,) = refine(picture.grey, there, _promise((), 0), radius_px=picture.radius_px)
+    (again,) = refine(picture.grey, there, _promise(grey, Sought(0)), radius_px=picture.radius_px)
     return trustworthy(again, sample.count, 0)

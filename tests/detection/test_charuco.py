@@ -17,9 +17,9 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.response import grey_image
-from rigkit.detection.tags.in_squares import beside_markers
+from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
 from rigkit.detection.targets.base import Search
-from rigkit.detection.targets.charuco import _between_markers, _by_squares, _marked_corners
+from rigkit.detection.targets.charuco import _between_markers, _by_squares, _marked_corners, _of
 from rigkit.detection.twins import alike_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
@@ -228,6 +228,26 @@ def test_a_board_whose_markers_blur_into_its_edges_is_found_whole(seed: int) -> 
     off = errors_by_place(found, truth)
     assert np.abs(off).max() < BLURRED_PX
     assert 0.5 < np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2)) < 1.5
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_small_squares_out_of_focus_are_known_by_all_their_markers_together(seed: int) -> None:
+    """The ink of the markers makes their corners look like those of no board, and no marker can be read alone."""
+    rng = np.random.default_rng(seed)
+    board = Board("c", 9, 5, 30.0, 30.0, pattern=Charuco("DICT_4X4_250", 23.0))
+    scene = one_board(rng, board=board, square_px=16.0, max_tilt_deg=30.0)
+    image = grey_image(scene.render(blur_px=2.0, noise_levels=2.0, rng=rng))
+    (found,) = detect_boards(image, [board])
+    assert found.board_id == "c" and found.complete
+    off = errors_by_place(found, scene.truth()[0])
+    assert np.abs(off).max() < 0.5
+    assert 0.5 < np.sqrt(np.mean((off / found.sigma_px[:, None]) ** 2)) < 1.5
+    # Every second row has the same markers before OpenCV 4.6: two of the three between these rows of corners.
+    truth = scene.truth()[0]
+    part = _of(board, truth.grid, truth.pixels).cut(slice(1, 5), slice(None))
+    assert place_by_markers(image, part, board) is not None
+    for pattern in (Charuco("DICT_4X4_250", 23.0, legacy=True), Charuco("DICT_5X5_250", 23.0)):
+        assert place_by_markers(image, part, replace(board, pattern=pattern)) is None
 
 
 def test_an_inverted_board_out_of_focus_is_placed_as_finely() -> None:

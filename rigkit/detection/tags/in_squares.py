@@ -6,10 +6,13 @@ leave of a code is compared with those of the board.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
+from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
@@ -17,18 +20,31 @@ from rigkit.detection.lattice.local_fit import foretold
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, read_tags, transferred
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
-from rigkit.detection.tags.placing import squares_of, voted_place
+from rigkit.detection.tags.placing import MIN_TAGS_OF_PLACE, place_together, squares_of, voted_place
 from rigkit.kernels.surface import maps_of_quads
 
 MIN_MARKERS, AGREEING_MARKERS = 3, 0.7
 """Markers, and which part of those read, that give a lattice the same place: of a board of the other pattern, or with
 other columns, the markers of every second row do."""
 
+LIKE_BETTER_ROWS = 0.5
+"""A row of markers agrees with a place if they are like their codes by so much, at least, of what those of the better
+half of the rows are: of a board of the other pattern, every second row is by 0."""
+
 MAX_FORETOLD_GAIN = 8.0
 """Corners beyond those known are foretold up to this standard deviation, for corners of standard deviation 1."""
 
 MARKERS_BESIDE = 2
 """Markers that touch a corner within the board."""
+
+
+def vouched_by_markers(boards: Sequence[Board], image: GreyImage, lattice: Lattice) -> bool:
+    """Return whether the markers in the squares of a lattice, all together, make it one of these ChArUco boards.
+
+    The ink of markers, blurred, spoils the fit of corners beside it, which then looks like that of anything but a
+    board: with squares of 12 to 22 px, blurred by 1.5 and 2 px, the evidence of the corners is -0.2 to -4 (REAL).
+    """
+    return any(_place_together(image, lattice, board) is not None for board in boards)
 
 
 def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
@@ -39,11 +55,37 @@ def place_by_markers(image: GreyImage, lattice: Lattice, board: Board) -> tuple[
         return None
     tags = _read(image, squares, board)
     sure = np.flatnonzero(tags.read)
-    if len(sure) < MIN_MARKERS:
-        return None
     at = _places(board)[tags.number[sure] - _pattern(board).first_marker] - 1
-    votes, turns, shift = voted_place(lattice, cells[sure], tags.turns[sure], at)
-    return (turns, shift) if votes >= max(MIN_MARKERS, AGREEING_MARKERS * len(sure)) else None
+    if len(sure) >= MIN_MARKERS:
+        votes, turns, shift = voted_place(lattice, cells[sure], tags.turns[sure], at)
+        if votes >= max(MIN_MARKERS, AGREEING_MARKERS * len(sure)):
+            return turns, shift
+    return _place_together(image, lattice, board)
+
+
+def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[int, IntArray] | None:
+    """Return, as `place_by_markers`, where all markers in the squares of a lattice say that it lies, which may be too
+    blurred to be read one by one."""
+    squares, cells = squares_of(lattice, dark=_pattern(board).inverted)
+    if len(squares) < MIN_TAGS_OF_PLACE:
+        return None
+    excess = excess_likeness(_as_printed(image, board), _within(squares, board), marker_codes(board))
+    codes_at, places = np.full((board.rows + 1, board.columns + 1), -1), _places(board)
+    codes_at[places[:, 1], places[:, 0]] = 4 * np.arange(len(places))
+    place = place_together(excess, cells, lattice.size, codes_at)
+    if place is None:
+        return None
+    _, turns, shift = place
+    columns, rows = lattice.size
+    column, row = (grid_turned(cells, (columns - 1, rows - 1), turns) + shift).T
+    inside = (column >= 0) & (row >= 0) & (column <= board.columns) & (row <= board.rows)
+    codes = codes_at[row[inside], column[inside]]
+    own = codes >= 0
+    of_row = np.bincount(row[inside][own]), np.bincount(row[inside][own], excess[inside][own, codes[own] + -turns % 4])
+    means = np.sort(of_row[1][of_row[0] > 0] / of_row[0][of_row[0] > 0])
+    agreeing = means > LIKE_BETTER_ROWS * means[len(means) // 2 :].mean()
+    # The first square lies before the first corner.
+    return (turns, shift - 1) if agreeing.mean() >= AGREEING_MARKERS else None
 
 
 def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:

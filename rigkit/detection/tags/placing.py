@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 
@@ -134,6 +133,17 @@ def placed_lattices(image: GreyImage, lattices: Sequence[Lattice], board: TagBoa
     return pixels, used
 
 
+def _place_together(
+    image: GreyImage, size: tuple[int, int], quads: FloatArray, cells: IntArray, board: TagBoard
+) -> Place | None:
+    """Return where a lattice of this size lies by all tags in its squares `quads` (N, 4, 2) at `cells` (N, 2)."""
+    if len(quads) < MIN_TAGS_OF_PLACE:
+        return None
+    codes_at = np.full((board.board.rows, board.board.columns), -1)
+    codes_at[::2, ::2] = 4 * np.arange(board.numbers.size).reshape(board.numbers.shape)
+    return place_together(excess_likeness(image, quads, board.codes), cells, size, codes_at)
+
+
 Place = tuple[int, int, IntArray]
 """How many tags say it, quarter turns and shift (2,) that take a lattice to the board's grid."""
 
@@ -156,45 +166,38 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     return votes, turn, shift
 
 
-def _place_together(
-    image: GreyImage, size: tuple[int, int], quads: FloatArray, cells: IntArray, board: TagBoard
-) -> Place | None:
-    """Return where a lattice of this size lies whose tags, in the squares `quads` (N, 4, 2) at `cells` (N, 2), are too
-    blurred to be read one by one: where all of them together are most like the codes that the board has there."""
-    if len(quads) < MIN_TAGS_OF_PLACE:
-        return None
-    excess = excess_likeness(image, quads, board.codes)
+def place_together(excess: FloatArray, cells: IntArray, size: tuple[int, int], codes_at: IntArray) -> Place | None:
+    """Return where a lattice lies whose codes may be too blurred to be read one by one: where all of them together are
+    most like the codes that the board has there. None where that may be chance.
+
+    Parameters
+    ----------
+    excess : (N, 4 T) how like each code its squares are, as `excess_likeness`.
+    cells : (N, 2) column and row of the squares.
+    size : (columns, rows) of the lattice.
+    codes_at : (R, C) which code stands upright in each square of the board, -1 where none does.
+    """
     marked = excess.any(axis=1)
     if np.count_nonzero(marked) < MIN_TAGS_OF_PLACE:
         return None
     cells, excess = cells[marked], excess[marked]
-    code_of = np.full(int(board.codes.numbers.max()) + 1, -1)
-    code_of[board.codes.numbers[::4]] = np.arange(0, len(board.codes.numbers), 4)
-    tall, wide = board.numbers.shape
+    tall, wide = codes_at.shape
     columns, rows = size
     found: list[tuple[FloatArray, IntArray, IntArray]] = []
-    for turn, odd in product(range(4), (0, 1)):
+    for turn in range(4):
         turned = grid_turned(cells, (columns - 1, rows - 1), turn)
-        # Tags stand in every second column and row.
-        own = turned[:, 0] % 2 == odd
-        if np.count_nonzero(own) < MIN_TAGS_OF_PLACE:
-            continue
-        parity = turned[own][0] % 2
-        tags = turned[own] // 2
-        low, high = tags.min(axis=0), tags.max(axis=0)
+        low, high = turned.min(axis=0), turned.max(axis=0)
         shifts = [np.arange(-b, n - a) for a, b, n in zip(low, high, (wide, tall), strict=True)]
         shift = np.stack(np.meshgrid(*shifts), axis=-1).reshape(-1, 1, 2)
-        column, row = np.moveaxis(tags + shift, 2, 0)
+        column, row = np.moveaxis(turned + shift, 2, 0)
         inside = (column >= 0) & (column < wide) & (row >= 0) & (row < tall)
+        codes = np.where(inside, codes_at[np.where(inside, row, 0), np.where(inside, column, 0)], -1)
+        own = codes >= 0
         # Turned back by `turn`, the tag stands upright.
-        codes = code_of[board.numbers[np.where(inside, row, 0), np.where(inside, column, 0)]] + (-turn) % 4
-        total = np.where(inside, excess[own][np.arange(len(tags)), codes], 0.0).sum(axis=1)
-        count = inside.sum(axis=1)
+        total = np.where(own, excess[np.arange(len(cells)), codes + (-turn) % 4], 0.0).sum(axis=1)
+        count = own.sum(axis=1)
         score = np.where(count < MIN_TAGS_OF_PLACE, 0.0, total / np.sqrt(np.maximum(count, 1)))
-        move = np.insert(2 * shift[:, 0] - parity, 0, turn, axis=1)
-        found.append((score, count, move))
-    if not found:
-        return None
+        found.append((score, count, np.insert(shift[:, 0], 0, turn, axis=1)))
     score, count, move = (np.concatenate(part) for part in zip(*found, strict=True))
     best = int(score.argmax())
     if score[best] < max(SURE_EXCESS, AHEAD + float(np.delete(score, best).max(initial=0.0))):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -12,10 +13,11 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.lattices import MIN_BOARD_CORNERS, find_lattices, fitted
+from rigkit.detection.lattices import MIN_BOARD_CORNERS, Sought, find_lattices, fitted
 from rigkit.detection.saddles.local_contrast import equalised, stretched
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.refined import RefinedLattice
+from rigkit.detection.tags.in_squares import vouched_by_markers
 
 
 class Search:
@@ -80,15 +82,16 @@ class Search:
     def _found_lattices(self) -> list[RefinedLattice]:
         plain = all(board.pattern.type == Chessboard.type for board in self.boards)
         only = self.chessboard_sizes if plain else ()
-        marked = any(board.pattern.type == Charuco.type for board in self.boards)
-        found = find_lattices(self.grey, self.min_corners_seen, only, marked=marked)
+        marked = [board for board in self.boards if board.pattern.type == Charuco.type]
+        vouched = functools.partial(vouched_by_markers, marked) if marked else None
+        found = find_lattices(self.grey, self.min_corners_seen, only, vouched=vouched)
         if not found and self.grey.dtype != np.uint8:
             # Beyond 8 bits the squares of a board may be a hundredth of the range of brightness.
             seen = [item.lattice for item in find_lattices(equalised(self.grey), self.min_corners_seen, only)]
             # What is hot beside a board moves corners of the equalised image: they are placed on one that is only
             # brighter.
             self.grey = stretched(self.grey, [lattice.pixels for lattice in seen])
-            found = fitted(self.grey, seen, self.min_corners_seen, only)
+            found = fitted(self.grey, seen, Sought(self.min_corners_seen, only, vouched))
         return found
 
 
