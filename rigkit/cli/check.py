@@ -21,6 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--board", action="append", default=[], metavar="CxRxMM|BOARD.toml", help="default: those of the calibration"
     )
     parser.add_argument("--scene", action="store_true", help="no board: matches of any textured scene (rigs)")
+    parser.add_argument(
+        "--before",
+        nargs="+",
+        default=[],
+        type=Path,
+        metavar="IMAGE|FOLDER",
+        help="pictures of when it was trusted: tell what moved since, not what was wrong already",
+    )
     parser.add_argument("--length", type=float, metavar="MM", help="tell what it costs in a length so long,")
     parser.add_argument("--distance", type=float, metavar="MM", help="at this distance")
     parser.add_argument("--fix", type=Path, metavar="FILE.json", help="where it does not hold: write it corrected")

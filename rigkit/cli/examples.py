@@ -57,6 +57,7 @@ EXAMPLES: dict[str, str] = {
   rigkit check calibration.json fresh/*.png                 one to three pictures of the board
   rigkit check rig.json fresh/left fresh/right --board 9x6x25 --fix rig-fixed.json
   rigkit check rig.json left1.png right1.png --scene         any textured scene, no board
+  rigkit check rig.json left right --scene --before old/left old/right      what moved since, not what was wrong already
   rigkit check calibration.json fresh -r check.html --register calib/history/cam.jsonl --temperature 21.5
 """,
     "history": """\

@@ -175,7 +175,11 @@ HISTORY_FILE = file(
     "One line of a register of checks (JSON lines)",
     {
         **optional(
-            of_dataclass(HistoryEntry, without=("amounts",))["properties"], "temperature_c", "reference", "digest"
+            of_dataclass(HistoryEntry, without=("amounts",))["properties"],
+            "temperature_c",
+            "reference",
+            "digest",
+            "baseline",
         ),
         "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
     },

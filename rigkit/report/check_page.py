@@ -17,7 +17,7 @@ from rigkit.planning.goal import px_words
 from rigkit.report import svg
 from rigkit.report.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK
-from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Change, SentinelCheck
+from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Baseline, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power
 
 ARROWS = (21, 16)
@@ -37,10 +37,12 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         f"Fresh points lie {check.rms_px:.3f} px rms from where the calibration has them ({check.corners} points in "
         f"{frames}); {check.expected_px:.3f} px are expected."
     ]
+    sentences += _since_words(check.baseline)
     change = check.change
     if check.holds:
         little = min((power.chance for power in check.powers), default=0.0) < LIKELY_SEEN
-        headline = f"Still holds{', as far as these pictures tell' if little else ''} ({p}, {frames})"
+        holds = "Nothing moved since" if check.baseline is not None else "Still holds"
+        headline = f"{holds}{', as far as these pictures tell' if little else ''} ({p}, {frames})"
         if change is not None and check.chance < ALARM_CHANCE:
             sentences.append(
                 f"More than chance is there, of no importance: {change}; it moves the projection by "
@@ -61,16 +63,17 @@ def check_facts(check: SentinelCheck) -> PageFacts:
     else:
         # What changed in several ways is told by what it does alone.
         what = change.hypothesis.words if change.hypothesis.kind == "lens" else change
-        headline = f"Does NOT hold ({p}): {what}; {_cost_words(check, change)}"
+        said = "Moved since" if check.baseline is not None else "Does NOT hold"
+        headline = f"{said} ({p}): {what}; {_cost_words(check, change)}"
         unsure = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
         sentences.append(
             f"It moves the projection by {change.size_px:.3f} px rms{unsure}; after the correction "
             f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
         )
-    if not check.holds and len(check.watched.cameras) > 1:
+    if not check.holds and check.baseline is None and len(check.watched.cameras) > 1:
         sentences.append(
-            "Moved since, or never held? Pictures of the time of the calibration tell: where they alarm alike, the "
-            "file never fitted these cameras so well; calibrate anew."
+            "Moved since, or never held? Pictures of the time of the calibration, given with --before, tell: what was "
+            "wrong then is no change."
         )
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
@@ -84,6 +87,16 @@ def check_facts(check: SentinelCheck) -> PageFacts:
         sentences=tuple(sentences),
         tables=(check_table(check), power_table(check.powers)),
     )
+
+
+def _since_words(then: Baseline | None) -> list[str]:
+    """Return what frames of before say of the file, where there are any."""
+    if then is None:
+        return []
+    return [
+        f"Since {counted(then.frames, 'frame')} of before: these lay {then.rms_px:.3f} px rms from where the file has "
+        f"them, {then.rms_corrected_px:.3f} px once it is corrected to them; that is no change."
+    ]
 
 
 def _cost_words(check: SentinelCheck, change: Change) -> str:
@@ -179,6 +192,7 @@ def check_to_dict(check: SentinelCheck) -> dict[str, Any]:
         "units": [] if change is None else list(change.hypothesis.units),
         "size_px": None if change is None else change.size_px,
         **{name: getattr(check, name) for name in ("cost", "cost_unit", "rms_px", "rms_fixed_px", "expected_px")},
+        "baseline": None if check.baseline is None else asdict(check.baseline),
         "powers": [without_nan(asdict(power)) for power in check.powers],
         "page": facts.to_dict(),
     }

@@ -28,6 +28,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_camera, save_calibration
+from rigkit.io.calibrations.history_file import editions, load_history
 from rigkit.io.media.images import read_image
 from rigkit.report.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
@@ -272,6 +273,32 @@ def test_another_program_says_not_how_sure_it_is(
     assert main(["export", str(home / "cam.json"), "-o", there, "--to", "kalibr"]) == 0
     assert main(["check", there, str(home / "same")]) == 2
     assert "pictures of the time when it held" in capsys.readouterr().err
+
+
+def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file whose focal length is off by a hundredth; pictures of before, some more, and some after a knock."""
+    wrong, register, fixed = tmp_path / "wrong.json", tmp_path / "cam.jsonl", tmp_path / "fixed.json"
+    told = json.loads((home / "cam.json").read_text())
+    told["camera"]["parameters"] |= {name: 1.01 * told["camera"]["parameters"][name] for name in ("fx", "fy")}
+    wrong.write_text(json.dumps(told))
+    again = _pictures(tmp_path / "again", CAMERA, np.random.default_rng(8))
+    since = ["--before", str(home / "same"), "--register", str(register)]
+    assert main(["check", str(wrong), str(again), *since[2:]]) == 1
+    assert main(["check", str(wrong), str(again), *since]) == 0
+    said = capsys.readouterr().out
+    assert "Nothing moved since" in said and "Since 3 frames of before" in said
+    assert main(["check", str(wrong), str(home / "moved"), *since, "--fix", str(fixed), "--json"]) == 1
+    done = json.loads(capsys.readouterr().out)
+    assert done["cause"] == "focus" and done["baseline"]["frames"] == 3
+    assert done["amounts"] == pytest.approx([FOCUS_PERCENT], abs=4.0 * done["sigmas"][0])
+    # The change alone is put into the file, not what was wrong.
+    longer = load_camera(fixed).parameters[0] / load_camera(wrong).parameters[0] - 1.0
+    assert 100.0 * longer == pytest.approx(FOCUS_PERCENT, abs=0.1)
+    entries = load_history(register)
+    assert [bool(entry.baseline) for entry in entries] == [False, True, True]
+    assert [len(edition.entries) for edition in editions(entries)] == [1, 2]
+    assert main(["check", str(wrong), str(again), "--before", str(again)]) == 2
+    assert "both a fresh image and one of before" in capsys.readouterr().err
 
 
 def test_folders_of_a_rig_are_its_cameras_by_their_names_or_in_its_order(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ def test_a_camera_that_turned_is_found_to_a_hundredth_of_a_degree(rng: np.random
     assert check.change.amounts == pytest.approx(np.degrees(turn), abs=4.0 * float(check.change.sigmas.max()))
     assert check.change.sigmas.max() < 0.01
     # A rig's file may come from anywhere.
-    assert "never held" in check_facts(check).sentences[-1]
+    assert "--before" in check_facts(check).sentences[-1]
 
 
 def test_a_longer_baseline_is_a_change_of_scale_or_shift(rng: np.random.Generator) -> None:

@@ -34,6 +34,8 @@ class HistoryEntry:
     source : the file that was checked, as seen from the register's folder.
     reference : of a calibration made anew the one that it is a change of; "" else.
     digest : SHA-256 of the file of which the amounts are changes, as it was then; "" of registers that are older.
+    baseline : SHA-256 of the pictures of before that the amounts are changes since; "" where they are changes of what
+        the file held.
     holds, chance, verdict : whether it still held, the p-value, and what was said.
     frames : how many there were.
     rms_px : of the fresh corners.
@@ -51,6 +53,7 @@ class HistoryEntry:
     rms_px: float
     reference: str = ""
     digest: str = ""
+    baseline: str = ""
     temperature_c: float | None = None
     amounts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -67,6 +70,11 @@ class HistoryEntry:
         """The file of which the amounts are changes."""
         return self.reference or self.source
 
+    @property
+    def told_of(self) -> str:
+        """What the amounts are changes of: the file, or that as pictures of before correct it."""
+        return f"{self.watched} since pictures {self.baseline[:8]}" if self.baseline else self.watched
+
     @classmethod
     def of_check(
         cls,
@@ -75,6 +83,7 @@ class HistoryEntry:
         *,
         reference: Path | None = None,
         digest: str = "",
+        baseline: str = "",
         temperature_c: float | None = None,
         now: datetime | None = None,
     ) -> HistoryEntry:
@@ -97,6 +106,7 @@ class HistoryEntry:
             source=source.as_posix(),
             reference="" if reference is None else reference.as_posix(),
             digest=digest,
+            baseline=baseline,
             holds=check.holds,
             chance=check.chance,
             verdict=_verdict(check),
@@ -132,16 +142,18 @@ class Edition:
 
 
 def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
-    """Return the calibrations of which entries (by date) are changes: a file that was overwritten is another one.
+    """Return the calibrations of which entries (by date) are changes: a file that was overwritten is another one, and
+    so is one corrected by pictures of before.
     Entries that do not say what it held are taken for changes of what it held before, or first."""
     found: dict[tuple[str, str], list[HistoryEntry]] = {}
     latest: dict[str, str] = {}
     for entry in entries:
-        before = latest.get(entry.watched, "")
-        now = latest[entry.watched] = entry.digest or before
-        if before == "" and (entry.watched, "") in found:
-            found[entry.watched, now] = found.pop((entry.watched, ""))
-        found.setdefault((entry.watched, now), []).append(entry)
+        whose = entry.told_of
+        before = latest.get(whose, "")
+        now = latest[whose] = entry.digest or before
+        if before == "" and (whose, "") in found:
+            found[whose, now] = found.pop((whose, ""))
+        found.setdefault((whose, now), []).append(entry)
     files = [watched for watched, _ in found]
     return tuple(
         Edition(watched, digest, tuple(own), files.count(watched) > 1) for (watched, digest), own in found.items()
@@ -224,9 +236,9 @@ def _entry(data: Any) -> HistoryEntry:
     if not (0.0 <= chance <= 1.0 and isinstance(holds, bool)):
         raise ValueError("chance is from 0 to 1, holds true or false")
     texts = {name: data.pop(name) for name in ("date", "kind", "source", "verdict")}
-    texts |= {name: data.pop(name, "") for name in ("reference", "digest")}
+    texts |= {name: data.pop(name, "") for name in ("reference", "digest", "baseline")}
     if not all(isinstance(text, str) for text in texts.values()):
-        raise ValueError("date, kind, source, reference, digest and verdict are words")
+        raise ValueError("date, kind, source, reference, digest, baseline and verdict are words")
     if not datetime.fromisoformat(texts["date"]).year > 1:
         raise ValueError("its date is of the year 1")
     frames, rms_px = whole(data.pop("frames")), real(data.pop("rms_px"))

@@ -36,7 +36,7 @@ from rigkit.planning.goal import Goal
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
-from rigkit.validation.sentinel.whitened import NULL_RANK
+from rigkit.validation.sentinel.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500
 MIN_FRAME_MATCHES = 40
@@ -52,8 +52,6 @@ MATCHES_OF_DIRECTION = 5
 """A fit follows one direction for so many matches, those that move them most: what is left of fewer tells no scatter.
 SIMULATED, 6 to 24 directions, none to a quarter of the matches wrong: of 1.5 matches a direction 5 % of the scatters
 found are below a twentieth of what is true, of 3 below two thirds, of 5 none are below half."""
-MIN_FREE_VARIANCE = 1e-3
-"""Of the variance of a match, what the fit leaves at least."""
 REACH_SIGMAS = 0.2
 """Derivatives are differences over this part of the standard deviations of theta."""
 
@@ -75,6 +73,14 @@ def check_scene(
 
     Raises DegenerateError where too few matches are found.
     """
+    return check_matches(watched, matches_of_scenes(watched, frames, progress=progress), cost)
+
+
+def matches_of_scenes(
+    watched: Watched, frames: Sequence[Sequence[Any]], *, progress: Progress = silent
+) -> list[PairMatches]:
+    """Return the matches of the first camera with each other one in images of textured scenes, one a camera in every
+    frame; frames with too few are left out."""
     found = []
     for k, images in enumerate(frames):
         progress("matches", k, len(frames))
@@ -86,7 +92,7 @@ def check_scene(
             if len(matches.pixels1) >= MIN_FRAME_MATCHES:
                 found.append(matches)
     progress("matches", len(frames), len(frames))
-    return check_matches(watched, found, cost)
+    return found
 
 
 def scene_matches(watched: Watched, numbers: tuple[int, int], image1: Any, image2: Any) -> PairMatches:
@@ -119,19 +125,19 @@ def straightened(watched: Watched, numbers: tuple[int, int], found: Corresponden
 
 
 def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return the verdict on matches of a rig's cameras.
+    """Return the verdict on matches of a rig's cameras; raises as `matches_say`."""
+    return judge_evidence(watched, lambda now: matches_say(now, matches), cost)
 
-    Raises DegenerateError where there are too few.
+
+def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
+    """Return what matches of a rig's cameras say of theta.
+
+    Raises DegenerateError where there are none, or the lenses see none of them.
     """
     if not matches:
         raise DegenerateError(
             f"check: less than {MIN_FRAME_MATCHES} matches in every frame; show the rig a scene with texture and depth"
         )
-    return judge_evidence(watched, lambda now: matches_say(now, matches), cost)
-
-
-def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
-    """Return what matches of a rig's cameras say of theta."""
     layout = watched.layout
     n = layout.count
     information, scores, variances, disagreements = [], [], [], []
@@ -147,10 +153,11 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         np.add.at(score, by_part, -(weight * residual)[:, None] * jacobian)
         information.append(own.sum(axis=0))
         scores.append(score.sum(axis=0))
-        disagreement, free = _disagreement(own / sigma**2, score / sigma**2)
-        disagreements.append(disagreement)
-        variances.append(sigma**2 * disagreement)
-        freedom += free
+        ratio, free = disagreement(own / sigma**2, score / sigma**2)
+        disagreements.append(ratio)
+        variances.append(sigma**2 * ratio)
+        # Parts that err as a whole count once each.
+        freedom += min(free, np.count_nonzero(own.any(axis=(1, 2))) - 1.0)
         squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
         left_squares += float((weight * left**2).sum())
     usual = float(np.median(variances))
@@ -263,26 +270,3 @@ def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:
     """Return the number of the part of the image in which each of `pixels` (N, 2) lies."""
     place = np.clip((pixels + 0.5) / np.array(size_px) * PARTS, 0, PARTS - 1).astype(np.int64)
     return np.asarray(place[:, 1] * PARTS + place[:, 0])
-
-
-def _disagreement(information: FloatArray, score: FloatArray) -> tuple[float, float]:
-    """Return by how much more the parts (K, T, T), (K, T) of an image scatter than independent matches would, as a
-    ratio of variances, at least 1, and its degrees of freedom; what all have in common is left out."""
-    whole = information.sum(axis=0)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
-    seen = values > NULL_RANK * values[-1]
-    root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
-    common = root @ (root.T @ score.sum(axis=0))
-    left = (score - information @ common) @ root
-    # What all have in common follows each part by its share: what is left of part k and l has the covariance
-    # (k == l) B_k - B_k B_l with B the shares. The sum of its squares counts as so many values (Satterthwaite), and
-    # parts that err as a whole count once each.
-    shares = root.T @ information @ root
-    squares = shares @ shares
-    common = squares.sum(axis=0)
-    expected = max(root.shape[1] - float(np.trace(common)), MIN_FREE_VARIANCE)
-    spread = float(np.trace(common) - 2.0 * (squares * shares).sum() + (common**2).sum())
-    used = np.count_nonzero(shares.any(axis=(1, 2)))
-    freedom = min(expected**2 / max(spread, MIN_FREE_VARIANCE), used - 1.0)
-    return float(max(1.0, (left**2).sum() / expected)), freedom

@@ -88,6 +88,16 @@ class Change:
         return f"{self.hypothesis.words}: {values}"
 
 
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """What frames of the time when a calibration was trusted say of it: how many there were, and how far their points
+    lie from where it has them, rms in px, as it is and once it is corrected to them."""
+
+    frames: int
+    rms_px: float
+    rms_corrected_px: float
+
+
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class SentinelCheck:
     """The verdict on fresh pictures.
@@ -106,6 +116,7 @@ class SentinelCheck:
     cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
     flipped : how the pictures must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
         explanation, or was not asked.
+    baseline : what was wrong before; `watched` is without it. None where fresh frames are held against the file.
     """
 
     chance: float
@@ -124,6 +135,7 @@ class SentinelCheck:
     cost: float = 0.0
     cost_unit: str = "px"
     flipped: str = ""
+    baseline: Baseline | None = None
 
     @property
     def unexplained(self) -> bool:

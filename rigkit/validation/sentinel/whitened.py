@@ -21,6 +21,8 @@ COMMON_FREEDOM = 10.0
 board bend in some ways more than in others. Where measured, the variances of directions scatter around their mean by
 about half of it, as a mean square of so many values does."""
 NULL_RANK = 1e-9
+MIN_FREE_VARIANCE = 1e-3
+"""Of the variance of a match, what the fit leaves at least."""
 MAX_CONDITION_NUMBER = 1e15
 """Of a covariance that rounding leaves something of."""
 
@@ -62,3 +64,24 @@ class Whitened:
             for known in (watched, evidence)
         )
         return cls(own, covariance, left.T, freedom)
+
+
+def disagreement(information: FloatArray, score: FloatArray) -> tuple[float, float]:
+    """Return by how much more the parts (K, T, T), (K, T) of an image scatter than independent matches would, as a
+    ratio of variances, at least 1, and its degrees of freedom; what all have in common is left out."""
+    whole = information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(whole * scale[:, None] * scale)
+    seen = values > NULL_RANK * values[-1]
+    root = vectors[:, seen] * scale[:, None] / np.sqrt(values[seen])
+    common = root @ (root.T @ score.sum(axis=0))
+    left = (score - information @ common) @ root
+    # What all have in common follows each part by its share: what is left of part k and l has the covariance
+    # (k == l) B_k - B_k B_l with B the shares. The sum of its squares counts as so many values (Satterthwaite).
+    shares = root.T @ information @ root
+    squares = shares @ shares
+    common = squares.sum(axis=0)
+    expected = max(root.shape[1] - float(np.trace(common)), MIN_FREE_VARIANCE)
+    spread = float(np.trace(common) - 2.0 * (squares * shares).sum() + (common**2).sum())
+    freedom = max(expected**2 / max(spread, MIN_FREE_VARIANCE), 1.0)
+    return float(max(1.0, (left**2).sum() / expected)), freedom

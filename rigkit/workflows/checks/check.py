@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -40,17 +40,18 @@ from rigkit.io.media.images import read_image_of
 from rigkit.report.check_page import check_facts, check_page
 from rigkit.report.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
-from rigkit.validation.sentinel.epipolar import check_scene
-from rigkit.validation.sentinel.evidence import FreshView, Watched
+from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.epipolar import matches_of_scenes, matches_say
+from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
 from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
-from rigkit.validation.sentinel.judge import SentinelCheck, check_views
+from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera, with_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import camera_format, camera_text, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.inputs.paths import NamesFiles
-from rigkit.workflows.outputs.provenance import digest_line, digest_of, software_facts
+from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +60,9 @@ class CheckOptions(NamesFiles):
 
     boards: tuple[Board, ...] = ()
     """Boards that may be in the pictures; (): those of the calibration."""
+    before: tuple[Path, ...] = ()
+    """Images of the time when the calibration was trusted, given as the fresh ones are: what they show of it already
+    is no change. (): fresh images are held against the file."""
     scene: bool = False
     """The pictures show any textured scene instead of boards (rigs)."""
     length: Task | None = None
@@ -110,45 +114,39 @@ def check_pictures(
         )
     watched, known = load_watched(source)
     warn_if_bad(source)
-    frames = _frames(watched, [Path(image) for image in images])
-    inputs = [source, *(image for frame in frames for image in frame)]
+    if not images:
+        raise InputError("check: give fresh images, or a folder of them")
+    now = _frames(watched, [Path(image) for image in images])
+    before = _frames(watched, options.before) if options.before else []
+    inputs = [source, *(image for frame in (*now, *before) for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
         ensure_register(options.history, inputs, options.temperature_c)
+    both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
+    if both:
+        raise InputError(f"check: '{min(both)}' is both a fresh image and one of before")
     goals = [] if options.length is None else length_goals(watched.cameras, watched.cam_from_rig, options.length)
-    left_out: list[tuple[str, str]] = []
-    unreadable: list[str] = []
-    if options.scene:
-        if len(watched.cameras) < 2:
-            raise InputError("check: a scene without boards tells of a rig only; one camera needs pictures of a board")
-        read = [_read(watched, source, frame, unreadable) for frame in frames]
-        with about(source):
-            check = check_scene(watched, [images for images in read if images], goals, progress=progress)
-    else:
-        boards = options.boards or known
-        if not boards:
-            raise InputError(f"check: '{source}' does not say what boards there are; give --board 9x6x25")
-        with about(source):
-            seen = _boards_seen(watched, source, frames, boards, unreadable, progress)
-            wrong = other_size({name: found for own in seen for name, found in own.items()}, boards, known)
-            if wrong is not None:
-                raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
-            views = _views(watched, frames, seen, boards, left_out)
-            if not views:
-                raise InputError(f"check: {_nothing_to_check(left_out, unreadable, boards)}")
-            check = check_views(watched, views, goals)
-            if not check.holds:
-                check = replace(check, flipped=flipped_pictures(watched, views))
-                _require_right_order(check, views)
+    pictures = _Pictures(source=source, watched=watched, boards=options.boards or known, known=known, progress=progress)
+    with about(source):
+        look, views = pictures.seen(now, scene=options.scene)
+        if before:
+            check = judge_since(watched, pictures.seen(before, scene=options.scene)[0], look, goals)
+        else:
+            check = judge_evidence(watched, look, goals)
+        if views and not check.holds:
+            check = replace(check, flipped=flipped_pictures(check.watched, views))
+            _require_right_order(check, views)
     files = _files(source, check, options)
     write_together(files, force=options.force)
     if options.history is not None:
-        place = as_seen_from(options.history, source)
-        entry = HistoryEntry.of_check(check, place, digest=digest_of(source), temperature_c=options.temperature_c)
-        add_entry(options.history, entry)
+        _register(options.history, source, check, before, options.temperature_c)
     written = (*files, *([options.history] if options.history is not None else []))
     return CheckedPictures(
-        check=check, facts=check_facts(check), left_out=tuple(left_out), unreadable=tuple(unreadable), written=written
+        check=check,
+        facts=check_facts(check),
+        left_out=tuple(pictures.left_out),
+        unreadable=tuple(pictures.unreadable),
+        written=written,
     )
 
 
@@ -163,6 +161,16 @@ def _files(source: Path, check: SentinelCheck, options: CheckOptions) -> dict[Pa
         facts = {source.name: digest_line(source), **software_facts()}
         files[options.report] = check_page(check, f"Check of {source.name}", facts)
     return files
+
+
+def _register(
+    register: Path, source: Path, check: SentinelCheck, before: Sequence[Sequence[Path]], temperature_c: float | None
+) -> None:
+    # Of words that say how it is computed, the digest.
+    told = (digest_of_images([image for frame in before for image in frame]) or "").rpartition(": ")[2]
+    place = as_seen_from(register, source)
+    entry = HistoryEntry.of_check(check, place, digest=digest_of(source), baseline=told, temperature_c=temperature_c)
+    add_entry(register, entry)
 
 
 def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
@@ -198,8 +206,6 @@ def _watched_rig(known: SavedRig, source: Path) -> Watched:
 def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     """Return the images of every moment, one a camera."""
     count = len(watched.cameras)
-    if not sources:
-        raise InputError("check: give fresh images, or a folder of them")
     if count == 1:
         return [[image] for image in images_in(sources)]
     if all(source.is_dir() for source in sources):
@@ -222,40 +228,65 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     return [images[k : k + count] for k in range(0, len(images), count)]
 
 
-def _read(watched: Watched, source: Path, frame: Sequence[Path], unreadable: list[str]) -> list[Any]:
-    """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
-    images = [_image_of(camera, source, path, unreadable) for camera, path in zip(watched.cameras, frame, strict=True)]
-    return [] if any(image is None for image in images) else images
+@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+class _Pictures:
+    """Pictures of the cameras watched, by the boards that may be in them and those `known` to the file `source`, with
+    what was left out of them, and what could not be used, so far."""
 
+    source: Path
+    watched: Watched
+    boards: Sequence[Board]
+    known: Sequence[Board]
+    progress: Progress
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
 
-def _image_of(camera: Camera, source: Path, path: Path, unreadable: list[str]) -> Any:
-    """Return an image of the camera; None where it cannot be used, which goes to `unreadable`."""
-    try:
-        return read_image_of(path, camera.size_px, source)
-    except InputError as error:
-        unreadable.append(str(error))
-        return None
+    def seen(self, frames: Sequence[Sequence[Path]], *, scene: bool) -> tuple[Look, list[FreshView]]:
+        """Return what frames say, given cameras, and the boards in them; none of a scene."""
+        if scene:
+            if len(self.watched.cameras) < 2:
+                raise InputError(
+                    "check: a scene without boards tells of a rig only; one camera needs pictures of a board"
+                )
+            read = [self._read(frame) for frame in frames]
+            matches = matches_of_scenes(self.watched, [images for images in read if images], progress=self.progress)
+            return (lambda now: matches_say(now, matches)), []
+        if not self.boards:
+            raise InputError(f"check: '{self.source}' does not say what boards there are; give --board 9x6x25")
+        found = self._boards_seen(frames)
+        wrong = other_size({name: own for each in found for name, own in each.items()}, self.boards, self.known)
+        if wrong is not None:
+            raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
+        views = _views(self.watched, frames, found, self.boards, self.left_out)
+        if not views:
+            raise InputError(f"check: {_nothing_to_check(self.left_out, self.unreadable, self.boards)}")
+        return (lambda now: evidence_of(now, views)), views
 
+    def _read(self, frame: Sequence[Path]) -> list[Any]:
+        """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
+        images = [self._image(camera, path) for camera, path in zip(self.watched.cameras, frame, strict=True)]
+        return [] if any(image is None for image in images) else images
 
-def _boards_seen(
-    watched: Watched,
-    source: Path,
-    frames: Sequence[Sequence[Path]],
-    boards: Sequence[Board],
-    unreadable: list[str],
-    progress: Progress,
-) -> list[dict[str, Sequence[BoardDetection]]]:
-    """Return of every camera what each of its images shows; why one cannot be used goes to `unreadable`."""
-    total = sum(len(frame) for frame in frames)
-    seen: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in watched.cameras]
-    for k, frame in enumerate(frames):
-        for c, path in enumerate(frame):
-            progress("corners", k * len(frame) + c, total)
-            image = _image_of(watched.cameras[c], source, path, unreadable)
-            if image is not None:
-                seen[c][str(path)] = detect_boards(image, boards, camera=far_camera(watched.cameras[c]))
-    progress("corners", total, total)
-    return seen
+    def _image(self, camera: Camera, path: Path) -> Any:
+        """Return an image of the camera; None where it cannot be used, which goes to `unreadable`."""
+        try:
+            return read_image_of(path, camera.size_px, self.source)
+        except InputError as error:
+            self.unreadable.append(str(error))
+            return None
+
+    def _boards_seen(self, frames: Sequence[Sequence[Path]]) -> list[dict[str, Sequence[BoardDetection]]]:
+        """Return of every camera what each of its images shows; why one cannot be used goes to `unreadable`."""
+        total, cameras = sum(len(frame) for frame in frames), self.watched.cameras
+        found: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in cameras]
+        for k, frame in enumerate(frames):
+            for c, path in enumerate(frame):
+                self.progress("corners", k * len(frame) + c, total)
+                image = self._image(cameras[c], path)
+                if image is not None:
+                    found[c][str(path)] = detect_boards(image, self.boards, camera=far_camera(cameras[c]))
+        self.progress("corners", total, total)
+        return found
 
 
 def _views(
@@ -315,9 +346,12 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
 def fixed_text(source: Path, check: SentinelCheck) -> str:
     """Return the file `source` with the change that explains the pictures, and a finding that says so."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
-    fixed, own = check.fixed, check.watched.of_models
+    watched = load_watched(source)[0]
+    # Of a change since pictures of before, that alone.
+    fixed, own = watched.changed(check.step), watched.of_models
+    since = "" if check.baseline is None else f" beside {check.baseline.frames} of before"
     said = Finding.look(
-        f"corrected from {check.frames} fresh frames: {check.change}; views and residuals are older",
+        f"corrected from {check.frames} fresh frames{since}: {check.change}; views and residuals are older",
         "calibrate anew when there is time",
     )
     # What the lenses may do beyond their models the file says by itself; nothing that happens changes a pupil.

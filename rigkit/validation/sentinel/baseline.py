@@ -1,0 +1,88 @@
+"""What moved since a calibration was trusted: pictures of then correct it, and fresh ones are held against that.
+
+With C the covariance of theta, and w = L^T e + noise the whitened score of pictures of before (`whitened`), theta was
+off by e = G w then, G = C L (I + L^T C L)^-1: that is taken back, and what is left open, P = G G^T + (I - G L^T) C
+(I - G L^T)^T, is the scatter of these pictures, and C where they show nothing. A file may be off by more than C says: C
+counts as many times as what they show of it beyond chance, w^T (I + L^T C L)^-1 w - R, so that it is off by no more in
+any direction. And frames of one camera may disagree by more than their points tell (what lens and scene share in each):
+by how much those of before do among themselves, and the fresh ones, counts against all.
+
+Reference: Y. Bar-Shalom, X.-R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001),
+section 5.2.3 (the gain, and the covariance as a sum that cannot become negative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.planning.goal import Goal
+from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.judge import Baseline, Look, SentinelCheck, judge_evidence
+from rigkit.validation.sentinel.whitened import Whitened, disagreement
+
+CORRECTIONS = 4
+"""Times that the correction is linearised anew: published lenses are off by up to 2 px."""
+
+
+def judge_since(watched: Watched, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+    """Return the verdict on what `look` finds in fresh frames, against the cameras as what `before` finds in frames of
+    the time when they were trusted corrects them.
+
+    Raises DegenerateError where the frames of before do not go together with the cameras at all.
+    """
+    trusted, now, change = watched, watched, np.zeros(watched.layout.count)
+    first = said = before(watched)
+    for k in range(CORRECTIONS):
+        said = before(now)
+        wider = _Disagreement.of(said, look(now))
+        whitened = Whitened.of(trusted, wider.of_frames(said))
+        if k == 0:
+            score = whitened.score
+            beyond = float(score @ np.linalg.solve(whitened.covariance, score)) - len(score)
+            trusted = replace(watched, covariance=max(beyond, 1.0) * watched.covariance)
+            whitened = Whitened.of(trusted, wider.of_frames(said))
+        gain = np.linalg.solve(whitened.covariance, whitened.by_theta @ trusted.covariance).T
+        change = gain @ (whitened.score + whitened.by_theta @ change)
+        now = watched.changed(change)
+    left = np.eye(len(change)) - gain @ whitened.by_theta
+    corrected = replace(now, covariance=gain @ gain.T + left @ trusted.covariance @ left.T)
+    check = judge_evidence(corrected, lambda now: wider.of_frames(look(now)), cost)
+    return replace(check, baseline=Baseline(len(first.score), first.rms_px, before(corrected).rms_px))
+
+
+@dataclass(frozen=True, slots=True)
+class _Disagreement:
+    """By how much more frames disagree than their points tell, a ratio of variances, and its degrees of freedom."""
+
+    ratio: float
+    freedom: float
+
+    @classmethod
+    def of(cls, *times: FreshEvidence) -> _Disagreement:
+        """Return that of frames of several times, between which something may have changed."""
+        count = times[0].score.shape[1]
+        information, score = [], []
+        for k, said in enumerate(times):
+            own = slice(k * count, (k + 1) * count)
+            each = (
+                np.zeros((len(said.score), len(times) * count, len(times) * count)),
+                np.zeros((len(said.score), len(times) * count)),
+            )
+            each[0][:, own, own], each[1][:, own] = said.information / said.variance_px2, said.score / said.variance_px2
+            information.append(each[0])
+            score.append(each[1])
+        return cls(*disagreement(np.concatenate(information), np.concatenate(score)))
+
+    def of_frames(self, said: FreshEvidence) -> FreshEvidence:
+        """Return what frames say, counted so much less."""
+        if self.ratio <= 1.0:
+            return said
+        return replace(
+            said,
+            variance_px2=self.ratio * said.variance_px2,
+            overdispersion=float(np.sqrt(self.ratio)) * said.overdispersion,
+            freedom=min(self.freedom, said.freedom),
+        )

@@ -1,0 +1,133 @@
+"""What moved since pictures of before: what was wrong already is no change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.calibration_scenes import lens, noisy_view
+from helpers.sentinel_scenes import NOISE_PX, poses_held
+
+from rigkit.cameras.base import Camera
+from rigkit.core.arrays import FloatArray
+from rigkit.geometry.rigid3 import Rigid3
+from rigkit.geometry.rotation import exp_so3
+from rigkit.report.check_page import check_facts
+from rigkit.validation.sentinel.baseline import judge_since
+from rigkit.validation.sentinel.epipolar import PairMatches, matches_say
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.judge import Look, judge_evidence
+
+MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
+MATCH_NOISE_PX = 0.1
+WRONG_DEG, TURN_DEG = 0.1, 0.05
+BEFORE, FRESH = 9, 3
+
+
+def _turned(pose: Rigid3, degrees: float) -> Rigid3:
+    turn = exp_so3(np.radians([degrees, 0.0, 0.0]))
+    return Rigid3(turn @ pose.rotation, turn @ pose.translation_mm)
+
+
+def _file() -> Watched:
+    """A rig whose file is off: by 0.3 % of the left focus and a tenth of a degree, 15 and 87 of its sigmas."""
+    camera = lens("wide")
+    longer = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, 1.003, 1.0))
+    sigmas = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
+    return Watched(
+        names=("left", "right"),
+        cameras=(longer, camera),
+        cam_from_rig=(Rigid3.identity(), _turned(MOUNT, WRONG_DEG)),
+        covariance=np.diag([*sigmas, *sigmas, *[2e-5] * 3, *[0.01] * 3]) ** 2,
+        sigma_px=NOISE_PX,
+        freedom=20.0,
+    )
+
+
+def _scene(pose: Rigid3, rng: np.random.Generator) -> PairMatches:
+    camera = lens("wide")
+    rays, valid = camera.unproject(rng.uniform([100.0, 100.0], [1500.0, 1100.0], (300, 2)))
+    points = rays[valid] * rng.uniform(700.0, 4000.0, (int(valid.sum()), 1))
+    pixels1, seen1 = camera.project(points)
+    pixels2, seen2 = camera.project(pose.apply(points))
+    both = seen1 & seen2 & camera.on_image(pixels2)
+    noisy = [p[both] + MATCH_NOISE_PX * rng.standard_normal((int(both.sum()), 2)) for p in (pixels1, pixels2)]
+    return PairMatches(0, 1, *noisy)
+
+
+def _scenes(pose: Rigid3, count: int, rng: np.random.Generator) -> Look:
+    matches = [_scene(pose, rng) for _ in range(count)]
+    return lambda now: matches_say(now, matches)
+
+
+def _boards(camera: Camera, rng: np.random.Generator, which: slice) -> Look:
+    poses = poses_held("reg", BEFORE + FRESH)[which]
+    views = [FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
+    return lambda now: evidence_of(now, views)
+
+
+def test_a_rig_that_never_held_is_checked_for_what_moved_since() -> None:
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
+        assert not judge_evidence(_file(), same).holds
+        quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
+        assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
+        assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
+        assert check_facts(quiet).headline.startswith("Nothing moved since")
+        assert not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
+        sigmas = check.change.sigmas
+        assert check.change.amounts == pytest.approx([TURN_DEG, 0.0, 0.0], abs=4.0 * float(sigmas.max()))
+        assert sigmas[0] < 0.1 * TURN_DEG
+        assert check_facts(check).headline.startswith("Moved since (")
+
+
+def _known(focus: float) -> tuple[Camera, Watched]:
+    """A lens, and its file, that is off by a focal length so many times as long."""
+    camera = lens("reg")
+    wrong = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, focus, 1.0))
+    sigmas: FloatArray = np.array([0.3, 0.3, 0.3, 0.3, *[1e-3] * (camera.parameters.size - 4)])
+    file = Watched(
+        names=("cam",),
+        cameras=(wrong,),
+        cam_from_rig=(Rigid3.identity(),),
+        covariance=np.diag(sigmas**2),
+        sigma_px=NOISE_PX,
+        freedom=20.0,
+    )
+    return camera, file
+
+
+def test_a_lens_whose_file_is_off_is_checked_for_what_moved_since() -> None:
+    camera, file = _known(1.01)
+    longer = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, 1.001, 1.0))
+    fresh = slice(BEFORE, None)
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        before, same, moved = (
+            _boards(c, rng, which) for c, which in ((camera, slice(BEFORE)), (camera, fresh), (longer, fresh))
+        )
+        assert not judge_evidence(file, same).holds
+        assert judge_since(file, before, same).holds
+        check = judge_since(file, before, moved)
+        assert not check.holds and check.change is not None and check.change.hypothesis.kind == "focus"
+        assert check.change.amounts == pytest.approx([0.1], abs=4.0 * float(check.change.sigmas[0]))
+
+
+def test_frames_that_disagree_count_less() -> None:
+    """Every frame errs as a whole: unchanged cameras must not alarm, as often as they say."""
+    camera, file = _known(1.0)
+
+    def erring(count: int, rng: np.random.Generator) -> Look:
+        own = rng.standard_normal((count, camera.parameters.size)) * np.sqrt(np.diag(file.covariance))
+
+        def look(now: Watched) -> FreshEvidence:
+            said = told(now)
+            return replace(said, score=said.score + np.einsum("nij,nj->ni", said.information, own))
+
+        told = _boards(camera, rng, slice(count))
+        return look
+
+    checks = [judge_since(file, erring(4, rng), erring(4, rng)) for rng in map(np.random.default_rng, range(3))]
+    assert all(check.holds for check in checks)
