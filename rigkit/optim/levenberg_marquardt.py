@@ -142,15 +142,18 @@ def minimise(
 def damped_step(jacobian: FloatArray, residual: FloatArray, damping: float) -> DenseStep | None:
     """Return the step (U,) that lessens residuals (M,) with the derivatives (M, U), by the damped normal equations.
 
-    The columns are scaled to length one first, so that `damping` is the share of the diagonal of J^T J that is added to
-    it (Marquardt); a column of zeros does not move. None where the system is singular all the same.
+    The unknowns are scaled so that the columns have length one: `damping` is the share of the diagonal of J^T J that is
+    added to it (Marquardt). What a column of zeros is of does not move. None where the system is singular all the same.
     """
-    size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    scaled = jacobian / size
+    normal = jacobian.T @ jacobian
+    size = np.maximum(np.sqrt(np.diag(normal)), 1e-300)
+    normal = normal / size / size[:, None]
+    normal.flat[:: len(size) + 1] += damping
+    gradient = (jacobian.T @ residual) / size
     try:
-        change = np.linalg.solve(scaled.T @ scaled + damping * np.eye(size.size), -(scaled.T @ residual))
+        change = np.linalg.solve(normal, -gradient)
     except np.linalg.LinAlgError:
         return None
     # Decrease of the undamped model |r + J h|^2 for the damped step: h^T (mu h - J^T r).
-    predicted = float(change @ (damping * change - scaled.T @ residual))
+    predicted = float(change @ (damping * change - gradient))
     return DenseStep(np.asarray(change / size), predicted)

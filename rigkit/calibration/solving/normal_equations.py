@@ -144,11 +144,12 @@ class NormalEquations:
         system[p:, :p] = system[:p, p:].T
         blocks = system[p:, p:].reshape(views, 6, views, 6)
         blocks[np.arange(views), :, np.arange(views), :] = _damped(self.pp, damping_p)
-        coupling = np.concatenate([self.gg[:p, p:], np.moveaxis(self.gp[:, p:], 1, 2).reshape(-1, 3 * count)])
-        back = np.einsum("amk,mkl->aml", coupling.reshape(-1, count, 3), inverse).reshape(len(coupling), -1)
-        rhs = np.concatenate([self.g[:p], self.p.ravel()]) - back @ self.g[p:]
-        step = _solve_positive(system - back @ coupling.T, rhs)
-        points = (inverse @ (self.g[p:] - coupling.T @ step).reshape(count, 3, 1)).reshape(-1)
+        # One long row for each coordinate of a point: its block multiplies three rows at once.
+        coupling = np.concatenate([self.gg[p:, :p], np.moveaxis(self.gp[:, p:], 0, 1).reshape(3 * count, -1)], axis=1)
+        back = (inverse @ coupling.reshape(count, 3, -1)).reshape(coupling.shape)
+        rhs = np.concatenate([self.g[:p], self.p.ravel()]) - self.g[p:] @ back
+        step = _solve_positive(system - coupling.T @ back, rhs)
+        points = (inverse @ (self.g[p:] - coupling @ step).reshape(count, 3, 1)).reshape(-1)
         return np.concatenate([step[:p], points]), step[p:].reshape(views, 6)
 
     @property
