@@ -61,9 +61,9 @@ from rigkit.reconstruction.scene import SceneReconstruction as SceneReconstructi
 from rigkit.reconstruction.scene import reconstruct_scene as reconstruct_scene
 from rigkit.rectification.rectify import rectify_map as rectify_map
 from rigkit.relative_pose.solvers.registry import fundamental_for as fundamental_for
-from rigkit.report.calibration_page import CalibrationSection as CalibrationSection
-from rigkit.report.calibration_page import build_calibration_page as build_calibration_page
 from rigkit.report.notebook import notebook_progress as notebook_progress
+from rigkit.report.pages.calibration_page import CalibrationSection as CalibrationSection
+from rigkit.report.pages.calibration_page import build_calibration_page as build_calibration_page
 from rigkit.validation.certificate.contracts import Quantity as Quantity
 from rigkit.validation.certificate.contracts import Task as Task
 from rigkit.validation.checks import ValidationReport as ValidationReport

@@ -23,7 +23,7 @@ from rigkit.cameras.pinhole import Pinhole
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.sampson import epipolar_normals
 from rigkit.io.schema import SCHEMAS, key_rows, schema_text
-from rigkit.report.calibration_drawings import uncertainty_svg
+from rigkit.report.pages.calibration_drawings import uncertainty_svg
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ROOT / "docs" / "pages"

@@ -12,14 +12,14 @@ from rigkit.core.findings import gravest_first
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration, Candidate
     from rigkit.core.boards import Board
-    from rigkit.report.page_facts import PageFacts
+    from rigkit.report.pages.page_facts import PageFacts
 
 MAX_NAMED = 3
 
 
 def page(calibration: Calibration, boards: Sequence[Board]) -> PageFacts:
     """Return what the page says of one camera, with the pictures of `boards` to take next where any are to be found."""
-    from rigkit.report.calibration_facts import camera_facts
+    from rigkit.report.pages.calibration_facts import camera_facts
     from rigkit.workflows.calibration.next_pictures import next_views
 
     try:
@@ -49,7 +49,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 def describe(calibration: Calibration) -> str:
     """Return the result for a person: the headline first."""
     from rigkit.rectification.targets import field_across
-    from rigkit.report.calibration_facts import focal_words, training_note
+    from rigkit.report.pages.calibration_facts import focal_words, training_note
     from rigkit.report.tables import rounded_parameters
 
     camera = calibration.camera

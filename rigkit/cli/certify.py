@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note_written, options_of, print_json, print_statement
     from rigkit.core.errors import ExitCode, InputError
-    from rigkit.report.certificate_page import basis, causes_table
+    from rigkit.report.pages.certificate_page import basis, causes_table
     from rigkit.report.tables import tables_to_text
     from rigkit.validation.certificate.contracts import Quantity, Task
     from rigkit.workflows.checks.certify import CertifyOptions, certify_file

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, note_written, options_of, print_json, print_statement, progress_on_stderr
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
-    from rigkit.report.check_page import check_table, check_to_dict
+    from rigkit.report.pages.check_page import check_table, check_to_dict
     from rigkit.report.tables import tables_to_text
     from rigkit.workflows.checks.check import CheckOptions, check_pictures
 

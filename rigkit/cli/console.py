@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from rigkit.core.arrays import FloatArray
     from rigkit.geometry.rigid3 import Rigid3
-    from rigkit.report.page_facts import PageFacts
+    from rigkit.report.pages.page_facts import PageFacts
 
 Options = TypeVar("Options")
 REDRAW_S = 0.1

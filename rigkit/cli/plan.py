@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note_written, print_json
     from rigkit.core.printing import counted
-    from rigkit.report.plan_page import plan_facts, plan_lead, plan_to_dict, plan_words
+    from rigkit.report.pages.plan_page import plan_facts, plan_lead, plan_to_dict, plan_words
     from rigkit.report.tables import tables_to_text
 
     done = _planned(args)

@@ -13,13 +13,13 @@ from rigkit.core.printing import length_words
 if TYPE_CHECKING:
     from rigkit.calibration.rig.result import RigCalibration
     from rigkit.io.manifests.rig_session import RigSession
-    from rigkit.report.page_facts import PageFacts
+    from rigkit.report.pages.page_facts import PageFacts
     from rigkit.validation.check import Check
 
 
 def page(rig: RigCalibration, checks: Sequence[Check], session: RigSession) -> PageFacts:
     """Return what the page says of a rig, and of each camera, calibrated as its session asks for."""
-    from rigkit.report.calibration_facts import rig_facts
+    from rigkit.report.pages.calibration_facts import rig_facts
     from rigkit.workflows.calibration.calibrate_rig import shown_cameras
 
     shown = shown_cameras(rig, session)

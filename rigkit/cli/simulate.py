@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from rigkit.cli.console import note, options_of, print_json, progress_on_stderr
     from rigkit.core.errors import ExitCode
-    from rigkit.report.study_page import study_tables
+    from rigkit.report.pages.study_page import study_tables
     from rigkit.report.tables import tables_to_markdown
     from rigkit.workflows.study import StudyOptions, run_studies
 

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
     """Print what a data set came to, of which the files are in `out`; return the exit code."""
+    from rigkit.report.pages.validation_page import summary_table
     from rigkit.report.tables import tables_to_text
-    from rigkit.report.validation_page import summary_table
 
     if json:
         result = {
@@ -64,7 +64,7 @@ def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> i
 
 
 def _say_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
-    from rigkit.report.validation_verdict import failed_facts
+    from rigkit.report.pages.validation_verdict import failed_facts
 
     for fact in failed_facts(reports, compared):
         print(" ".join(filter(None, [fact.what, fact.pair_id, ",".join(fact.methods), fact.words])))

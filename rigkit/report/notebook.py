@@ -19,8 +19,8 @@ from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report import svg
+from rigkit.report.pictures.scene_view import boards_scene, rig_scene, scene_of
 from rigkit.report.rig_tables import rig_reach
-from rigkit.report.scene_view import boards_scene, rig_scene, scene_of
 from rigkit.report.tables import measured_words
 
 SCENE_WIDTH, SCENE_HEIGHT, SCENE_RIM = 420.0, 300.0, 14.0

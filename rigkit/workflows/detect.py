@@ -28,7 +28,7 @@ from rigkit.io.corners.corners_file import write_corners
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.io.media.images import Image, images_of_folder, name_unread, no_images, read_image, read_image_of
 from rigkit.io.media.video import is_video
-from rigkit.report.overlay import draw_boards
+from rigkit.report.pictures.overlay import draw_boards
 from rigkit.workflows.inputs.camera_files import import_camera
 from rigkit.workflows.inputs.frames import VideoFrames, frames_folder, frames_of_video
 from rigkit.workflows.inputs.identify_board import explained, suggestion

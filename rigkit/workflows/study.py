@@ -24,8 +24,8 @@ from rigkit.io.disk.json_reader import json_text
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic, write_together
 from rigkit.io.manifests.study_file import load_study
-from rigkit.report.study_figure import study_figure
-from rigkit.report.study_page import cell_table, study_page, study_tables
+from rigkit.report.pages.study_page import cell_table, study_page, study_tables
+from rigkit.report.pictures.study_figure import study_figure
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import Study, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate

@@ -30,7 +30,7 @@ from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.calibrations.calibration_file import camera_to_json, load_camera, save_calibration
 from rigkit.io.calibrations.history_file import editions, load_history
 from rigkit.io.media.images import read_image
-from rigkit.report.check_page import _could_have_found
+from rigkit.report.pages.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard

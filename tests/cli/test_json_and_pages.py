@@ -14,9 +14,9 @@ from helpers.stereo_pictures import of_one_camera
 from report.test_first_screen import reported
 
 from rigkit.cli.main import main
-from rigkit.report.page import build_page, validation_facts
-from rigkit.report.validation_page import pair_section, summary_table
-from rigkit.report.validation_verdict import verdict_of
+from rigkit.report.pages.page import build_page, validation_facts
+from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_verdict import verdict_of
 from rigkit.validation.diagnose import diagnose
 
 REPEATS = ("held-out RMS",)

@@ -25,9 +25,9 @@ from report.test_first_screen import page_of, reported
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.tables import Cell, Column, Table
-from rigkit.report.calibration_charts import images_svg
-from rigkit.report.calibration_page import CalibrationSection, build_calibration_page
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.calibration_charts import images_svg
+from rigkit.report.pages.calibration_page import CalibrationSection, build_calibration_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 
 SCHEMES = {"light": "--blink-settings=preferredColorScheme=1", "dark": "--blink-settings=preferredColorScheme=0"}
 RUN = """<script>%s</script><script>

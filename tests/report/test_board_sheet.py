@@ -14,8 +14,8 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.circles import Circles
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
-from rigkit.report.plan_page import printed_outlines
+from rigkit.report.pages.plan_page import printed_outlines
+from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.workflows.capture.print_board import PrintOptions, print_board
 
 POINTS_PER_MM = 72.0 / 25.4

@@ -23,10 +23,10 @@ from rigkit.core.findings import Finding
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import Knowledge
 from rigkit.planning.plan import plan_views
-from rigkit.report.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.calibration_facts import _reach, focal_words
-from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
-from rigkit.report.plan_page import plan_words
+from rigkit.report.pages.calibration_drawings import pattern_svg, residuals_svg, uncertainty_svg
+from rigkit.report.pages.calibration_facts import _reach, focal_words
+from rigkit.report.pages.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
+from rigkit.report.pages.plan_page import plan_words
 
 NOISE_PX = 0.2
 IMAGES = 20
@@ -240,7 +240,7 @@ def test_the_sentence_and_the_map_have_one_worst_place(calibration: Calibration)
 def test_what_a_bad_calibration_says_of_the_rest_of_the_image_is_no_advice(
     most: float, advice: str, calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rigkit.report.calibration_facts.MAX_RATIO_BEYOND", most)
+    monkeypatch.setattr("rigkit.report.pages.calibration_facts.MAX_RATIO_BEYOND", most)
     said = [_reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))]
     assert "px at worst outside" in said[1] and said[0].startswith(said[1].rstrip("."))
     assert advice in said[0] and advice not in said[1]

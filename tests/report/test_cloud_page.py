@@ -9,7 +9,7 @@ import numpy as np
 from helpers.browser import probed
 
 from rigkit.core.cloud import OrientedCloud
-from rigkit.report.cloud_page import MAX_DRAWN, build_cloud_page
+from rigkit.report.pages.cloud_page import MAX_DRAWN, build_cloud_page
 
 PROBE = """<script>
 const canvas = document.querySelector("canvas[data-cloud]"), box = document.querySelector("[data-shape]");

@@ -12,9 +12,9 @@ from helpers.reconstructions import make_reconstruction
 
 from rigkit.calibration.calibrate import calibrate
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
-from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg
-from rigkit.report.figures import as_pdf, cloud_figure, corners_figure
+from rigkit.report.pages.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
+from rigkit.report.pages.calibration_drawings import coverage_svg, pattern_svg, residuals_svg
+from rigkit.report.pictures.figures import as_pdf, cloud_figure, corners_figure
 from rigkit.report.render import asset, data_uri
 
 

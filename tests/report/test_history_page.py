@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, editions
-from rigkit.report.history_page import history_page
+from rigkit.report.pages.history_page import history_page
 from rigkit.validation.sentinel.drift import heat_drift
 from rigkit.workflows.checks.history import show_history
 

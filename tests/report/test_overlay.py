@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
-from rigkit.report.overlay import OVERLAY_COLOURS, draw_boards
+from rigkit.report.pictures.overlay import OVERLAY_COLOURS, draw_boards
 
 INK_LEVELS = 60
 """From the colour of a label: OpenCV 4 draws hairlines whose ink is nowhere full."""

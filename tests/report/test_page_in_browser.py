@@ -11,10 +11,10 @@ from helpers.browser import probed
 from helpers.reconstructions import make_reconstruction
 
 from rigkit.core.truth import MeasuredAngle, PairTruth
-from rigkit.report.figures import as_png, cloud_figure
-from rigkit.report.page import build_page
-from rigkit.report.validation_page import pair_section, summary_table
-from rigkit.report.validation_verdict import verdict_of
+from rigkit.report.pages.page import build_page
+from rigkit.report.pages.validation_page import pair_section, summary_table
+from rigkit.report.pages.validation_verdict import verdict_of
+from rigkit.report.pictures.figures import as_png, cloud_figure
 from rigkit.validation.checks import validate
 
 PROBE = """<script>

@@ -12,8 +12,8 @@ import pytest
 
 from rigkit.core.errors import InputError
 from rigkit.core.posetype import PoseType
-from rigkit.report.study_figure import study_figure
-from rigkit.report.study_page import cell_table, study_tables
+from rigkit.report.pages.study_page import cell_table, study_tables
+from rigkit.report.pictures.study_figure import study_figure
 from rigkit.report.tables import tables_to_csv, tables_to_markdown
 from rigkit.study.study import CHUNK_TRIALS, Claim, Study, Variant, chunk_count, run_chunk
 from rigkit.study.table import StudyTable, tabulate

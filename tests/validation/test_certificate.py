@@ -18,8 +18,8 @@ from rigkit.core.findings import Severity
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.geometry.triangulation import triangulate_rays
-from rigkit.report.certificate_page import bound_figure
-from rigkit.report.figures import _drawn
+from rigkit.report.pages.certificate_page import bound_figure
+from rigkit.report.pictures.figures import _drawn
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import (

@@ -17,7 +17,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.calibration_file import save_calibration
 from rigkit.io.calibrations.history_file import HistoryEntry, add_entry, as_seen_from, ensure_register, load_history
-from rigkit.report.history_page import drift_svg, history_facts, history_page
+from rigkit.report.pages.history_page import drift_svg, history_facts, history_page
 from rigkit.workflows.checks.history import add_to_history, show_history
 
 

@@ -22,7 +22,7 @@ from rigkit.io.calibrations.calibration_file import calibration_text, load_calib
 from rigkit.io.calibrations.history_file import load_history
 from rigkit.kernels.departures import DISPLACEMENTS
 from rigkit.planning.goal import projection_goal
-from rigkit.report.check_page import check_facts, check_page
+from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND

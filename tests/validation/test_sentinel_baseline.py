@@ -13,7 +13,7 @@ from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
-from rigkit.report.check_page import check_facts
+from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.sentinel.baseline import judge_since
 from rigkit.validation.sentinel.epipolar import PairMatches, matches_say
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of

@@ -20,7 +20,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.io.calibrations.history_file import HistoryEntry
 from rigkit.planning.candidates import Reach
-from rigkit.report.check_page import check_facts
+from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, straightened

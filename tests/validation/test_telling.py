@@ -19,7 +19,7 @@ from rigkit.planning.candidates import Reach, sees_held
 from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, plan_views
-from rigkit.report.plan_page import plan_words
+from rigkit.report.pages.plan_page import plan_words
 from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, told_by
 from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views

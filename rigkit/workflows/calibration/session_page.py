@@ -12,7 +12,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.io.manifests.rig_session import RigSession
 from rigkit.io.manifests.session import Session
 from rigkit.io.media.images import read_image
-from rigkit.report.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
+from rigkit.report.pages.calibration_page import CalibrationSection, build_calibration_page, thumbnail_jpeg
 from rigkit.validation.check import Check
 from rigkit.workflows.calibration.next_pictures import next_views
 from rigkit.workflows.inputs.corners import SessionCorners, named_images

@@ -23,8 +23,8 @@ from rigkit.planning.candidates import Reach
 from rigkit.planning.guess import guessed_camera
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, plan_views
-from rigkit.report.check_page import power_table
-from rigkit.report.plan_page import plan_page
+from rigkit.report.pages.check_page import power_table
+from rigkit.report.pages.plan_page import plan_page
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.evidence import Watched
 from rigkit.validation.sentinel.telling import views_that_tell

@@ -11,7 +11,7 @@ from rigkit.core.printing import brief
 from rigkit.io.boards.board_file import board_text, load_layout
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import write_atomic, write_together
-from rigkit.report.board_sheet import board_sheet, pdf_bytes, svg_text
+from rigkit.report.pictures.board_sheet import board_sheet, pdf_bytes, svg_text
 from rigkit.workflows.inputs.paths import NamesFiles
 
 MAX_UNEVEN = 1.05

@@ -14,8 +14,8 @@ from rigkit.core.printing import brief
 from rigkit.io.calibrations.rig_file import is_rig_file
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
-from rigkit.report.certificate_page import certificate_facts, certificate_page, certificate_pdf
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.pages.certificate_page import certificate_facts, certificate_page, certificate_pdf
+from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
 from rigkit.workflows.checks.check import load_watched

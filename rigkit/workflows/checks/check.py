@@ -37,8 +37,8 @@ from rigkit.io.disk.json_reader import json_text
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_together
 from rigkit.io.media.images import read_image_of
-from rigkit.report.check_page import check_facts, check_page
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.pages.check_page import check_facts, check_page
+from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.baseline import judge_since
 from rigkit.validation.sentinel.epipolar import matches_of_scenes, matches_say

@@ -15,7 +15,7 @@ from rigkit.core.printing import brief
 from rigkit.io.calibrations.rig_file import SavedRig, is_board_rigs_file, is_rig_file, load_board_rigs
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
-from rigkit.report.figures import difference_png
+from rigkit.report.pictures.figures import difference_png
 from rigkit.workflows.inputs.camera_files import import_camera, is_rig, own_calibration, saved_rig, warn_if_bad
 from rigkit.workflows.inputs.paths import NamesFiles
 

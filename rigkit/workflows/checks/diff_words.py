@@ -13,8 +13,8 @@ from rigkit.calibration.rig.compare import RigDifference
 from rigkit.core.printing import length_words
 from rigkit.core.tables import Table, cells, columns
 from rigkit.io.disk.writing import write_atomic
-from rigkit.report.figures import difference_png
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
+from rigkit.report.pictures.figures import difference_png
 from rigkit.workflows.checks.diff import BoardsPair, CameraPair, RigPair
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 

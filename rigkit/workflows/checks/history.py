@@ -27,7 +27,7 @@ from rigkit.io.calibrations.history_file import (
 from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.planning.information import MIN_SIGMA_PX
-from rigkit.report.history_page import history_page, overwritten
+from rigkit.report.pages.history_page import history_page, overwritten
 from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
 from rigkit.validation.sentinel.judge import judge_evidence
 from rigkit.validation.sentinel.watch import watched_camera

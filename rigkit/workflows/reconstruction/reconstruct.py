@@ -12,7 +12,7 @@ from rigkit.core.progress import Progress, silent
 from rigkit.io.manifests.manifest import Dataset
 from rigkit.io.ply import ply_bytes
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.report.figures import pair_pictures
+from rigkit.report.pictures.figures import pair_pictures
 from rigkit.workflows.reconstruction.datasets import (
     DatasetOptions,
     PairFailure,

@@ -24,8 +24,8 @@ from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
 from rigkit.reconstruction.growing.fuse import FusedCloud, PosedCloud, fuse_clouds
 from rigkit.reconstruction.scene import reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
-from rigkit.report.cloud_page import build_cloud_page
-from rigkit.report.figures import as_png, cloud_figure
+from rigkit.report.pages.cloud_page import build_cloud_page
+from rigkit.report.pictures.figures import as_png, cloud_figure
 from rigkit.workflows.inputs.camera_files import saved_rig, warn_if_bad, warn_of_pupils
 from rigkit.workflows.outputs.provenance import software_facts
 from rigkit.workflows.outputs.results import require_folder, write_results

@@ -33,9 +33,9 @@ from rigkit.reconstruction.growing.dense import grow_scene
 from rigkit.reconstruction.moved_cameras import Calibrations, moved_pairs
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene, with_pupils
 from rigkit.reconstruction.scene_pose import KnownPose
-from rigkit.report.cloud_page import build_cloud_page
-from rigkit.report.figures import as_png, cloud_figure, epipolar_figure
-from rigkit.report.scene_figure import normals_png
+from rigkit.report.pages.cloud_page import build_cloud_page
+from rigkit.report.pictures.figures import as_png, cloud_figure, epipolar_figure
+from rigkit.report.pictures.scene_figure import normals_png
 from rigkit.workflows.inputs.camera_files import (
     import_camera,
     import_near_camera,

@@ -10,8 +10,8 @@ from rigkit.core.printing import brief
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Table
 from rigkit.io.manifests.manifest import Dataset
+from rigkit.report.pages.validation_page import crosscheck_table
 from rigkit.report.tables import table_files
-from rigkit.report.validation_page import crosscheck_table
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.workflows.reconstruction.datasets import (
     DatasetOptions,

@@ -15,7 +15,7 @@ from rigkit.core.tables import Table
 from rigkit.io.disk.reading import csv_table, is_number
 from rigkit.io.manifests.manifest import Dataset
 from rigkit.reconstruction.paper import MOTIONS, OWN_MOTIONS, reconstruct_as_paper
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files
 from rigkit.validation.checks import ValidationReport, validate
 from rigkit.validation.paper_claims import NOTHING_TO_COMPARE, claim_table, estimator_order_table

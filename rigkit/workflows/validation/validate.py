@@ -23,11 +23,11 @@ from rigkit.reconstruction.calibration_shifts import CalibrationShifts, with_cal
 from rigkit.reconstruction.geometry import PairGeometry
 from rigkit.reconstruction.pairing import MatchedPair
 from rigkit.reconstruction.reconstruct import Reconstruction, on_planes, reconstruct_from
-from rigkit.report.drawings import normal_errors_svg, residuals_svg
-from rigkit.report.figures import pair_jpeg, pair_pictures
-from rigkit.report.page import PairSection
-from rigkit.report.page_facts import PageFacts
-from rigkit.report.validation_page import crosscheck_table, pair_section
+from rigkit.report.pages.page import PairSection
+from rigkit.report.pages.page_facts import PageFacts
+from rigkit.report.pages.validation_page import crosscheck_table, pair_section
+from rigkit.report.pictures.drawings import normal_errors_svg, residuals_svg
+from rigkit.report.pictures.figures import pair_jpeg, pair_pictures
 from rigkit.validation.checks import ValidationReport, validate_each
 from rigkit.validation.crosscheck import CrossCheckReport, crosscheck
 from rigkit.validation.diagnose import diagnose, diagnose_cameras

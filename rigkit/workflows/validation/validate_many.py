@@ -15,7 +15,7 @@ from rigkit.core.processes import over_items
 from rigkit.core.progress import Progress, silent
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.manifests.manifest import load_dataset
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.tables import table_files
 from rigkit.validation.tables import mean_normal_error
 from rigkit.workflows.outputs.provenance import software_facts

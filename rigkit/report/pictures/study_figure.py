@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rigkit.report.figures import new_figure
+from rigkit.report.pictures.figures import new_figure
 from rigkit.study.study import STUDY_PLANES
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 

@@ -11,7 +11,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.io.calibrations.history_file import Edition, HistoryEntry, editions
 from rigkit.report import svg
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK, SOFT, WRONG
 from rigkit.validation.sentinel.drift import HeatDrift, heat_drift
 from rigkit.validation.sentinel.judge import ALARM_CHANCE

@@ -16,9 +16,9 @@ from rigkit.core.findings import Severity, gravest_first, worst
 from rigkit.core.printing import digits
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.plan import Plan
-from rigkit.report.calibration_drawings import MAP_GRID
-from rigkit.report.page_facts import PageFacts
-from rigkit.report.plan_page import plan_table, plan_words
+from rigkit.report.pages.calibration_drawings import MAP_GRID
+from rigkit.report.pages.page_facts import PageFacts
+from rigkit.report.pages.plan_page import plan_table, plan_words
 from rigkit.report.rig_tables import rig_basis, rig_reach, rig_tables
 from rigkit.report.tables import rounded_parameters, rounded_words
 from rigkit.validation.check import Check

@@ -15,8 +15,8 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.planning.plan import Plan
 from rigkit.planning.words import placement
 from rigkit.report import svg
-from rigkit.report.board_sheet import black_squares
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.pages.page_facts import PageFacts
+from rigkit.report.pictures.board_sheet import black_squares
 from rigkit.report.render import drawing, render, shown_table
 from rigkit.report.svg import INK, MARK
 

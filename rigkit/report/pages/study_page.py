@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rigkit.core.tables import Cell, Column, Table, cells, columns
-from rigkit.report.page_facts import PageFacts, build_facts_page
-from rigkit.report.study_figure import study_figure
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
+from rigkit.report.pictures.study_figure import study_figure
 from rigkit.study.study import STUDY_PLANES, Study
 from rigkit.study.table import ALL_PLANES, StudyCell, StudyTable
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rigkit.affine.correspondences import Correspondences
 from rigkit.reconstruction.scene import SceneReconstruction
-from rigkit.report.figures import as_png, pair_axes
+from rigkit.report.pictures.figures import as_png, pair_axes
 
 POINTS_PER_INCH = 72.0
 DENSE_SIDE = 4.0

@@ -15,7 +15,7 @@ from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.goal import px_words
 from rigkit.report import svg
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
 from rigkit.report.svg import DRAWN_WIDTH, INK
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, Baseline, Change, SentinelCheck
 from rigkit.validation.sentinel.power import FOUND, TIMES, Power

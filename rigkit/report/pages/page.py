@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from rigkit.core.tables import Table
-from rigkit.report.page_facts import PageFacts
+from rigkit.report.pages.page_facts import PageFacts
+from rigkit.report.pages.validation_verdict import ValidationVerdict
 from rigkit.report.render import data_uri, render, shown_table
-from rigkit.report.validation_verdict import ValidationVerdict
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -10,8 +10,8 @@ import numpy as np
 
 from rigkit.core.findings import Finding, Severity
 from rigkit.core.tables import Table, cells, columns
-from rigkit.report.figures import DPI, as_pdf, as_png, new_figure
-from rigkit.report.page_facts import PageFacts, build_facts_page
+from rigkit.report.pages.page_facts import PageFacts, build_facts_page
+from rigkit.report.pictures.figures import DPI, as_pdf, as_png, new_figure
 from rigkit.validation.certificate.contracts import Certificate, Quantity
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from rigkit.core.printing import brief
 from rigkit.core.tables import Table
 from rigkit.io.media.images import Image
 from rigkit.planning.plan import Plan
-from rigkit.report.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
-from rigkit.report.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
-from rigkit.report.calibration_facts import (
+from rigkit.report.pages.calibration_charts import histogram_svg, images_svg, lens_svg, radius_svg
+from rigkit.report.pages.calibration_drawings import coverage_svg, pattern_svg, residuals_svg, uncertainty_svg
+from rigkit.report.pages.calibration_facts import (
     IMAGES_KEY,
     LEFT_OUT_KEY,
     NEXT_KEY,
@@ -27,10 +27,10 @@ from rigkit.report.calibration_facts import (
     rig_facts,
     training_note,
 )
-from rigkit.report.page_facts import PageFacts, told
-from rigkit.report.plan_page import shown_views
+from rigkit.report.pages.page_facts import PageFacts, told
+from rigkit.report.pages.plan_page import shown_views
+from rigkit.report.pictures.scene_view import boards_scene, rig_scene
 from rigkit.report.render import data_uri, drawing, render, shown_table
-from rigkit.report.scene_view import boards_scene, rig_scene
 from rigkit.validation.check import Check
 
 THUMBNAILS_PX = (640, 320)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rigkit.core.tables import Table
-from rigkit.report.figures import drawn_dark
+from rigkit.report.pictures.figures import drawn_dark
 from rigkit.report.render import data_uri, drawing, render, shown_table
 from rigkit.report.tables import tables_to_list
 

@@ -17,7 +17,7 @@ from rigkit.cameras.compare import CameraDifference
 from rigkit.core.arrays import FloatArray, Pixels, in_8_bits
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.report.scene_view import PYRAMID
+from rigkit.report.pictures.scene_view import PYRAMID
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -12,8 +12,8 @@ from rigkit.core.findings import Severity
 from rigkit.core.printing import counted
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.reconstruction.reconstruct import Reconstruction
-from rigkit.report.page import PairSection
-from rigkit.report.scene_view import scene_of
+from rigkit.report.pages.page import PairSection
+from rigkit.report.pictures.scene_view import scene_of
 from rigkit.report.tables import measured_words
 from rigkit.validation.checks import ValidationReport
 from rigkit.validation.crosscheck import CrossCheckReport

@@ -11,7 +11,7 @@ from rigkit.geometry.rotation import angle_between
 from rigkit.geometry.triangulation import correct_rays_px
 from rigkit.reconstruction.reconstruct import Reconstruction
 from rigkit.report import svg
-from rigkit.report.figures import board_colour
+from rigkit.report.pictures.figures import board_colour
 from rigkit.validation.checks import ValidationReport
 
 WHISKER = 1.5

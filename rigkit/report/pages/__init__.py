@@ -1,0 +1,1 @@
+"""The pages that verbs write, what they say, and their charts."""

@@ -1,0 +1,1 @@
+"""Figures, drawings over images, scenes in perspective, and boards to print."""
