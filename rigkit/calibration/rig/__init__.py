@@ -3,7 +3,7 @@
 - each camera alone: `rigkit.calibration`
 - views in: `observations`; boards on one mount: `board_places`, `board_ties`, `board_sizes`
 - a start: `frames`
-- one least squares: `layout`, `state`, `carried` (how views follow from targets, mounts and places), `shape`, `known`,
+- one least squares: `layout`, `state`, `pose_jacobians` (how views follow from the rig), `shape`, `known`,
   `solver`; what does not fit in it left out: `disagree`, `joint`
 - how sure that is: `heldout`, `flatness`, `lags`, `between_models`, `displaced`, `uncertainty`
 - what to think of it: `verdicts`
