@@ -115,5 +115,6 @@ def _apart(one: KeptFrame, two: KeptFrame) -> float:
 
 def _moved(one: FloatArray, two: FloatArray) -> float:
     """Return by how much of its extent, where that is smaller, a board was moved from one view to the other."""
-    extent = min(float((view + np.roll(view, 4)).max()) for view in (one, two))
+    # The second four of DIRECTIONS are opposite to the first.
+    extent = min(float((view[:4] + view[4:]).max()) for view in (one, two))
     return float(np.abs(one - two).max()) / max(extent, 1e-9)
