@@ -55,12 +55,10 @@ def minimise_each(
     for _ in range(stop.steps):
         if not active.any():
             break
-        diagonal = np.einsum("kii->ki", here.normal)
-        diagonal = np.where(diagonal > 0.0, diagonal, 1.0)
-        added = level[:, None] * diagonal
+        diagonal = np.diagonal(here.normal, axis1=1, axis2=2)
+        added = level[:, None] * np.where(diagonal > 0.0, diagonal, 1.0)
         damped = here.normal.copy()
-        on_diagonal = np.einsum("kii->ki", damped)
-        on_diagonal += added
+        damped.reshape(len(damped), -1)[:, :: damped.shape[1] + 1] += added
         step: FloatArray = np.asarray(np.linalg.solve(damped, here.descent[..., None])[..., 0], dtype=np.float64)
         predicted = (step * (added * step + here.descent)).sum(axis=-1)
         trial = moved(state, step)
