@@ -10,6 +10,7 @@ import numpy as np
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.uncertainty import transfer_uncertainty
+from rigkit.calibration.rig.verdicts import lag_words
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature
 from rigkit.geometry.rotation import log_so3
@@ -84,6 +85,7 @@ def rig_basis(rig: RigCalibration) -> str:
         "All intrinsics and mounts solved together; held out: frames that took no part, with one pose for all cameras. "
         f"{rig.corner_count} corners, {rig.shared_count} poses shared by several views. Frames disagree "
         f"{rig.overdispersion:.2f} times as much as independent corners would; all sigmas count that in."
+        + "".join(f" {words[0].upper()}{words[1:]}." for words in lag_words(rig))
     )
 
 

@@ -17,7 +17,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import RigkitError
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3
+from rigkit.geometry.rotation import exp_so3, log_so3
 
 from .sessions import CORNERS_PX, MOUNT, SECOND_CENTRE
 
@@ -27,6 +27,7 @@ LAG_S, JITTER_S = 0.012, 0.003
 PERIODS_S = (1.5, 6.0)
 """Of the swings that a motion is made of."""
 SWINGS = 3
+BASELINES_MM = "baselines, mm"
 MIDDLE, REACH = np.array([0.0, 0.0, 600.0, 0.0, 0.0, 0.0]), np.array([60.0, 45.0, 90.0, 0.3, 0.3, 0.6])
 """Of a board's middle (mm) and of its turns (rad), and how far each swings."""
 BELOW = Rigid3(exp_so3(np.array([0.15, 0.02, -0.01])), [5.0, -110.0, 12.0])
@@ -52,7 +53,8 @@ class Motion:
 
 
 def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[str, list[float]]:
-    """Return the errors of the baselines of a rig of so many cameras, in stated sigmas."""
+    """Return the errors of the baselines, mounts and lags of a rig of so many cameras, in stated sigmas, and those of
+    the baselines in mm."""
     chosen = dict(list(CAMERAS.items())[:cameras])
     motion, views = Motion(rng), dict[str, list[tuple[str, BoardView]]]()
     lag = {name: rng.uniform(-LAG_S, LAG_S) for name in chosen}
@@ -67,12 +69,20 @@ def moving_session(frames: int, cameras: int, rng: np.random.Generator) -> dict[
             if len(pixels) >= BOARD.corner_count / 2:
                 views.setdefault(name, []).append((f"{k:03d}", view))
     rig = calibrate_rig(views, dict.fromkeys(chosen, SIZE), model=lens("reg").model, folds=0)
-    off = []
+    off, mm, mounts = [], [], list[float]()
     for a, b in combinations(chosen, 2):
         length, sigma = rig.baseline_mm(a, b)
         between = chosen[b][1].inverse().translation_mm - chosen[a][1].inverse().translation_mm
-        off.append((length - float(np.linalg.norm(between))) / sigma)
-    return {"baselines": off}
+        mm.append(length - float(np.linalg.norm(between)))
+        off.append(mm[-1] / sigma)
+    for k, found in enumerate(rig.cameras[1:], 1):
+        true = chosen[found.name][1]
+        turned = log_so3(found.cam_from_rig.rotation @ true.rotation.T)
+        moved = found.cam_from_rig.translation_mm - true.translation_mm
+        mounts += (np.concatenate([turned, moved]) / rig.sigmas[rig.mount(k)]).tolist()
+    first = lag[next(iter(chosen))]
+    late = [(own.frames - FRAMES_PER_S * (lag[name] - first)) / own.sigma for name, own in rig.lags.items()]
+    return {"baselines": off, "mounts": mounts, "lags": late, BASELINES_MM: mm}
 
 
 def moving_sessions(frames: int, seeds: int) -> dict[tuple[str, str], FloatArray]:
@@ -87,4 +97,7 @@ def moving_sessions(frames: int, seeds: int) -> dict[tuple[str, str], FloatArray
                 continue
             for what, own in found.items():
                 errors[what, f"by {cameras} cameras"] += own
-    return {key: np.abs(own) for key, own in errors.items()}
+    for (what, seen), own in errors.items():
+        if what == BASELINES_MM and own:
+            print(f"{frames} frames, {what} {seen}: rms error {np.sqrt(np.mean(np.square(own))):.3f}", flush=True)
+    return {key: np.abs(own) for key, own in errors.items() if own and key[0] != BASELINES_MM}

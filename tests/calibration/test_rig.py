@@ -11,6 +11,7 @@ from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.moments import Moments
 from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.solver import rig_normal
 from rigkit.calibration.rig.state import RigObservations, RigState
@@ -98,21 +99,36 @@ def _small_rig(kind: str, tied: bool, rng: np.random.Generator) -> tuple[RigObse
     return observations, state
 
 
+def _lagging(state: RigState, rng: np.random.Generator) -> RigState:
+    """Return the state with a second camera that lags, by a little more or less from picture to picture."""
+    poses = len(state.frame_mm)
+    # Turning about one axis: of a way that winds, a second order of the time is left out of the lag's derivative.
+    axis = rng.normal(size=(poses, 1, 3))
+    ways = np.concatenate([axis * [[0.2], [0.1]], 30.0 * rng.normal(size=(poses, 2, 3))], axis=-1)
+    own, information = np.zeros((2, poses)), np.full((2, poses), np.inf)
+    own[1], information[1] = 0.1 * rng.normal(size=poses), 1e6 * rng.uniform(1.0, 2.0, poses)
+    return replace(state, moments=Moments(np.array([0.0, 0.3]), ways, own, information))
+
+
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
-@pytest.mark.parametrize("tied", [False, True])
-def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.Generator) -> None:
-    """Central differences of the cost and of the residuals, by every kind of unknown."""
+@pytest.mark.parametrize(("tied", "late"), [(False, False), (True, False), (False, True)])
+def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, late: bool, rng: np.random.Generator) -> None:
+    """Central differences of the cost and of the residuals, by every kind of unknown; the pictures' own times, too,
+    which are then eliminated."""
     observations, state = _small_rig(kind, tied, rng)
+    state = _lagging(state, rng) if late else state
     shape, poses = observations.shape, len(observations.keys)
     layout = state.layout(observations)
-    assert layout.count == 17 + 6 + (6 if tied else 0) + shape.count
+    assert layout.count == 17 + 6 + (6 if tied else 0) + late + shape.count
     normal = rig_normal(observations, state)
     scale = np.ones(layout.count + 6 * poses)
     for run, camera in zip(layout.cameras, state.cameras, strict=True):
         scale[run] = 1e-2 * np.maximum(np.abs(camera.parameters), 1e-2)
 
-    def residuals(x: np.ndarray) -> np.ndarray:
+    def residuals(x: np.ndarray, own_times: np.ndarray | float = 0.0) -> np.ndarray:
         moved = state.moved(SchurStep(x[: layout.count], x[layout.count :].reshape(-1, 6), 0.0), layout)
+        if moved.moments is not None:
+            moved = replace(moved, moments=replace(moved.moments, own=moved.moments.own + own_times))
         return np.concatenate(
             [
                 (evaluate(moved.of_camera(c, observations), own).px * w[..., None]).ravel()
@@ -131,21 +147,37 @@ def test_gradient_and_gauss_newton_matrix(kind: str, tied: bool, rng: np.random.
         gauss_newton[: layout.count, own] = normal.gp[f]
         gauss_newton[own, : layout.count] = normal.gp[f].T
         gauss_newton[own, own] = normal.pp[f]
-    numeric = (jacobian @ jacobian.T) * scale[:, None] * scale
+    here = residuals(np.zeros(h.size))
+    numeric, gradient = jacobian @ jacobian.T, jacobian @ here
+    if state.moments is not None:
+        each = 1e-5 * np.eye(poses)[:, None] * [[0.0], [1.0]]
+        times = np.array([(residuals(0.0 * h, -e) - residuals(0.0 * h, e)) / 2e-5 for e in each])
+        known, own_times = np.diag(state.moments.information[1]), state.moments.own[1]
+        back = jacobian @ times.T @ np.linalg.inv(times @ times.T + known)
+        numeric -= back @ times @ jacobian.T
+        gradient -= back @ (times @ here - known @ own_times)
+        reduced = here @ here + own_times @ known @ own_times
+        pull = times @ here - known @ own_times
+        reduced -= pull @ np.linalg.solve(times @ times.T + known, pull)
+        assert normal.cost == pytest.approx(reduced, rel=1e-6)
+    numeric *= scale[:, None] * scale
     assert np.abs(numeric - gauss_newton * scale[:, None] * scale).max() < 1e-5 * np.abs(numeric).max()
     with_priors = rig_normal(observations, state, 0.3)
     expected = sum(float((camera_prior(camera)[1] ** 2).sum()) for camera in state.cameras)
     expected += float(((state.unknowns / shape.sigma) ** 2).sum())
     assert with_priors.cost - normal.cost == pytest.approx(0.09 * expected, rel=1e-6)
-    gradient = (jacobian @ residuals(np.zeros(h.size))) * scale
+    gradient *= scale
     assert np.abs(gradient - np.concatenate([normal.g, normal.p.ravel()]) * scale).max() < 1e-5 * np.abs(gradient).max()
 
 
 @pytest.mark.parametrize("kind", ["flat", "warp", "released"])
-@pytest.mark.parametrize("tied", [False, True])
-def test_covariance_of_lenses_and_of_the_boards_mean_motion(kind: str, tied: bool, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(("tied", "late"), [(False, False), (True, False), (False, True)])
+def test_covariance_of_lenses_and_of_the_boards_mean_motion(
+    kind: str, tied: bool, late: bool, rng: np.random.Generator
+) -> None:
     """Against the inverse of all equations at once, carried to a camera's boards by central differences."""
     observations, state = _small_rig(kind, tied, rng)
+    state = _lagging(state, rng) if late else state
     layout, normal = state.layout(observations), rig_normal(observations, state, SHAPE_WEIGHT)
     count, poses = layout.count, len(observations.keys)
     whole = np.zeros((count + 6 * poses, count + 6 * poses))

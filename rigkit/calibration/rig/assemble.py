@@ -15,18 +15,17 @@ from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
 from rigkit.calibration.rig.displaced import lens_modes
 from rigkit.calibration.rig.flatness import shape_error
+from rigkit.calibration.rig.frame_covariance import frame_covariance
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.lags import lag_error
+from rigkit.calibration.rig.lags import lags_of
 from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians, pose_products
+from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.solver import with_rig_priors
 from rigkit.calibration.rig.state import RigState
 from rigkit.calibration.solving.clustered import Clustered, effective_freedom
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.boards import Board
-from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 
 
@@ -40,16 +39,11 @@ def assemble_rig(
     """
     observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
     layout = state.layout(observations)
-    sigma = residual_sigma(joint)
-    prior = _prior(joint, sigma)
-    known = _global_covariance(joint, prior, sigma)
+    known, sigma = frame_covariance(observations, joint.solution, joint.sigma_px, joint.frames)
     overdispersion = known.clustered.overdispersion
     beside = _error_of_held(joint, layout, normal.covariance[0])
-    for off in (
-        shape_error(observations, state, sigma * overdispersion),
-        lag_error(observations, state, normal.products, prior, sigma * overdispersion),
-    ):
-        beside[: len(off), : len(off)] += np.outer(off, off)
+    off = shape_error(observations, state, sigma * overdispersion)
+    beside[: len(off), : len(off)] += np.outer(off, off)
     covariance = known.covariance
     beside += between_rig_models(joint, np.sqrt(np.diag(covariance + beside)))
     covariance += beside
@@ -81,7 +75,7 @@ def assemble_rig(
         departures=lens_modes(observations, joint.solution, far, told),
         board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
-    return rig, far
+    return replace(rig, lags=lags_of(joint.views.names, state, rig.widening**2 * covariance, layout.lags)), far
 
 
 def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
@@ -102,21 +96,6 @@ def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, told: IntAr
             own = np.arange(run.stop - PUPIL_TERMS, run.stop)
             out[name] = SolvedPupil(camera.pupil, covariance[np.ix_(own, own)], covariance[np.ix_(told, own)])
     return out
-
-
-def _prior(joint: JointRig, sigma_px: float) -> FloatArray:
-    """Return the information (n, n) of the priors of the globals but for released corners, px^2."""
-    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
-    n = state.layout(observations).shape.start + observations.shape.basis.shape[-1]
-    nothing = replace(normal, gg=np.zeros_like(normal.gg), g=np.zeros_like(normal.g))
-    return with_rig_priors(nothing, observations, state, sigma_px).gg[:n, :n]
-
-
-def _global_covariance(joint: JointRig, prior: FloatArray, sigma_px: float) -> GlobalCovariance:
-    """Return how sure the solution is, with the frames as what repeats."""
-    observations, state, normal = joint.observations, joint.solution.state, joint.solution.normal
-    products = pose_products(observations, state, normal.products)
-    return GlobalCovariance.of(normal, products, prior, joint.frames, sigma_px, in_order=True)
 
 
 def _cameras(
@@ -168,25 +147,6 @@ def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatAr
         through = unit[:, index] * known.weights(joint.observations, layout)[index]
         out += through @ known.covariance @ through.T
     return out
-
-
-def residual_sigma(joint: JointRig) -> float:
-    """Return the standard deviation of a corner of median quality, degrees of freedom counted.
-
-    Raises DegenerateError where there are none.
-    """
-    observations, normal, state = joint.observations, joint.solution.normal, joint.solution.state
-    layout = state.layout(observations)
-    poses = int((np.einsum("fii->f", normal.pp) > 0.0).sum())
-    # Every unknown of the shape has a prior, which pays for it.
-    unknowns = layout.shape.start + 6 * poses
-    freedom = 2 * observations.corner_count - unknowns
-    if freedom <= 0:
-        raise DegenerateError("rig: fewer corners than unknowns; take more frames")
-    total = float(normal.costs.sum())
-    if state.unknowns.size:
-        total += joint.sigma_px**2 * float(((state.unknowns / observations.shape.sigma) ** 2).sum())
-    return float(np.sqrt(total / freedom))
 
 
 def _board_rigs(

@@ -85,6 +85,7 @@ def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
         mount_mm=np.einsum("cij,cj->ci", turn, state.mount_mm),
         frame_rotation=first @ state.frame_rotation,
         frame_mm=state.frame_mm @ first.T,
+        moments=None if state.moments is None else state.moments.turned(first),
     )
 
 
@@ -104,5 +105,7 @@ def _way(here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArr
         for k, run in enumerate(runs):
             if run is not None:
                 way[run] = moved[k]
+    if here.moments is not None and there.moments is not None:
+        way[layout.lags] = (there.moments.lags - here.moments.lags)[1:]
     way[layout.shape] = there.unknowns - here.unknowns
     return way

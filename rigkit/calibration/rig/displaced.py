@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.displaced import LensModes, telling_modes
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.pose_jacobians import gone_in_cam, pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import Solution
@@ -47,7 +47,11 @@ def _of_camera(
     alone, own = state.of_camera(c, observations), observations.cameras[c]
     n = layout.shape.start
     by_globals = np.zeros((n, modes.shape[1]))
-    by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes)
+    late = None
+    if state.moments is not None:
+        information = state.moments.information[c, observations.frame[c]]
+        late = gone_in_cam(observations, state, c, alone.translation_mm), information
+    by_globals[layout.cameras[c]], by_own = _products(alone, own, observations.weights[c], modes, late)
     by_pose = np.zeros((len(observations.keys), 6, modes.shape[1]))
     for part in pose_jacobians(observations, state, c, alone.translation_mm):
         shown = by_own[part.views]
@@ -58,9 +62,16 @@ def _of_camera(
     return LensModes(modes, moves[told])
 
 
-def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _products(
+    alone: State,
+    own: Observations,
+    weight: FloatArray,
+    modes: FloatArray,
+    late: tuple[FloatArray, FloatArray] | None,
+) -> tuple[FloatArray, FloatArray]:
     """Return the weighted products of the modes with the derivatives by the parameters (P, M), and with those by the
-    pose of each view (V, 6, M)."""
+    pose of each view (V, 6, M); `late` is by how much each goes on in time (V, 6), and the information on its own
+    time."""
     points, lever = alone.points_in_cam(own)
     pixels, valid, d_pixels_d_point, d_pixels_d_parameters = alone.camera.project_with_jacobians(points)
     used = valid & (weight > 0.0)
@@ -73,5 +84,12 @@ def _products(alone: State, own: Observations, weight: FloatArray, modes: FloatA
     )
     by_view = np.concatenate([-d_pixels_d_point @ skew(lever), d_pixels_d_point], axis=-1)
     views, count = len(weight), modes.shape[1]
+    if late is not None:
+        # What the pictures' own times take up.
+        by_time = np.einsum("vcxi,vi->vcx", by_view, late[0])
+        weighted = by_time * np.where(used, weight, 0.0)[..., None] ** 2
+        known = np.einsum("vcx,vcx->v", weighted, by_time) + late[1]
+        taken = np.einsum("vcx,vcxm->vm", by_time, moved) / known[:, None]
+        moved -= weighted[..., None] * taken[:, None, None]
     of_views = np.swapaxes(by_view.reshape(views, -1, 6), 1, 2) @ moved.reshape(views, -1, count)
     return d_pixels_d_parameters.reshape(-1, d_pixels_d_parameters.shape[-1]).T @ moved.reshape(-1, count), of_views

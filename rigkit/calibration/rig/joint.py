@@ -25,6 +25,7 @@ from rigkit.calibration.rig.disagree import (
 )
 from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, places_of, turned_alike
 from rigkit.calibration.rig.known import KnownCameras
+from rigkit.calibration.rig.lags import times_of, with_lags
 from rigkit.calibration.rig.observations import FrameObservations, RigViews
 from rigkit.calibration.rig.shape import common_shape
 from rigkit.calibration.rig.solver import solve_rig
@@ -84,18 +85,8 @@ class JointRig:
 
     @cached_property
     def frames(self) -> IntArray:
-        """Number of the frame of every pose, (F,), in the natural order of their names; frames in which all cameras see
-        what they saw in an earlier one have its number."""
-        frame = {entry.key: entry.frame for own in self.views.seen for entry in own.values()}
-        names = [frame[key] for key in self.observations.keys]
-        shown = [
-            (names[f], f"{c} {view.board.board_id}", view.pixels)
-            for c, (own, of_views) in enumerate(zip(self.observations.cameras, self.observations.frame, strict=True))
-            for view, f in zip(own.views, of_views.tolist(), strict=True)
-        ]
-        frames, boards, pixels = zip(*sorted(shown, key=lambda of: natural_key(of[0])), strict=True)
-        number = dict(zip(frames, cluster_numbers(frames, boards, pixels).tolist(), strict=True))
-        return np.array([number[name] for name in names], dtype=np.int64)
+        """Number of the frame of every pose, (F,): `frame_numbers`."""
+        return frame_numbers(self.views, self.observations)
 
     def folds(self, count: int) -> IntArray:
         """Return the fold of every pose (F,), of `count` of them or, of fewer frames, each its own."""
@@ -107,6 +98,21 @@ class JointRig:
     def shared_count(self) -> int:
         """Targets, counted in every frame, of which several views are tied."""
         return len(shared_keys(self.views.seen))
+
+
+def frame_numbers(views: RigViews, observations: RigObservations) -> IntArray:
+    """Return the number of the frame of every pose, (F,), in the natural order of their names; frames in which all
+    cameras see what they saw in an earlier one have its number."""
+    frame = {entry.key: entry.frame for own in views.seen for entry in own.values()}
+    names = [frame[key] for key in observations.keys]
+    shown = [
+        (names[f], f"{c} {view.board.board_id}", view.pixels)
+        for c, (own, of_views) in enumerate(zip(observations.cameras, observations.frame, strict=True))
+        for view, f in zip(own.views, of_views.tolist(), strict=True)
+    ]
+    frames, boards, pixels = zip(*sorted(shown, key=lambda of: natural_key(of[0])), strict=True)
+    number = dict(zip(frames, cluster_numbers(frames, boards, pixels).tolist(), strict=True))
+    return np.array([number[name] for name in names], dtype=np.int64)
 
 
 def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | None = None) -> JointRig:
@@ -126,6 +132,7 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
         progress("rig", i, MAX_ROUNDS)
         _require_agreement(views, len(left_out), shared)
         observations, solution = _solved(views, mounts, sigma, known)
+        solution = _with_lags(views, observations, solution, sigma)
         cost = cost_of_sharing(observations, solution, seen)
         usual = usual_cost(cost, sigma)
         worse = bad_ones(cost, usual)
@@ -185,6 +192,14 @@ def _solved(
     if known is not None:
         observations = known.hold(observations, start, views.names)
     return observations, solve_rig(observations, start, sigma)
+
+
+def _with_lags(
+    views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float
+) -> Solution[RigState]:
+    """Return the solution with the lags of cameras where frames surely tell of them."""
+    times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
+    return with_lags(observations, solution, sigma, times, frame_numbers(views, observations))
 
 
 def _boards_px(seen: Sequence[FrameObservations]) -> float:

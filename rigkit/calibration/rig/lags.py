@@ -1,82 +1,216 @@
-"""What cameras without a common trigger have done to a rig: each lags by a time of its own, and boards go on meanwhile.
+"""Cameras without a common trigger: each lags by a time of its own behind the first, and boards go on meanwhile.
 
-A lag moves what a camera sees of a frame along the way that the board goes there, which the frames before and after
-tell. Boards that go the same way for a while make an error that frames have in common, so that their scatter does not
-show it. A step of the solver with a lag a camera says how far that would move lenses and mounts: that far they may be
-off, as where boards are not quite what they were taken for (`flatness`).
+Lags are solved for with all else, with the boards' ways made anew from the poses that come out (`moments`), where the
+images speak for them. They stay where frames agree on them far beyond their scatter: boards that stand, or are
+elsewhere in every frame, say nothing of lags, and ways through such frames are no motion that a camera has seen.
+
+A camera that runs freely lags by more in one frame than in the next. How much, between all frames, comes from how far
+views that share a pose disagree along their ways (expectation and maximisation); each picture's own time is then taken
+out of what it says.
+
+Reference: A. P. Dempster, N. M. Laird, D. B. Rubin, "Maximum likelihood from incomplete data via the EM algorithm",
+J. R. Statist. Soc. B 39 (1977), section 4.5, on variances of random effects.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.certainty.covariance import PoseJacobians
-from rigkit.calibration.rig.flatness import CHANCE_SIGMAS
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians, summed_products
-from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.solving.clustered import reduced_by_cluster
-from rigkit.calibration.solving.poses import steps_between
-from rigkit.core.arrays import FloatArray, scaled_pinv
-from rigkit.core.identifiers import natural_key
+from rigkit.calibration.rig.flatness import CHANCE_SIGMAS, STEP_DAMPING
+from rigkit.calibration.rig.frame_covariance import frame_covariance, residual_sigma
+from rigkit.calibration.rig.moments import Lag, Moments, ways_through
+from rigkit.calibration.rig.pose_jacobians import at_own_moment
+from rigkit.calibration.rig.solver import rig_normal, solve_rig
+from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.solving.clustered import LARGE_FREEDOM
+from rigkit.calibration.solving.linearise import normal_equations
+from rigkit.calibration.solving.solver import FROM_OPTIMUM, Solution
+from rigkit.core.arrays import BoolArray, FloatArray, IntArray
+from rigkit.core.identifiers import last_number, natural_key
+
+CHANCE = 0.01
+"""Of cameras that are triggered together so few are taken for lagging, with lags that may be none in their sigmas."""
+MAX_ROUNDS, SETTLED = 8, 0.01
+"""Ways and times of pictures are found anew until the cost changes by less than this part, so many times at most."""
+FIRST_SPREAD, LEAST_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
+"""By how much pictures of a camera lag differently, in the time between frames: where the search begins, the least that
+is told from nothing, and how many steps it makes."""
+ORDERS_DRAWN = 199
+"""Orders of the ways that are drawn for what chance does."""
+RIDGE, HELD = 1e-9, 1e12
+"""As parts of the largest information: keeps a pose that hardly a corner shows, and a time that is the frame's."""
 
 
-def lag_error(
-    observations: RigObservations,
-    state: RigState,
-    products: tuple[FloatArray, ...],
-    prior: FloatArray,
-    sigma_px: float,
-) -> FloatArray:
-    """Return by how much the globals but for released corners, (n,), would move if every camera but the first had a
-    lag; zero where views agree no better with one than by chance.
+def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
+    """Return the time of every key, (F,), in units of the usual time between two frames; NaN for views that share no
+    pose. The last numbers in the names of `frames` tell it, their order where these do not rise."""
+    names = sorted({frame for key, frame in frames.items() if key[0] == frame}, key=natural_key)
+    told = [last_number(name) for name in names]
+    numbers = np.array([float(n) if n.isdecimal() else 0.0 for n in told])
+    if not (np.diff(numbers) > 0.0).all():
+        numbers = np.arange(float(len(names)))
+    usual = np.median(np.diff(numbers)) if len(names) > 1 else 1.0
+    time = dict(zip(names, ((numbers - numbers[:1]) / usual).tolist(), strict=True))
+    return np.array([time[key[0]] if frames[key] == key[0] else np.nan for key in keys])
 
-    Parameters
-    ----------
-    products : those of every view of each camera (`view_products`).
-    prior : (n, n) information of the priors, px^2.
-    sigma_px : standard deviation of a corner, the disagreement of the frames counted in.
+
+def with_lags(
+    observations: RigObservations, solution: Solution[RigState], sigma_px: float, times: FloatArray, frames: IntArray
+) -> Solution[RigState]:
+    """Return the solution with lags and times of pictures, or the same where the frames do not surely tell of lags.
+
+    `times` (F,) of the keys, `sigma_px` as for `solve_rig`, `frames` as for `frame_covariance`.
     """
-    n, lags = len(prior), len(observations.cameras) - 1
-    layout, way = state.layout(observations), _ways(observations, state)
-    if not lags or not way.any():
-        return np.zeros(n)
-    each = []
-    for c, (own, lens) in enumerate(zip(products, layout.cameras, strict=True)):
-        parts = pose_jacobians(observations, state, c, state.of_camera(c, observations).translation_mm)
-        if c:
-            parts = [_with_lag(part, way, n + c - 1) for part in parts]
-        each.append((own, np.r_[lens.start : lens.stop, layout.shape.start : n], parts))
-    whole = summed_products(each, len(observations.keys), n + lags)
-    information, score = reduced_by_cluster(whole, n + lags, np.arange(len(whole)))
-    total = information.sum(axis=0)
-    total[:n, :n] += prior
-    # At the solution nothing pulls but the lags.
-    pull = np.append(np.zeros(n), score.sum(axis=0)[n:])
-    step = scaled_pinv(total) @ pull
-    if pull @ step < sigma_px**2 * (lags + CHANCE_SIGMAS * np.sqrt(2.0 * lags)):
-        return np.zeros(n)
-    return np.asarray(step[:n])
+    cameras, keys = len(observations.cameras), len(observations.keys)
+    none = np.zeros((cameras, keys))
+    start = Moments(none[:, 0], np.zeros((keys, 0, 6)), none, np.full_like(none, np.inf))
+    start = _through(start, solution.state, observations, times)
+    if cameras < 2 or not start.ways.any() or not _asked(observations, solution.state, start, sigma_px):
+        return solution
+    lagging = replace(solution, state=replace(solution.state, moments=start))
+    for own_times in (False, True):
+        for _ in range(MAX_ROUNDS):
+            state, before = lagging.state, lagging.normal.cost
+            moments = _through(state.moments or start, state, observations, times)
+            if own_times:
+                sigma = residual_sigma(observations, lagging, sigma_px)
+                moments = _with_own_times(replace(state, moments=moments), moments, observations, sigma)
+            lagging = solve_rig(observations, replace(state, moments=moments), sigma_px, FROM_OPTIMUM)
+            if abs(before - lagging.normal.cost) < SETTLED * before:
+                break
+        if not own_times and _chance(observations, lagging, sigma_px, frames) > CHANCE:
+            sigma = residual_sigma(observations, solution, sigma_px)
+            if _chance_of_scatter(solution.state, observations, start, sigma) > CHANCE:
+                return solution
+    return lagging
 
 
-def _with_lag(part: PoseJacobians, way: FloatArray, at: int) -> PoseJacobians:
-    """Return how views follow, with a lag of their camera among the globals."""
-    moved = np.broadcast_to(part.target, (len(part.views), 6, 6)) @ way[part.poses, :, None]
-    return replace(part, index=np.append(part.index, at), globals=np.concatenate([part.globals, moved], axis=-1))
-
-
-def _ways(observations: RigObservations, state: RigState) -> FloatArray:
-    """Return how the target of every pose goes on, (F, 6), in a frame's time: half of the way from the frame before to
-    the one after, in the order of their names; zero at the ends."""
-    keys, out = observations.keys, np.zeros((len(observations.keys), 6))
-    for target in dict.fromkeys(target for _, target in keys):
-        own = [f for f, key in enumerate(keys) if key[1] == target]
-        own.sort(key=lambda f: natural_key(keys[f][0]))
-        if len(own) > 2:
-            before, after = own[:-2], own[2:]
-            out[own[1:-1]] = 0.5 * steps_between(
-                (state.frame_rotation[before], state.frame_mm[before]),
-                (state.frame_rotation[after], state.frame_mm[after]),
-            )
+def lags_of(names: Sequence[str], state: RigState, covariance: FloatArray, lags: slice) -> dict[str, Lag]:
+    """Return the lags of all cameras but the first by their `names`, where they were solved for; `covariance` (G, G) is
+    that of the globals, of which they are the `lags`."""
+    if state.moments is None:
+        return {}
+    sigmas, out = np.sqrt(np.diag(covariance)[lags]), {}
+    for c, sigma in enumerate(sigmas.tolist(), 1):
+        known = state.moments.information[c]
+        # Of pictures that show a frame alone, or first, nothing is known but the frame's.
+        scatter = float(np.std(state.moments.own[c][np.isfinite(known)])) if np.isfinite(known).any() else 0.0
+        out[names[c]] = Lag(float(state.moments.lags[c]), sigma, scatter)
     return out
+
+
+def _through(moments: Moments, state: RigState, observations: RigObservations, times: FloatArray) -> Moments:
+    """Return the moments with ways through the poses of a state."""
+    targets = [target for _, target in observations.keys]
+    return replace(moments, ways=ways_through(state.frame_rotation, state.frame_mm, targets, times))
+
+
+def _asked(observations: RigObservations, state: RigState, start: Moments, sigma_px: float) -> bool:
+    """Say whether a step with lags takes more off the cost than it does by chance."""
+    state = replace(state, moments=start)
+    normal, more = rig_normal(observations, state, sigma_px), len(state.cameras) - 1
+    step, before = normal.step(STEP_DAMPING), normal.cost / max(2 * observations.corner_count, 1)
+    limit = max(before, sigma_px**2) * (more + CHANCE_SIGMAS * np.sqrt(2.0 * more))
+    return step is not None and step.predicted > limit
+
+
+def _chance(observations: RigObservations, solution: Solution[RigState], sigma_px: float, frames: IntArray) -> float:
+    """Return the probability of such lags where there are none: Wald's test, with the scatter between frames."""
+    # Imported here: scipy is slow to import, and few rigs ask.
+    from scipy.special import fdtrc
+
+    assert solution.state.moments is not None
+    found, run = solution.state.moments.lags[1:], solution.state.layout(observations).lags
+    known = frame_covariance(observations, solution, sigma_px, frames)[0].clustered
+    size = float(found @ np.linalg.pinv(known.covariance[run, run], hermitian=True) @ found) / len(found)
+    return float(fdtrc(len(found), min(known.freedom, LARGE_FREEDOM), size))
+
+
+def _with_own_times(state: RigState, moments: Moments, observations: RigObservations, sigma_px: float) -> Moments:
+    """Return the moments with how far the times of pictures scatter, by camera, and where each one probably lies, all
+    but poses as it is; `sigma_px` is the standard deviation of a corner."""
+    by_target = _by_target(state, observations)
+    free = _free(by_target)
+    products = _with_times(by_target, moments.speeds_at_all())
+    spread, own = np.where(free.any(axis=0), FIRST_SPREAD, 0.0), moments.own.T
+    poses, late = np.arange(6), np.arange(6, products.shape[1])
+    largest = np.maximum(np.einsum("fii->fi", products[..., :-1]).max(axis=1, keepdims=True), 1.0)
+    for _ in range(SPREAD_ROUNDS):
+        known = (sigma_px / np.maximum(spread, LEAST_SPREAD)) ** 2
+        information = np.where(free, known, HELD * largest)
+        system, right = products[..., :-1].copy(), products[..., -1].copy()
+        system[:, poses, poses] += RIDGE * largest
+        system[:, late, late] += information
+        right[:, 6:] -= information * own
+        inverse = np.linalg.inv(system)
+        found = own + np.einsum("fij,fj->fi", inverse, right)[:, 6:]
+        second = (found**2 + sigma_px**2 * np.einsum("fii->fi", inverse)[:, 6:]) * free
+        spread = np.sqrt(second.sum(axis=0) / np.maximum(free.sum(axis=0), 1))
+    information = np.where(free, information, np.inf)
+    return replace(moments, own=np.where(free, found, 0.0).T, information=information.T)
+
+
+def _by_target(state: RigState, observations: RigObservations) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what the views of n cameras say of the targets where they have seen them: information (n, F, 6, 6) and
+    score (n, F, 6); and how these places follow the poses, (n, F, 6, 6)."""
+    shape = len(state.cameras), len(observations.keys)
+    information, score, follow = np.zeros((*shape, 6, 6)), np.zeros((*shape, 6)), np.zeros((*shape, 6, 6))
+    follow[:] = np.eye(6)
+    for c, own in enumerate(observations.cameras):
+        alone, frame = state.of_camera(c, observations), observations.frame[c]
+        normal = normal_equations(own, alone.with_corners_held(), observations.weights[c])
+        turned = state.targets(c, observations)[0] @ np.swapaxes(state.frame_rotation[frame], -1, -2)
+        follow[c, frame, :3, :3] = turned
+        for part in at_own_moment(observations, state, c, alone.translation_mm):
+            back = np.swapaxes(part.target, -1, -2)
+            np.add.at(information[c], part.poses, back @ normal.pp[part.views] @ part.target)
+            np.add.at(score[c], part.poses, (back @ normal.p[part.views][:, :, None])[..., 0])
+    return information, score, follow
+
+
+def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: FloatArray) -> FloatArray:
+    """Return the products (F, 6 + n, 7 + n) of every pose, of the derivatives by it and by the own times of n cameras,
+    and of the residual; targets have `speeds` (n, F, 6)."""
+    information, score, by_pose = by_target
+    cameras, keys = score.shape[:2]
+    follow = np.zeros((cameras, keys, 6, 6 + cameras))
+    follow[..., :6] = by_pose
+    for c in range(cameras):
+        follow[c, :, :, 6 + c] = speeds[c]
+    back = np.swapaxes(follow, -1, -2)
+    return np.concatenate([back @ information @ follow, back @ score[..., None]], axis=-1).sum(axis=0)
+
+
+def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:
+    """Return whose own times are free, (F, n): of a frame's moments one is what its pose is of, that of the first
+    camera that sees it."""
+    shown = np.einsum("nfii->nf", by_target[0]) > 0.0
+    return np.asarray((shown & (np.cumsum(shown, axis=0) > 1)).T)
+
+
+def _chance_of_scatter(state: RigState, observations: RigObservations, start: Moments, sigma_px: float) -> float:
+    """Return the probability that views agree so much better with times of their own where ways have nothing to do
+    with them: those of other frames serve as well then."""
+    by_target, rng = _by_target(state, observations), np.random.default_rng(0)
+    free, known = _free(by_target), (sigma_px / FIRST_SPREAD) ** 2
+    ways = start.ways[:, 0]
+    moving = np.flatnonzero(ways.any(axis=1))
+
+    def gain(own: FloatArray) -> float:
+        products = _with_times(by_target, np.broadcast_to(own, (free.shape[1], *own.shape)))
+        largest = np.maximum(np.einsum("fii->fi", products[..., :-1]).max(axis=1, keepdims=True), 1.0)
+        held = np.concatenate(
+            [np.broadcast_to(RIDGE * largest, (len(own), 6)), np.where(free, known, HELD * largest)], 1
+        )
+        system, right = products[..., :-1] + held[:, :, None] * np.eye(held.shape[1]), products[..., -1:]
+        return float((right * np.linalg.solve(system, right)).sum())
+
+    found, better = gain(ways), 0
+    for _ in range(ORDERS_DRAWN):
+        other = ways.copy()
+        other[moving] = ways[rng.permutation(moving)]
+        better += gain(other) >= found
+    return (better + 1.0) / (ORDERS_DRAWN + 1.0)

@@ -12,22 +12,23 @@ from rigkit.cameras.base import Camera
 @dataclass(frozen=True, eq=False, slots=True)
 class Layout:
     """Where each kind of unknown stands among the globals: intrinsics of all cameras, mounts of all but the first, the
-    boards that have a place of their own on their target, the boards' shape."""
+    boards that have a place of their own on their target, lags of all cameras but the first, the boards' shape."""
 
     cameras: tuple[slice, ...]
     mounts: tuple[slice | None, ...]
     boards: tuple[slice | None, ...]
+    lags: slice
     shape: slice
 
     @classmethod
-    def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int) -> Layout:
-        """Lay out cameras of so many parameters each, boards that have a place to find or not, and the shape."""
-        ends = accumulate([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), shape], initial=0)
+    def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int, lags: int = 0) -> Layout:
+        """Lay out cameras of so many parameters each, boards that have a place to find or not, lags, and the shape."""
+        ends = accumulate([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), lags, shape], initial=0)
         runs = starmap(slice, pairwise(ends))
         cameras = tuple(next(runs) for _ in sizes)
         mounts = (None, *(next(runs) for _ in sizes[1:]))
         boards = tuple(next(runs) if place else None for place in places)
-        return cls(cameras, mounts, boards, next(runs))
+        return cls(cameras, mounts, boards, next(runs), next(runs))
 
     @classmethod
     def of_cameras(cls, cameras: Iterable[Camera]) -> Layout:

@@ -26,15 +26,36 @@ def pose_jacobians(
     observations: RigObservations, state: RigState, c: int, translation_mm: Points
 ) -> list[PoseJacobians]:
     """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from targets, its mount where that
-    is free, and (board by board, where boards have places on a target) from these."""
+    is free, (board by board, where boards have places on a target) from these, and from its lag where cameras lag."""
+    parts = at_own_moment(observations, state, c, translation_mm)
+    if state.moments is None:
+        return parts
+    frame, lag = observations.frame[c], state.layout(observations).lags.start + c - 1
+    meanwhile = state.targets(c, observations)[0] @ np.swapaxes(state.frame_rotation[frame], -1, -2)
+    return [state.moments.at_reference(part, c, meanwhile[part.views], lag) for part in parts]
+
+
+def gone_in_cam(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> FloatArray:
+    """Return by how much the boards of all views of camera `c` go on at their moments, (V, 6) a unit of time."""
+    out = np.zeros((len(translation_mm), 6))
+    for part in at_own_moment(observations, state, c, translation_mm):
+        if state.moments is not None:
+            out[part.views] = (part.target @ state.moments.speeds(c, part.poses)[:, :, None])[..., 0]
+    return out
+
+
+def at_own_moment(
+    observations: RigObservations, state: RigState, c: int, translation_mm: Points
+) -> list[PoseJacobians]:
+    """Return how the views of camera `c` follow from the targets where it has seen them, mount and places."""
     layout, frame, lever = state.layout(observations), observations.frame[c], translation_mm - state.mount_mm[c]
     turn = state.mount_rotation[c]
     if not observations.tied:
         return [pose_jacobians_of_mount(turn, layout.mounts[c], frame, lever)]
-    out, board = [], observations.cameras[c].board
+    out, board, rotation = [], observations.cameras[c].board, state.targets(c, observations)[0]
     for b in np.unique(board).tolist():
         views = np.flatnonzero(board == b)
-        onto = turn @ state.frame_rotation[frame[views]]
+        onto = turn @ rotation[views]
         place = np.zeros((len(views), 6, 6))
         place[:, :3, :3] = place[:, 3:, 3:] = onto
         target = _swung(onto @ state.board_mm[b]) @ _turned(turn)

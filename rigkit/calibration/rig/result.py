@@ -13,6 +13,7 @@ from rigkit.calibration.pupil import SolvedPupil
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_rig import BoardRig
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.moments import Lag
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.calibration.solving.solver import Convergence
 from rigkit.cameras.base import Camera
@@ -72,6 +73,7 @@ class RigCalibration:
     departures : of each camera what its lens may do beyond its model, and how the rest of the rig is off with it; empty
         where that is not known.
     pupils : by name those that move, solved for with all else; their `with_frame` is with what `covariance` is of.
+    lags : by name of all cameras but the first, where they have no common trigger and boards moved; else empty.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -91,6 +93,7 @@ class RigCalibration:
     verdicts: tuple[Finding, ...] = ()
     departures: tuple[LensModes, ...] = ()
     pupils: Mapping[str, SolvedPupil] = field(default_factory=dict)
+    lags: Mapping[str, Lag] = field(default_factory=dict)
 
     _repr_html_ = drawn
 

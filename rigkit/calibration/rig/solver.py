@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.moments import without_own_times
+from rigkit.calibration.rig.pose_jacobians import gone_in_cam, pose_jacobians
 from rigkit.calibration.rig.state import RigObservations, RigState
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
@@ -34,6 +35,9 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
     for c, own in enumerate(observations.cameras):
         alone = state.of_camera(c, observations)
         n = normal_equations(own, alone, observations.weights[c])
+        if (moments := state.moments) is not None:
+            f, gone = observations.frame[c], gone_in_cam(observations, state, c, alone.translation_mm)
+            n = without_own_times(n, gone, moments.own[c, f], moments.information[c, f])
         each.append(n)
         size = alone.camera.parameters.size
         # Where the camera's own unknowns stand in the rig, and by themselves.
@@ -64,7 +68,8 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
                 gg[there, index] += both
                 gg[index, there] += both.T
     released = None
-    if observations.shape.kind == "released":
+    # Pictures with times of their own couple the points that they show.
+    if observations.shape.kind == "released" and state.moments is None:
         released = layout.shape.start + observations.shape.basis.shape[-1]
     return replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
 

@@ -4,6 +4,9 @@ A target is what keeps its shape while it moves before the cameras: a single boa
 other, whose frame is that of the first of them. The camera c sees board b of the target of frame f at
 
     cam_from_board = cam_from_rig[c] rig_from_target[f] target_from_board[b].
+
+Where cameras lag, rig_from_target is that of the first camera's moment, and each sees the target where it has gone
+meanwhile (`rigkit.calibration.rig.moments`).
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.moments import Moments
 from rigkit.calibration.solving.normal_equations import SchurStep
 from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State
@@ -79,7 +83,8 @@ class RigObservations:
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigState:
     """Cameras, their mounts cam_from_rig (n, 3, 3), (n, 3) mm, the first the identity, rig_from_target of every key
-    (F, 3, 3), (F, 3) mm, target_from_board of every board (B, 3, 3), (B, 3) mm, and the shape's unknowns."""
+    (F, 3, 3), (F, 3) mm, target_from_board of every board (B, 3, 3), (B, 3) mm, the shape's unknowns, and where cameras
+    have no common trigger the moments of their pictures."""
 
     cameras: tuple[Camera, ...]
     mount_rotation: Mat3
@@ -89,15 +94,23 @@ class RigState:
     board_rotation: Mat3
     board_mm: Points
     unknowns: FloatArray
+    moments: Moments | None = None
 
     def layout(self, observations: RigObservations) -> Layout:
         """Return where the unknowns stand."""
-        return Layout.of([c.parameters.size for c in self.cameras], observations.places, observations.shape.count)
+        lags = 0 if self.moments is None else len(self.cameras) - 1
+        sizes = [c.parameters.size for c in self.cameras]
+        return Layout.of(sizes, observations.places, observations.shape.count, lags)
+
+    def targets(self, c: int, observations: RigObservations) -> tuple[Mat3, Points]:
+        """Return rig_from_target of every view of camera `c` when it was taken, (V, 3, 3) and (V, 3)."""
+        f = observations.frame[c]
+        poses = self.frame_rotation[f], self.frame_mm[f]
+        return poses if self.moments is None else self.moments.targets(c, f, poses)
 
     def of_camera(self, c: int, observations: RigObservations) -> State:
         """Return the state of camera `c` alone, every view with its pose in that camera."""
-        f = observations.frame[c]
-        rotation, place = self.frame_rotation[f], self.frame_mm[f]
+        rotation, place = self.targets(c, observations)
         if observations.tied:
             b = observations.cameras[c].board
             place = place + np.einsum("vij,vj->vi", rotation, self.board_mm[b])
@@ -119,6 +132,7 @@ class RigState:
             board_rotation=exp_so3(boards[:, :3]) @ self.board_rotation,
             board_mm=self.board_mm + boards[:, 3:],
             unknowns=self.unknowns + step.globals[layout.shape],
+            moments=None if self.moments is None else self.moments.moved(step.globals[layout.lags]),
         )
 
     def with_frames(self, other: RigState) -> RigState:

@@ -43,7 +43,23 @@ def judge_rig(
         for camera in rig.cameras
         for said in modelled_pupil(camera.calibration)
     ]
-    return (headline, *pupils, *others)
+    return (headline, *pupils, *_lags(rig), *others)
+
+
+def _lags(rig: RigCalibration) -> list[Finding]:
+    return [Finding.good(f"{'; '.join(lag_words(rig))}: boards are taken where they were then")] if rig.lags else []
+
+
+def lag_words(rig: RigCalibration) -> list[str]:
+    """Return in words when each camera took its pictures, where they have no common trigger."""
+    first, out = rig.cameras[0].name, []
+    for name, lag in rig.lags.items():
+        when = "after" if lag.frames >= 0.0 else "before"
+        out.append(
+            f"camera '{name}' takes its pictures {abs(lag.frames):.3f} +- {lag.sigma:.3f} of the time between two "
+            f"frames {when} '{first}' (they vary by {lag.scatter:.3f})"
+        )
+    return out
 
 
 def _not_converged(rig: RigCalibration) -> list[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import combinations, zip_longest
 from pathlib import Path
 from typing import Any
@@ -147,6 +147,7 @@ def rig_text(rig: RigCalibration, made: Made | None = None) -> str:
                 "outline_px": outline_of_corners(c.calibration).round(1).tolist(),
                 **({} if own is None else {"departures": _rows_of(own)}),
                 **({} if c.name not in rig.pupils else {"pupil": pupil_to_json(rig.pupils[c.name])}),
+                **({} if c.name not in rig.lags else {"lag": asdict(rig.lags[c.name])}),
             }
             for c, own in zip_longest(rig.cameras, rig.departures)
         ],
@@ -179,7 +180,7 @@ def load_saved_rig(path: str | Path) -> SavedRig:
     pupils: dict[str, SolvedPupil] = {}
     with damage_named(path):
         for entry in data["cameras"]:
-            if set(entry) | {"outline_px", "departures", "pupil"} != RIG_CAMERA_KEYS:
+            if set(entry) | {"outline_px", "departures", "pupil", "lag"} != RIG_CAMERA_KEYS:
                 raise InputError(
                     f"'{path}': a camera must have the keys {', '.join(sorted(RIG_CAMERA_KEYS))}, no others"
                 )

@@ -142,6 +142,11 @@ RIG_FILE = file(
                     "and how much what `covariance` is of is off with them",
                 ),
                 "pupil?": _PUPIL,
+                "lag?": said(
+                    obj({"frames": NUMBER, "sigma": NUMBER, "scatter": NUMBER}),
+                    "by how much it takes its pictures after the first, the standard deviation of that, and by how "
+                    "much its pictures lag differently, in the usual time between two frames",
+                ),
             },
             "the first is the rig's frame",
             min_items=1,

@@ -1,0 +1,140 @@
+"""When each camera took its pictures, and where targets were then: cameras without a common trigger.
+
+A camera lags behind the first by a time of its own, and each of its pictures by a little more or less. Meanwhile a
+target has gone on, along a polynomial of time through its poses in the frames before and after: the pose of key f has
+made the step  s(t) = sum_k ways[f, k] t^(k + 1)  after the time t. Times are in units of the time between two frames.
+
+What a picture's own time does to it, the derivative u by that time, is taken out of its view before the rest is solved
+for: of the products M of the columns of a view,  M - (M u) (M u)^T / (u^T M u + information)  are left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rigkit.calibration.certainty.covariance import PoseJacobians
+from rigkit.calibration.solving.normal_equations import NormalEquations
+from rigkit.calibration.solving.poses import steps_between
+from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
+from rigkit.geometry.board_pose import stepped
+
+POINTS, MIN_POINTS = 5, 3
+"""Poses that a way goes through, the frame's own counted in. Swings of 1.5 s, six frames a second: a fifth order's
+speeds are 1 % off in the middle and 5 % at the ends, a third order's 8 and 16 %."""
+WAY_REACH = 4.0
+"""So many times between two frames may lie between a frame and those that its way goes through."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """By how much a camera takes its pictures after the first of its rig, and the standard deviation of that; by how
+    much its pictures lag differently (standard deviation). In units of the usual time between two frames."""
+
+    frames: float
+    sigma: float
+    scatter: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Moments:
+    """The moments of pictures.
+
+    Attributes
+    ----------
+    lags : (n,) of the cameras, the first zero.
+    ways : (F, K, 6) of the targets, in the rig.
+    own : (n, F) by how much more a camera lags in the frame of a key.
+    information : (n, F) px^2 a squared unit, of `own` about zero; infinite where that is zero.
+    """
+
+    lags: FloatArray
+    ways: FloatArray
+    own: FloatArray
+    information: FloatArray
+
+    def moved(self, step: FloatArray) -> Moments:
+        """Return the moments after a step (n - 1,) of the lags."""
+        return replace(self, lags=self.lags + np.append(0.0, step))
+
+    def turned(self, turn: Mat3) -> Moments:
+        """Return the same in a rig that has been turned, (3, 3)."""
+        return replace(self, ways=(self.ways.reshape(-1, 3) @ turn.T).reshape(self.ways.shape))
+
+    def targets(self, c: int, key: IntArray, poses: tuple[Mat3, Points]) -> tuple[Mat3, Points]:
+        """Return rig_from_target of views (V,) of camera `c` at their own moments, from the `poses` of their keys."""
+        powers = self._times(c, key) ** np.arange(1.0, self.ways.shape[1] + 1.0)
+        rotation, place = stepped(poses, np.einsum("vks,vk->vs", self.ways[key], powers))
+        return rotation, place
+
+    def speeds(self, c: int, key: IntArray) -> FloatArray:
+        """Return how the targets of views of camera `c` go on at their moments, (V, 6) a unit of time."""
+        order = np.arange(float(self.ways.shape[1]))
+        return np.einsum("vks,vk->vs", self.ways[key], (order + 1.0) * self._times(c, key) ** order)
+
+    def speeds_at_all(self) -> FloatArray:
+        """Return the speeds of all targets at the moments of all cameras, (n, F, 6)."""
+        keys = np.arange(len(self.ways))
+        return np.array([self.speeds(c, keys) for c in range(len(self.lags))])
+
+    def _times(self, c: int, key: IntArray) -> FloatArray:
+        return (self.lags[c] + self.own[c, key])[:, None]
+
+    def at_reference(self, part: PoseJacobians, c: int, meanwhile: Mat3, lag: int) -> PoseJacobians:
+        """Return how views of camera `c` follow the targets as they are at the first camera's moment, and the `lag`
+        among the globals, from how they follow them at their own: the targets have turned by `meanwhile` (V, 3, 3)."""
+        speed, since = self.speeds(c, part.poses)[:, :, None], np.zeros((len(part.views), 6, 6))
+        since[:, :3, :3], since[:, 3:, 3:] = meanwhile, np.eye(3)
+        index, follow = part.index, part.globals
+        if c:
+            index, follow = np.append(index, lag), np.concatenate([follow, part.target @ speed], axis=-1)
+        return replace(part, target=part.target @ since, index=index, globals=follow)
+
+
+def without_own_times(
+    normal: NormalEquations, gone: FloatArray, own: FloatArray, information: FloatArray
+) -> NormalEquations:
+    """Return the normal equations of a camera's views without the pictures' own times `own` (V,), by which their poses
+    have `gone` (V, 6) a unit of time: whatever these are, they cost `information` (V,) times their squares."""
+    (products,), free = normal.products, np.isfinite(information)
+    own, information, gone = (np.where(free, own, 0.0), np.where(free, information, 1.0), gone * free[:, None])
+    pose = slice(-7, -1)
+    by_time = np.einsum("vij,vj->vi", products[:, :, pose], gone)
+    known = np.einsum("vi,vi->v", by_time[:, pose], gone) + information
+    by_time[:, -1] -= information * own
+    left = products - by_time[:, :, None] * (by_time / known[:, None])[:, None]
+    left[:, -1, -1] += information * own**2
+    by_globals = np.einsum("vgi,vi->vg", normal.gp, gone)
+    part = by_globals / known[:, None]
+    return replace(
+        normal,
+        gg=normal.gg - by_globals.T @ part,
+        gp=normal.gp - part[:, :, None] * by_time[:, None, pose],
+        pp=left[:, pose, pose],
+        g=normal.g - part.T @ by_time[:, -1],
+        p=left[:, pose, -1],
+        costs=normal.costs + information * own**2 - by_time[:, -1] ** 2 / known,
+        products=(left,),
+    )
+
+
+def ways_through(rotation: Mat3, place: Points, targets: Sequence[str], times: FloatArray) -> FloatArray:
+    """Return the ways (F, POINTS - 1, 6) through the poses (F, 3, 3) and (F, 3) of `targets`, at `times` (F,): nothing
+    where they are not known, or where fewer than MIN_POINTS poses are near enough in time."""
+    ways = np.zeros((len(times), POINTS - 1, 6))
+    for target in dict.fromkeys(targets):
+        own = np.array([f for f, t in enumerate(targets) if t == target and np.isfinite(times[f])], dtype=np.int64)
+        own = own[np.argsort(times[own])]
+        for i, f in enumerate(own):
+            first = min(max(i - POINTS // 2, 0), max(len(own) - POINTS, 0))
+            near = np.array(
+                [k for k in own[first : first + POINTS] if k != f and abs(times[k] - times[f]) <= WAY_REACH]
+            )
+            if len(near) + 1 < MIN_POINTS:
+                continue
+            here = (np.repeat(rotation[f : f + 1], len(near), 0), np.repeat(place[f : f + 1], len(near), 0))
+            powers = (times[near] - times[f])[:, None] ** np.arange(1.0, len(near) + 1.0)
+            ways[f, : len(near)] = np.linalg.solve(powers, steps_between(here, (rotation[near], place[near])))
+    return ways
