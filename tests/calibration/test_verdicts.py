@@ -11,6 +11,8 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
+from rigkit.calibration.judging import verdicts
+from rigkit.calibration.judging.changing import CHANGES
 from rigkit.calibration.judging.verdicts import judge_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import fit_model, identifiable
@@ -46,6 +48,16 @@ def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
     assert said(result, "tilted by more than") and result.verdicts[0].severity is Severity.BAD
     assert said(result, "where the boards were, most in the")
     assert said(result, "no corners in the whole left, whole right")
+
+
+@pytest.mark.parametrize(("tilt_deg", "told"), [((0.0, 3.0), False), ((10.0, 45.0), True)])
+def test_boards_all_alike_tell_no_motion(
+    tilt_deg: tuple[float, float], told: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They leave a lens open whose misfit looks like a motion, or a zoom, of each image."""
+    monkeypatch.setattr(verdicts, "changing", lambda *_: [CHANGES["rows"]])
+    views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=20.0, tilt_deg=tilt_deg)
+    assert said(calibrate(views, SIZE, model="brown", board="flat"), "rolling shutter") == told
 
 
 def test_boards_that_face_a_fisheye_from_all_sides_are_tilted_enough(rng: np.random.Generator) -> None:

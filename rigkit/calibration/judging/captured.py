@@ -80,10 +80,14 @@ def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]
     return [
         *(_repeated(images, number) if _hardly_any(images, number) else []),
         *_too_few(images, number),
-        *_tilts(calibration),
-        *_parallel(calibration),
+        *hardly_tilted(calibration),
         *_distances(calibration),
     ]
+
+
+def hardly_tilted(c: Calibration) -> list[Finding]:
+    """Return findings where boards are not tilted against the image, or all alike."""
+    return [*_tilts(c), *_parallel(c)]
 
 
 def few_repeated(calibration: Calibration, clusters: IntArray) -> list[Finding]:

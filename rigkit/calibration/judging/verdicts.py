@@ -21,6 +21,7 @@ from rigkit.calibration.judging.captured import (
     Extent,
     extrapolated,
     few_repeated,
+    hardly_tilted,
     judge_capture,
     same_way_up,
 )
@@ -159,6 +160,9 @@ def _residuals(
     # Where it was another lens later on, residuals of one for both are of no motion, of no board, and no second cause.
     but = CHANGES if worst(also) is Severity.BAD else ()
     change = changing(c, correlation, solved, but, clusters)
+    if hardly_tilted(c):
+        # A lens that such boards leave open gives their images shears and zooms of their own: nobody can tell.
+        change = [finding for finding in change if finding.severity is Severity.BAD]
     # A pupil that moves looks a little like a zoom in every image, and what changes never like a pupil.
     return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
 
