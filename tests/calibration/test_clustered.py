@@ -112,6 +112,17 @@ def test_one_cluster_says_nothing() -> None:
     assert (found.covariance == 0.25 * unit).all() and found.overdispersion == 1.0 and np.isinf(found.freedom)
 
 
+def test_images_that_agree_too_well_do_so_by_chance(rng: np.random.Generator) -> None:
+    """With half of the pulls that independent corners have, sigmas stay those of independent corners."""
+    rows = rng.normal(size=(8, 60, 3))
+    information = np.swapaxes(rows, 1, 2) @ rows
+    score = 0.5 * np.einsum("vrn,vr->vn", rows, rng.normal(size=(8, 60)))
+    unit = np.linalg.inv(information.sum(axis=0))
+    found = clustered_covariance(unit, information, score, np.zeros((3, 3)), 1.0)
+    assert found.overdispersion == 1.0
+    assert np.trace(found.covariance @ np.linalg.inv(unit)) == pytest.approx(3.0)
+
+
 def test_three_images_say_how_much_they_disagree() -> None:
     camera, squared, predicted = lens("fish"), [], []
     rng = np.random.default_rng(8)
