@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.boards import Board
@@ -17,6 +19,9 @@ from rigkit.validation.check import Check
 from rigkit.workflows.calibration.next_pictures import next_views
 from rigkit.workflows.inputs.corners import SessionCorners, named_images
 from rigkit.workflows.outputs.provenance import digest_line, digest_of_images, software_facts
+
+MAX_PICTURES = 240
+"""Each is 20 kB on the page: with those of 3000 images it had 64 MB."""
 
 
 def session_page(session: Session, calibration: Calibration, corners: SessionCorners, files: Mapping[Path, str]) -> str:
@@ -65,13 +70,18 @@ def _boards_in_words(boards: Sequence[Board]) -> str:
 
 
 def _thumbnails(session: Session, calibration: Calibration) -> dict[str, bytes]:
-    """Return a small picture of every image that is there, used or left out, with the corners found in it."""
+    """Return a small picture of every image that is there, used or left out, with the corners found in it; of many
+    images those that are left out, and those with the largest errors."""
     views: dict[str, list[ViewResult]] = {image: [] for image, _ in calibration.dropped}
+    worst = dict.fromkeys(views, np.inf)
     for view in calibration.views:
         views.setdefault(view.image, []).append(view)
+        error = float((view.residuals_px[view.kept] ** 2).sum(axis=-1).mean()) if view.kept.any() else np.inf
+        worst[view.image] = max(worst.get(view.image, 0.0), error)
+    shown = set(sorted(worst, key=lambda name: worst[name])[-MAX_PICTURES:])
     out = {}
     for name, path in named_images(session).items():
-        if name in views:
+        if name in shown:
             try:
                 out[name] = thumbnail_jpeg(read_image(path), views[name], count=len(session.images))
             except InputError:
