@@ -254,7 +254,7 @@ static void write_circle(
 /* Return the circle and those `beside` it that reach into its pixels, as their guesses have them. */
 static group_t grouped(
     int64_t n, const double *pixels, const double *maps, const double *curvatures, const double *blur, const double *uneven,
-    const int64_t *beside, const circle_rules_t *rules)
+    double reach, const int64_t *beside, const circle_rules_t *rules)
 {
     group_t group = {.own = guessed(pixels + 2 * n, maps + 4 * n, curvatures + 6 * n, blur[n], uneven + 2 * n)};
     for (int k = 0; k < BESIDE; k++) {
@@ -262,10 +262,11 @@ static group_t grouped(
         if (j < 0)
             continue;
         circle_t other = guessed(pixels + 2 * j, maps + 4 * j, curvatures + 6 * j, blur[n], uneven + 2 * n);
-        /* Both are as wide as the larger of their sides on the way from one to the other; half of what is left is its own. */
+        /* It is as wide as the larger of its sides on the way from one to the other, and so far the pixels go. */
         const double u = other.c[0] - group.own.c[0], v = other.c[1] - group.own.c[1], apart = hypot(u, v);
-        const double *M = other.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
-        if (0.5 * apart - wide < rules->near_beside * blur[n] && apart > 1.0 && inverted(&other))
+        const double *M = other.M, *own = group.own.M, wide = hypot(M[0] * u + M[2] * v, M[1] * u + M[3] * v) / apart;
+        const double far = reach * hypot(own[0] * u + own[2] * v, own[1] * u + own[3] * v) / apart;
+        if (apart - far - wide < rules->near_beside * blur[n] && apart > 1.0 && inverted(&other))
             group.beside[group.count++] = other;
     }
     return group;
@@ -281,7 +282,7 @@ void fit_circles(
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * CIRCLE_OUTCOMES;
         memset(result, 0, CIRCLE_OUTCOMES * sizeof(double));
-        group_t group = grouped(n, pixels, maps, curvatures, blur, uneven, beside, rules);
+        group_t group = grouped(n, pixels, maps, curvatures, blur, uneven, reach[n], beside, rules);
         circle_t *at = &group.own;
         const double band = rules->near_sigmas * at->s + rules->near_px;
         if (!inverted(at))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,14 +12,12 @@ from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
 from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, edge_reach, fit_circles
-from rigkit.detection.circles.local_map import PlaneMap, local_maps, with_smooth_curvatures
+from rigkit.detection.circles.local_map import CORNERS, PlaneMap, beside_each, local_maps, steps, with_smooth_curvatures
+from rigkit.detection.circles.rows import joined, rows_of
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.kernels.circles import BESIDE
 
 if TYPE_CHECKING:
     from rigkit.detection.circles.lattices import LabelledBlobs
-
-Rows = TypeVar("Rows", CircleFit, PlaneMap)
 
 FIRST_EDGE_BLUR = 0.8
 MIN_CIRCLES, MIN_SIDE = 9, 3
@@ -48,6 +46,8 @@ BLUR_ROUNDS = 3
 """The second has the neighbours' centres and sizes from the first, which took away up to 0.1 px (RENDERED, hexagonal,
 blur 3 px); the third, where that changed by how much the blur differs with the direction, has it from what the
 neighbours' light leaves, and circles that this light had hidden."""
+MIXED_ROUNDS = 2
+"""The second has the neighbours' sizes, and how much the blur differs with the direction, from the first."""
 FIRST_LENIENCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
@@ -131,28 +131,51 @@ class _Draft:
     hexagonal: bool
     bright: bool
     uneven_px2: FloatArray = field(default_factory=lambda: np.zeros(2))
+    mixed: bool = False
+
+    @property
+    def corner(self) -> float:
+        """Return how far pixels are a circle's own, over half the way to its neighbours."""
+        return CORNERS[self.hexagonal] if self.mixed else 1.0
 
     def chosen(self, which: BoolArray) -> _Draft:
         return replace(self, label=self.label[which], fit=rows_of(self.fit, which), around=rows_of(self.around, which))
 
 
 def _grown(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, quick: bool) -> CircleGrid | None:
-    own = blobs.chosen(found.index)
-    around = local_maps(found.label, own.pixels, found.label, hexagonal=found.hexagonal, sigma_px=FIRST_SIGMA_PX)
-    radius = _radius(own.shape, around.first)
-    bright = bool(own.sign[0] > 0)
-    fit = _fitted(grey, own.pixels, around, radius, np.full(len(own), FIRST_EDGE_BLUR), np.zeros(2))
-    draft = _Draft(label=found.label, fit=fit, around=around, radius=radius, hexagonal=found.hexagonal, bright=bright)
-    draft = _judged(draft, FIRST_LENIENCE)
+    draft = _first(grey, blobs, found)
     for step in () if quick else (_again, _with_all, _again):
         if _enough(draft):
             draft = step(grey, draft)
+    if not (_enough(draft) or quick):
+        draft = _mixed(grey, _first(grey, blobs, found, beside=True))
     if not _enough(draft):
         return None
     evidence = _evidence(draft)
     if evidence.convincing and not quick:
         draft = _through_its_blur(grey, draft)
     return _finished(draft, evidence, (grey.shape[1], grey.shape[0]))
+
+
+def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool = False) -> _Draft:
+    """Return the circles that blobs are; `beside`: fitted with the light of neighbours."""
+    own, label, hexagonal = blobs.chosen(found.index), found.label, found.hexagonal
+    around = local_maps(label, own.pixels, label, hexagonal=hexagonal, sigma_px=FIRST_SIGMA_PX)
+    radius = _radius(own.shape, around.first)
+    others, corner = (beside_each(label, hexagonal), CORNERS[hexagonal]) if beside else (None, 1.0)
+    blur = np.full(len(own), FIRST_EDGE_BLUR)
+    fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others)
+    bright = bool(own.sign[0] > 0)
+    draft = _Draft(label=label, fit=fit, around=around, radius=radius, hexagonal=hexagonal, bright=bright, mixed=beside)
+    return _judged(draft, FIRST_LENIENCE)
+
+
+def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
+    """Return the draft of circles that are not fitted without their neighbours' light: blur or motion mixes it."""
+    for _ in range(MIXED_ROUNDS):
+        if _enough(draft):
+            draft = _again(grey, replace(draft, uneven_px2=_uneven(draft)), beside=True)
+    return draft
 
 
 def _with_all(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
@@ -181,6 +204,7 @@ def _fitted(
     pixels: FloatArray,
     around: PlaneMap,
     radius: float,
+    corner: float,
     blur_px: FloatArray,
     uneven_px2: FloatArray,
     beside: IntArray | None = None,
@@ -188,7 +212,7 @@ def _fitted(
 ) -> CircleFit:
     """Return the circles of maps, fitted but for the first `known`, which only shine on those beside them."""
     maps = radius * around.first
-    reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded)
+    reach = edge_reach(maps, 0.5 / radius, blur_px, around.surrounded, corner)
     reach[:known] = 0.0
     return fit_circles(grey, pixels, maps, radius**2 * around.second, blur_px, reach, beside, uneven_px2)
 
@@ -251,8 +275,8 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     size_px = (grey.shape[1], grey.shape[0])
     around = with_smooth_curvatures(around, draft.label, fit.pixels, size_px, hexagonal=draft.hexagonal)
     radius = _radius(fit.maps, around.first)
-    others = _beside_each(draft.label, draft.hexagonal) if beside else None
-    fresh = _fitted(grey, fit.pixels, around, radius, fit.blur_px, draft.uneven_px2, others)
+    others = beside_each(draft.label, draft.hexagonal) if beside else None
+    fresh = _fitted(grey, fit.pixels, around, radius, draft.corner, fit.blur_px, draft.uneven_px2, others)
     return _judged(replace(draft, fit=fresh, around=around, radius=radius))
 
 
@@ -293,20 +317,6 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
     return draft
 
 
-def _beside_each(label: IntArray, hexagonal: bool) -> IntArray:
-    """Return which circles (N, BESIDE) are the neighbours of each, -1 where there is none."""
-    low = label.min(axis=0) - 1
-    table = np.full(np.ptp(label, axis=0) + 3, -1)
-    table[tuple((label - low).T)] = np.arange(len(label))
-    around = table[tuple((label[:, None] + _steps(hexagonal) - low).transpose(2, 0, 1))]
-    return np.pad(around, ((0, 0), (0, BESIDE - around.shape[1])), constant_values=-1)
-
-
-def _steps(hexagonal: bool) -> IntArray:
-    """Return the steps to a circle's neighbours, (4, 2) or (6, 2)."""
-    return np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if hexagonal else [])])
-
-
 def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
     """Return the draft with circles found beside its own, or None if there are none."""
     fit = draft.fit
@@ -317,13 +327,13 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
     near = np.linalg.norm(tried.pixels - around.pixels, axis=1) < OFF_PLACE * _spacing(around)
     if not near.any():
         return None
-    joined = replace(
+    grown = replace(
         draft,
         label=np.concatenate([draft.label, places[near]]),
-        fit=_joined(fit, rows_of(tried, near)),
-        around=_joined(draft.around, rows_of(around, near)),
+        fit=joined(fit, rows_of(tried, near)),
+        around=joined(draft.around, rows_of(around, near)),
     )
-    judged = _judged(joined)
+    judged = _judged(grown)
     return judged if len(judged.label) > len(draft.label) else None
 
 
@@ -331,17 +341,17 @@ def _tried(grey: GreyImage, draft: _Draft, places: IntArray, around: PlaneMap, *
     """Return the circles fitted at places beside those of the draft."""
     pixels, blur = around.pixels, np.full(len(places), float(np.median(draft.fit.blur_px)))
     if not beside:
-        return _fitted(grey, pixels, around, draft.radius, blur, draft.uneven_px2)
-    others = _beside_each(np.concatenate([draft.label, places]), draft.hexagonal)
+        return _fitted(grey, pixels, around, draft.radius, draft.corner, blur, draft.uneven_px2)
+    others = beside_each(np.concatenate([draft.label, places]), draft.hexagonal)
     pixels, blur = np.concatenate([draft.fit.pixels, pixels]), np.concatenate([draft.fit.blur_px, blur])
-    every, known = _joined(draft.around, around), len(draft.label)
-    fit = _fitted(grey, pixels, every, draft.radius, blur, draft.uneven_px2, others, known)
+    every, known = joined(draft.around, around), len(draft.label)
+    fit = _fitted(grey, pixels, every, draft.radius, draft.corner, blur, draft.uneven_px2, others, known)
     return rows_of(fit, np.arange(len(pixels)) >= known)
 
 
 def _beside(draft: _Draft, size_px: tuple[int, int]) -> tuple[IntArray, PlaneMap]:
     """Return the places next to circles of the draft that would lie in the image whole, and the maps there."""
-    step = _steps(draft.hexagonal)
+    step = steps(draft.hexagonal)
     known = {tuple(label) for label in draft.label.tolist()}
     beside = {tuple(place) for place in (draft.label[:, None] + step).reshape(-1, 2).tolist()}
     places = np.array(sorted(beside - known), np.int64).reshape(-1, 2)
@@ -386,16 +396,3 @@ def _finished(draft: _Draft, evidence: GridEvidence, size_px: tuple[int, int]) -
         empty=empty,
         evidence=evidence,
     )
-
-
-def rows_of(table: Rows, which: BoolArray) -> Rows:
-    """Return some rows of a class of arrays."""
-    return type(table)(**{name: getattr(table, name)[which] for name in _names(table)})
-
-
-def _joined(one: Rows, two: Rows) -> Rows:
-    return type(one)(**{name: np.concatenate([getattr(one, name), getattr(two, name)]) for name in _names(one)})
-
-
-def _names(table: CircleFit | PlaneMap) -> list[str]:
-    return [field.name for field in fields(table)]

@@ -17,7 +17,7 @@ from rigkit.detection.saddles.response import GreyImage
 from rigkit.kernels import circles as kernel
 
 NEAR_BESIDE = 3.0
-"""Blur brings light of a neighbour half of whose distance is less than so many sigmas: a 700th of it."""
+"""Blur brings light of a neighbour into pixels that lie less than so many sigmas off it: a 700th of it."""
 RULES = kernel.CircleRules.of(
     near_sigmas=4.0,
     near_px=3.0,
@@ -87,13 +87,16 @@ class CircleFit:
         return np.asarray(np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)))
 
 
-def edge_reach(maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray) -> FloatArray:
+def edge_reach(
+    maps: FloatArray, half_way: float, blur_px: FloatArray, surrounded: BoolArray, corner: float = 1.0
+) -> FloatArray:
     """Return to how many radii (N,) pixels are a circle's own.
 
-    That is half the way to the next circle; where there is none, the sheet may end there.
+    That is half the way to the next circle; where there is none, the sheet may end there. Where blur mixes the light of
+    circles the paper is seen at the corner of a cell alone, `corner` times as far.
     """
     narrow = np.sqrt(np.maximum(np.linalg.eigvalsh(maps @ np.swapaxes(maps, 1, 2))[:, 0], 1.0))
-    return np.where(surrounded, half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
+    return np.where(surrounded, corner * half_way, np.minimum(half_way, 1.0 + RIM_SIGMAS * blur_px / narrow))
 
 
 def fit_circles(

@@ -9,6 +9,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.tags.surface import SmoothMap, wide_perspective
+from rigkit.kernels.circles import BESIDE
 
 SQUARE_BASIS = np.eye(2)
 HEXAGONAL_BASIS = np.array([[1.0, 0.5], [0.0, np.sqrt(0.75)]])
@@ -57,8 +58,26 @@ class PlaneMap:
     slope_gain: FloatArray
 
 
+CORNERS = {False: np.sqrt(2.0), True: np.sqrt(4.0 / 3.0)}
+"""How much farther from a circle the corners of its cell are than the sides, in a square and in a hexagonal lattice."""
+
+
 def plane_basis(hexagonal: bool) -> FloatArray:
     return HEXAGONAL_BASIS if hexagonal else SQUARE_BASIS
+
+
+def beside_each(label: IntArray, hexagonal: bool) -> IntArray:
+    """Return which circles (N, BESIDE) are the neighbours of each, -1 where there is none."""
+    low = label.min(axis=0) - 1
+    table = np.full(np.ptp(label, axis=0) + 3, -1)
+    table[tuple((label - low).T)] = np.arange(len(label))
+    around = table[tuple((label[:, None] + steps(hexagonal) - low).transpose(2, 0, 1))]
+    return np.pad(around, ((0, 0), (0, BESIDE - around.shape[1])), constant_values=-1)
+
+
+def steps(hexagonal: bool) -> IntArray:
+    """Return the steps to a circle's neighbours, (4, 2) or (6, 2)."""
+    return np.array([(1, 0), (-1, 0), (0, 1), (0, -1), *([(1, -1), (-1, 1)] if hexagonal else [])])
 
 
 def local_maps(

@@ -22,10 +22,10 @@ from rigkit.detection.circles.find import (
     OFF_PLACE,
     CircleGrid,
     like_contrast,
-    rows_of,
 )
 from rigkit.detection.circles.fit import CircleFit, edge_reach, fit_circles
 from rigkit.detection.circles.local_map import NEXT
+from rigkit.detection.circles.rows import rows_of
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.rigid3 import Rigid3
