@@ -2,6 +2,7 @@
 """Measure what tells chessboards from other patterns: fit the weights of `rigkit.detection.checks.evidence` again.
 
     python scripts/measure_thresholds.py [--boards DIR ...] [--without DIR ...] [--seeds 12] [--worse 4]
+    python scripts/measure_thresholds.py --circles [--boards DIR ...] [--without DIR ...]
 
 Rendered boards (all conditions of the benchmark, blurs up to 3.5 px, squares down to 8 px) and rendered patterns (the
 blank pictures of the benchmark, grids of dots) are always measured; `--boards` adds folders of images of boards,
@@ -14,6 +15,9 @@ Prints the weights of a logistic regression (kinds of images weigh the same; wit
 `rigkit.detection.checks.evidence` states), how many lattices it takes for the wrong thing where their kind of image had
 no say in it, then the scores of the boards seen worst and of the patterns that resemble boards most, by the weights in
 use: the margin on both sides of 0.
+
+With `--circles` the same of grids of circles: what the largest lattice of each image of a grid weighs, and all lattices
+of other images, by `rigkit.detection.circles.evidence`.
 """
 
 from __future__ import annotations
@@ -34,6 +38,8 @@ import zlib
 import cv2
 import numpy as np
 from detection_bench.blanks import BLANKS, blank
+from detection_bench.circle_thresholds import BOARDS as CIRCLE_BOARDS
+from detection_bench.circle_thresholds import print_circle_margins
 from detection_bench.scenes import CONDITIONS, LENSES, one_board
 from detectors.degradations import SAME, Grey, degraded
 from numpy.typing import NDArray
@@ -270,6 +276,27 @@ def cross_validated(found: list[Candidate]) -> tuple[int, int]:
     return wrong[True], wrong[False]
 
 
+def circle_looks(
+    folders: list[Path], without: list[Path], seeds: int, worse: int
+) -> Iterator[tuple[str, bool, NDArray[np.uint8]]]:
+    """Yield (name, whether it shows a grid of circles, pixels) of rendered and real images and of worse ones."""
+    images: list[tuple[str, bool, NDArray[np.generic]]] = []
+    for seed in range(seeds):
+        for board in CIRCLE_BOARDS:
+            rng = np.random.default_rng(seed)
+            image = one_board(rng, lens=LENSES[seed % len(LENSES)], board=board).render(noise_levels=2.0, rng=rng)
+            images.append((f"{board.board_id} {seed}", True, image))
+        images += [
+            (f"{name} {seed}", False, blank(name, np.random.default_rng(seed), SIZES_PX[seed % 3])) for name in BLANKS
+        ]
+    images += [(image, True, pixels) for _, image, _, pixels in real(folders, True)]
+    images += [(image, False, pixels) for _, image, _, pixels in real(without, False)]
+    for name, shows, pixels in images:
+        for done, grey, _ in looks(name, pixels, worse):
+            if done not in ("covered", "cut"):
+                yield f"{name} {done}".strip(), shows, grey
+
+
 def print_sizes(found: list[Candidate]) -> None:
     """Print which sizes other patterns have by chance, and what the size of a board that is declared is worth."""
     large = [frozenset(c.size) for c in found if not c.board and c.corners >= MIN_EXPECTED_CORNERS]
@@ -290,7 +317,11 @@ def main() -> None:
     parser.add_argument("--without", type=Path, nargs="*", default=[], help="folders of images without boards")
     parser.add_argument("--seeds", type=int, default=12, help="rendered pictures of each kind")
     parser.add_argument("--worse", type=int, default=4, help="worse images made from each")
+    parser.add_argument("--circles", action="store_true", help="measure what tells grids of circles instead")
     args = parser.parse_args()
+    if args.circles:
+        print_circle_margins(circle_looks(args.boards, args.without, args.seeds, args.worse))
+        return
     images = (*rendered(args.seeds), *real(args.boards, True), *real(args.without, False))
     found = [candidate for image in images for candidate in judged(*image, args.worse)]
     tiny = sorted(c.evidence.score for c in found if c.board and c.cell_px < MIN_CELL_PX)
