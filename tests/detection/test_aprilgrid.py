@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from detection_bench.corner_bound import position_bound
-from detection_bench.scenes import BenchScene, bench_camera, one_board
+from detection_bench.scenes import BenchScene, bench_camera, one_board, three_boards
 from detection_bench.tag_bound import tag_information
 from detectors.degradations import degraded
 from helpers.detection_scenes import errors_by_place
@@ -174,6 +174,18 @@ def test_blurred_tags_of_another_board_are_none(rng: np.random.Generator) -> Non
     image = facing(KALIBR, 25.0).render(optics=Optics(2.5), noise_levels=2.0, rng=rng)
     others = replace(KALIBR, board_id="o", pattern=AprilGrid(0.3, first_tag=100))
     assert not any(found.board_id for found in detect_boards(image, [others]))
+
+
+def test_tags_of_few_bits_name_no_mirror_image() -> None:
+    """Of the nine in the lattice eight are read as some tag of the board, four of them as those of one place."""
+    tags = AprilGrid(0.3, "DICT_APRILTAG_16h5", numbering="opencv")
+    board, rng = Board("m", 6, 6, 40.0, 40.0, pattern=tags), np.random.default_rng(0)
+    beside = Board("n", 6, 4, 40.0, 40.0, pattern=replace(tags, first_tag=9))
+    small = Board("o", 4, 4, 40.0, 40.0, pattern=replace(tags, first_tag=15))
+    scene = three_boards(rng, boards=[board, beside, small], lens="fisheye", size_px=(960, 720))
+    image = scene.render(blur_px=0.8, noise_levels=2.0, rng=rng)
+    assert {item.board_id for item in detect_boards(image, [board])} == {"m"}
+    assert not any(item.board_id for item in detect_boards(np.ascontiguousarray(image[:, ::-1]), [board]))
 
 
 def test_tags_of_another_board_are_none(rng: np.random.Generator) -> None:

@@ -24,6 +24,11 @@ AGREEING_TAGS = 0.4
 """Part of the squares of a lattice where tags would be in the place that tags give it, which are read as those tags: a
 code by chance stands alone, dirt and glare cover a few."""
 
+AGREEING_READ = 0.7
+"""Part of the squares read in that place, as whatever tag, that are read as the tag there: codes of few bits are often
+misread, and in the mirror image of a board of nine tags of 16 bits eight are read and four agree (RENDERED). Where blur
+makes that of a board's own tags, all of them together are asked."""
+
 SURE_EXCESS = 6.0
 """All tags of a lattice together are more like their codes than like others by so many times the scatter of what chance
 makes, normal for a sum of many: one in a billion, with hundreds of places to try."""
@@ -159,9 +164,13 @@ def _place(image: GreyImage, lattice: Lattice, board: TagBoard) -> Place | None:
     bits = (board.codes.modules - 2 * board.pattern.border) ** 2
     columns, rows = lattice.size
     column, row = (grid_turned(cells, (columns - 1, rows - 1), turn) + shift).T
-    own = ((column | row) & 1 == 0) & (column >= 0) & (row >= 0)
+    tagged = (column | row) & 1 == 0
+    own = tagged & (column >= 0) & (row >= 0)
     own &= (column < board.board.columns) & (row < board.board.rows)
-    if votes * bits < MIN_BITS or votes < AGREEING_TAGS * np.count_nonzero(own):
+    least = max(AGREEING_TAGS * np.count_nonzero(own), AGREEING_READ * np.count_nonzero(own & tags.read))
+    # A lattice may go on over a board beside this one, most of whose tags are not read as this one's.
+    least = max(least, 0.5 * np.count_nonzero(tagged & tags.read))
+    if votes * bits < MIN_BITS or votes < least:
         return _place_together(image, lattice.size, quads, cells, board)
     return votes, turn, shift
 
