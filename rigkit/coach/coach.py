@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from enum import Enum
+from hashlib import sha256
 from typing import Any
 
 import cv2
@@ -84,6 +85,7 @@ class Coach:
         self._last: list[Glance | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
         self._names: list[str] = []
+        self._marks: dict[bytes, str] = {}
         self._called = keeper.names if len(keeper.names) > 1 else (None,)
         self._offered: tuple[Sequence[Image], bool] | None = None
         self._shown: dict[str, Any] = self.guide.state(None, None) | {"looks": 0}
@@ -93,13 +95,20 @@ class Coach:
                 for image, camera in zip(images, self._called, strict=True)
             ]
             if any(glance.view is not None for glance in seen):
-                self._add(name, seen)
+                self._add(name, seen, images)
 
     def look(
-        self, images: Sequence[Image], *, take: Take = Take.NO, photo: bool = False, source: str = ""
+        self,
+        images: Sequence[Image],
+        *,
+        take: Take = Take.NO,
+        photo: bool = False,
+        source: str = "",
+        show: Callable[[Sequence[Image]], None] = ignored,
     ) -> dict[str, Any]:
         """Look at a frame, an image a camera, and say what to do, and whether it was kept. A `photo` was taken by
-        itself, of a board that was held as still as it shows; `source` is the file that it is from.
+        itself, of a board that was held as still as it shows; `source` is the file that it is from. `show` is given the
+        frame together with what is said of it.
 
         Raises InputError for other cameras' images.
         """
@@ -110,7 +119,9 @@ class Coach:
             whole = photo or take is Take.YES
             glances = self._glances(images, whole=whole, photo=photo)
             advice = self.guide.advise(glances, photo=photo)
-            kept = take is Take.YES or (take is Take.WORTH and advice.take)
+            # A folder is looked through from its beginning again when the coach is started again.
+            again = self._marks.get(_mark(images)) if photo else None
+            kept = take is Take.YES or (take is Take.WORTH and advice.take and again is None)
             taken = None
             if kept and any(glance.view is not None for glance in glances):
                 if not whole:
@@ -119,9 +130,10 @@ class Coach:
                 advice = self.guide.advise(glances)
             self._last = list(glances)
             self._offered = None if taken else (images, photo)
+            show(images)
             self._show(glances, advice, taken=taken)
             if photo and not taken:
-                reason = _reason(glances, advice)
+                reason = f"it is {again} already" if again else _reason(glances, advice)
                 self._tell(f"{source or 'photo'}: not taken, as {reason}")
                 self.say(f"Not taken, as {reason}. {self._shown['words']}")
             return self._shown
@@ -129,12 +141,13 @@ class Coach:
     def _keep(self, images: Sequence[Image], glances: Sequence[Glance], source: str) -> str:
         """Write a frame and go on with it; return its name."""
         name = self.keeper.keep(images)
-        self._add(name, glances)
+        self._add(name, glances, images)
         self._tell(f"{source}: taken as {name}" if source else f"{name} taken")
         return name
 
-    def _add(self, name: str, glances: Sequence[Glance]) -> None:
+    def _add(self, name: str, glances: Sequence[Glance], images: Sequence[Image]) -> None:
         self._names.append(name)
+        self._marks[_mark(images)] = name
         self.guide.add(glances)
 
     def _show(self, glances: Sequence[Glance] | None, advice: RigAdvice | None, **more: Any) -> None:
@@ -209,7 +222,9 @@ class Coach:
             if not self._names:
                 raise InputError("coach: there is no frame to undo")
             self._tell(f"{self._names[-1]} set aside")
-            self.keeper.drop(self._names.pop())
+            dropped = self._names.pop()
+            self.keeper.drop(dropped)
+            self._marks = {mark: name for mark, name in self._marks.items() if name != dropped}
             frames = self.guide.frames[:-1]
             self.guide = RigGuide(self.keeper.names, self.guide.options, self._executor)
             for glances in frames:
@@ -223,6 +238,11 @@ class Coach:
             self.finished = self._finish() + missing
             self._tell(self.finished)
             return self.finished
+
+
+def _mark(images: Sequence[Image]) -> bytes:
+    """Return what tells a frame from others: all its pixels."""
+    return sha256(b"".join(np.ascontiguousarray(image).tobytes() for image in images)).digest()
 
 
 def _reason(glances: Sequence[Glance], advice: RigAdvice) -> str:

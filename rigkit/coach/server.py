@@ -41,7 +41,7 @@ def new_token() -> str:
 
 def coach_app(coach: Coach, token: str, hosts: tuple[str, ...] = LOCAL, *, camera: str = "page") -> Starlette:
     """Return the application. `hosts` are the names under which it may be asked; `camera` is "page" where the browser's
-    camera is used, "server" where frames come from this machine.
+    camera is used, "server" where frames come from this machine's, "folder" and "recording" where they are files.
 
     Raises InstallationError where starlette is missing.
     """

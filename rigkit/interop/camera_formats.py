@@ -65,7 +65,9 @@ def _write_colmap(camera: Camera, outline: Pixels | None) -> Written:
 
 def _only(cameras: tuple[Camera, ...], name: str) -> Camera:
     if len(cameras) != 1:
-        raise InputError(f"'{name}' holds {len(cameras)} cameras; leave the one that you want in it")
+        raise InputError(
+            f"'{name}' holds {len(cameras)} cameras; `rigkit export {name} --names cam0 -o cam0.json` takes out one"
+        )
     return cameras[0]
 
 

@@ -61,7 +61,9 @@ def write_rig(rig: Rig, kind: str, outlines: Outlines | None = None) -> ForeignR
     lenses that no model of the format follows.
     """
     if kind not in RIG_FORMATS:
-        raise InputError(f"'{kind}' has no rigs; known are {', '.join(RIG_FORMATS)}; or export the cameras one by one")
+        raise InputError(
+            f"'{kind}' has no rigs; known are {', '.join(RIG_FORMATS)}; or export one camera: --names ONE -o ONE.json"
+        )
     return RIG_FORMATS[kind].write(rig, outlines or {})
 
 

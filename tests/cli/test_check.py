@@ -43,6 +43,7 @@ BOARD = Board("board", 9, 6, 25.0, 25.0)
 CAMERA = Brown((640, 480), np.array([620.0, 621.0, 322.0, 236.0, -0.12, 0.05, 0.0, 0.0, 0.0]))
 FOCUS_PERCENT = 0.5
 NOISE_PX = 0.03
+LENGTH = ["--length", "100", "--distance", "500"]
 
 
 def _pictures(folder: Path, camera: Camera, rng: np.random.Generator, *others: PlacedBoard) -> Path:
@@ -271,8 +272,9 @@ def test_another_program_says_not_how_sure_it_is(
 ) -> None:
     there = str(tmp_path / "camchain.yaml")
     assert main(["export", str(home / "cam.json"), "-o", there, "--to", "kalibr"]) == 0
-    assert main(["check", there, str(home / "same")]) == 2
-    assert "pictures of the time when it held" in capsys.readouterr().err
+    for command in (["check", there, str(home / "same")], ["plan", there], ["certify", there, *LENGTH]):
+        assert main(command) == 2
+        assert "does not say how sure it is" in capsys.readouterr().err
 
 
 def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

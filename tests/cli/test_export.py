@@ -155,6 +155,11 @@ def test_a_rig_goes_out_as_a_camchain_and_comes_back(tmp_path: Path, capsys: pyt
     np.testing.assert_allclose(one.parameters, LEFT.parameters[:8], atol=1e-12)
     np.testing.assert_allclose(two.parameters, WIDE.parameters, atol=1e-12)
     np.testing.assert_allclose(cam1_from_cam0.matrix(), (POSES[2] @ POSES[0].inverse()).matrix(), atol=1e-9)
+    # One of its cameras is taken out as the message says.
+    one_out = str(tmp_path / "one.json")
+    assert main(["export", str(chain), "-o", one_out]) == 2 and "--names ONE -o ONE.json" in capsys.readouterr().err
+    assert main(["export", str(chain), "--names", "cam1", "-o", one_out]) == 0
+    np.testing.assert_allclose(load_camera(one_out).parameters, WIDE.parameters, atol=1e-12)
     # Another tool's rig is taken wherever ours is.
     assert main(["diff", str(rig), str(rig)]) == 0
     assert main(["diff", str(chain), str(chain)]) == 0

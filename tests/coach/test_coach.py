@@ -120,15 +120,19 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     (watched / "notes.png").write_text("no picture")
     told: list[str] = []
     coach = open_coach(options(tmp_path / "session"), told.append)
-    # The first picture once more: whoever took it is told that it brought nothing.
+    # The first picture once more, and the first place once more: whoever took it is told that it brought nothing.
     cv2.imwrite(str(watched / "001.png"), pictures[0])
-    said = []
-    coach_frames(
-        coach,
-        watched_frames([watched], until_idle_s=0.5),
-        photos=True,
-        show=lambda images: said.append(coach.state().get("words")),
-    )
+    cv2.imwrite(str(watched / "002.png"), pictures[0] ^ 1)
+    said, known = [], []
+
+    def show(images: object) -> None:
+        said.append(coach.state().get("words"))
+        known.append(len(told))
+
+    coach_frames(coach, watched_frames([watched], until_idle_s=0.5), photos=True, show=show)
+    # The picture before the page is the one whose corners are drawn on it.
+    assert known[0] == 1
+    assert any(str(words).startswith("Not taken, as it is frame-0001.png already. ") for words in said)
     assert any(
         str(words).startswith("Not taken, as it brings little that is new: 0 % of what the place asked for would. ")
         for words in said
@@ -142,7 +146,7 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     said_px = lens.advise(Glance(size_px=SIZE, view=None)).left[0].error
     assert said_px is not None and re.match(r"Done: \w+, error [0-9.]+ px \(", coach.finish())
     assert "00.png: taken as frame-0001.png" in told and any(
-        line.startswith("001.png: not taken, as it brings little that is new: 0 % of") for line in told
+        line.startswith("002.png: not taken, as it brings little that is new: 0 % of") for line in told
     )
     assert len([line for line in told if ": taken as " in line]) == len(kept) and told[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")

@@ -170,6 +170,8 @@ def test_who_has_no_camera_is_told_what_to_do(tmp_path: Path) -> None:
     with _guided(None, tmp_path / "a", tmp_path / "pa", "--watch", str(tmp_path / "incoming")) as page:
         page.wait("coach.looks > 2", PATIENCE_S)
         assert _words(page).startswith("Waiting for pictures in ")
+        intro = page.evaluate('document.getElementById("intro").innerText')
+        assert "put the file into the folder" in intro and "by itself" not in intro
         assert page.evaluate('["sharp", "still", "light"].every((id) => document.getElementById(id).hidden)')
         assert page.evaluate('document.querySelector("img").hidden'), "an empty picture has a frame"
         page.press("u")

@@ -141,9 +141,8 @@ def coach_frames(
 ) -> None:
     """Offer frames to the coach until there are enough, or no more, or somebody finished it."""
     for images, source in frames:
-        show(images)
         try:
-            state = coach.look(images, take=Take.WORTH, photo=photos, source=source)
+            state = coach.look(images, take=Take.WORTH, photo=photos, source=source, show=show)
         except RigkitError as error:
             _log.warning("%s: %s", source or "frame", error)
             coach.say(str(error))
@@ -213,7 +212,7 @@ def _run(
     token = new_token()
     host = own_address() if options.lan else LOCALHOST
     of_server = bool(options.video) or frames is not None
-    app = coach_app(coach, token, (host, *LOCAL), camera="server" if of_server else "page")
+    app = coach_app(coach, token, (host, *LOCAL), camera=_where(options))
     preview: dict[int, bytes] = app.state.preview
 
     def show(images: Sequence[Image]) -> None:
@@ -244,6 +243,12 @@ def _run(
         told(f"http://{host}:{port}/{token}/")
 
     serve(app, EVERYWHERE if options.lan else LOCALHOST, options.port, ready)
+
+
+def _where(options: CoachOptions) -> str:
+    """Return where frames come from, as the page knows it."""
+    found = {"folder": options.watch, "recording": options.video, "server": options.device}
+    return next((where for where, given in found.items() if given), "page")
 
 
 def _frames(options: CoachOptions) -> Iterator[Frame] | None:

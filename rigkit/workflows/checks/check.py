@@ -48,7 +48,7 @@ from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, j
 from rigkit.validation.sentinel.watch import watched_camera, with_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.detect import images_in
-from rigkit.workflows.inputs.camera_files import camera_format, camera_text, warn_if_bad
+from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad
 from rigkit.workflows.inputs.identify_board import explained
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, digest_of_images, software_facts
@@ -107,11 +107,6 @@ def check_pictures(
     exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
-    if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
-        raise InputError(
-            f"'{source}': another program's file does not say how sure it is, so that nobody can tell a change from "
-            "its own error; `rigkit calibrate` pictures of the time when it held, and check what that writes"
-        )
     watched, known = load_watched(source)
     warn_if_bad(source)
     if not images:
@@ -178,6 +173,7 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
 
     Raises InputError for another file, or one that does not say how sure it is.
     """
+    require_sure(source)
     if not is_rig_file(source):
         known = load_calibration(source)
         with about(source):

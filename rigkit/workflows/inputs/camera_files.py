@@ -94,6 +94,16 @@ def own_calibration(path: str | Path) -> Calibration | None:
     return known if isinstance(known, Calibration) else None
 
 
+def require_sure(source: Path) -> None:
+    """Raise InputError for another program's file: what a camera is used for needs to know how sure it is."""
+    if source.is_file() and camera_format(camera_text(source)) not in (None, "rigkit"):
+        raise InputError(
+            f"'{source}': another program's file does not say how sure it is, so that nobody can tell its own error "
+            "from what is asked for; `rigkit calibrate` pictures of that camera, or rig, of the time when it held, and "
+            "give what that writes"
+        )
+
+
 def called_bad(path: str | Path) -> Finding | None:
     """Return why a calibration or a rig of ours is not to be trusted, where that was said of it; None else."""
     if is_rig_file(path):

@@ -93,14 +93,18 @@ def export_camera(source: str | Path, options: ExportCameraOptions) -> ExportedC
 
 
 def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence[str] = ()) -> ExportedRig:
-    """Write a rig's file (ours, or another tool's) in another format; `names` picks cameras, in their order.
+    """Write a rig's file (ours, or another tool's) in another format; `names` picks cameras, in their order. A single
+    one that is picked may be written in ours.
 
     Formats with a file a camera get OUT-NAME. Raises InputError for no rig, a format without rigs, a camera that is
     not there, or a file that cannot be written.
     """
-    kind = options.kind
+    kind = options.kind or ("rigkit" if options.output.suffix == ".json" and len(names) == 1 else None)
     if kind is None:
-        raise InputError(f"export: say the rig's format with --to, one of {', '.join(RIG_FORMATS)}")
+        raise InputError(
+            f"export: say the rig's format with --to, one of {', '.join(RIG_FORMATS)}, or take one camera out: --names "
+            "ONE -o ONE.json"
+        )
     rig = import_rig(source)
     warn_if_bad(source)
     missing = [name for name in names if name not in rig]
@@ -109,6 +113,10 @@ def export_rig(source: str | Path, options: ExportCameraOptions, names: Sequence
             f"'{source}': no camera '{', '.join(missing) or names[0]}' to pick; there are {', '.join(rig)}"
         )
     rig = {name: rig[name] for name in names or rig}
+    if kind == "rigkit" and len(rig) == 1:
+        ensure_writable(options.output, force=options.force, inputs=[source])
+        save_camera(options.output, next(iter(rig.values()))[0], force=options.force)
+        return ExportedRig(kind=kind, max_error_px=0.0, written=(options.output,))
     with about(source):
         outlines = load_saved_rig(source).outlines if is_rig_file(source) else {}
         foreign = write_rig(rig, kind, outlines)
