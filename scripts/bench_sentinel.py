@@ -11,7 +11,8 @@ after a change.
 pupil: simulated fisheyes whose entrance pupils move (`measure_pupil.py`), calibrated from 20 near boards, checked with
 three.
 scene: a rig before rendered textured walls; a mount turns by 0.05 degrees.
-pairs: real pairs of textured scenes whose cameras and pose are known; the pose told is right, or 0.05 degrees off.
+pairs: real pairs of textured scenes whose cameras and pose are known; nothing moved, or the mount turned by 0.05
+degrees: as published, and since the rig's other pairs (`--before`).
 real: real captures; three, or half, of the images are checked against a calibration from the others.
 
     python scripts/bench_sentinel.py [lens] [rig] [departs] [pupil] [rendered] [scene] [pairs] [real] [--seeds 20]

@@ -46,7 +46,7 @@ class ScenePair:
 
 def pairs(data: Path, seeds: int) -> None:
     """Real pairs: the pose as published, and as if the mount had turned since. Where there are several pairs of one
-    rig, they are also checked against the rig as all others correct it: published calibrations are not exact."""
+    rig, they are also checked for what moved since all others: published calibrations are not exact."""
     found: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
     since: dict[str, list[SentinelCheck]] = {"nothing": [], "rotation": []}
     every = [_pair(entry, data) for entry in json.loads((data / "scenes/pairs.json").read_text())]
