@@ -76,6 +76,8 @@ SQUARES_PX = (8.0, 12.0)
 MIN_CELL_PX = 6.0
 """Boards of smaller squares, pictures of boards in the background among them, are listed apart."""
 CHANCE = ("codes", "mosaic", "code")
+CIRCLE_BLANKS = ("dots", "staggered")
+"""Blank pictures for chessboards that show grids of circles."""
 RIDGE = 1e-4
 MAX_RAGGED = 4.0
 """The prior: what keeps weights near 0, and that of raggedness at most this far from it."""
@@ -287,7 +289,9 @@ def circle_looks(
             image = one_board(rng, lens=LENSES[seed % len(LENSES)], board=board).render(noise_levels=2.0, rng=rng)
             images.append((f"{board.board_id} {seed}", True, image))
         images += [
-            (f"{name} {seed}", False, blank(name, np.random.default_rng(seed), SIZES_PX[seed % 3])) for name in BLANKS
+            (f"{name} {seed}", False, blank(name, np.random.default_rng(seed), SIZES_PX[seed % 3]))
+            for name in BLANKS
+            if name not in CIRCLE_BLANKS
         ]
     images += [(image, True, pixels) for _, image, _, pixels in real(folders, True)]
     images += [(image, False, pixels) for _, image, _, pixels in real(without, False)]

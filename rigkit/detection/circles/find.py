@@ -12,7 +12,7 @@ from rigkit.detection.circles.blobs import Blobs, find_blobs
 from rigkit.detection.circles.certainty import centre_sigmas
 from rigkit.detection.circles.evidence import GridEvidence
 from rigkit.detection.circles.fit import NEAR_BESIDE, CircleFit, edge_reach, fit_circles
-from rigkit.detection.circles.local_map import CORNERS, PlaneMap, beside_each, local_maps, steps, with_smooth_curvatures
+from rigkit.detection.circles.local_map import CORNER, PlaneMap, beside_each, local_maps, steps, with_smooth_curvatures
 from rigkit.detection.circles.rows import joined, rows_of
 from rigkit.detection.saddles.response import GreyImage
 
@@ -136,7 +136,7 @@ class _Draft:
     @property
     def corner(self) -> float:
         """Return how far pixels are a circle's own, over half the way to its neighbours."""
-        return CORNERS[self.hexagonal] if self.mixed else 1.0
+        return CORNER[self.hexagonal] if self.mixed else 1.0
 
     def chosen(self, which: BoolArray) -> _Draft:
         return replace(self, label=self.label[which], fit=rows_of(self.fit, which), around=rows_of(self.around, which))
@@ -162,7 +162,7 @@ def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool 
     own, label, hexagonal = blobs.chosen(found.index), found.label, found.hexagonal
     around = local_maps(label, own.pixels, label, hexagonal=hexagonal, sigma_px=FIRST_SIGMA_PX)
     radius = _radius(own.shape, around.first)
-    others, corner = (beside_each(label, hexagonal), CORNERS[hexagonal]) if beside else (None, 1.0)
+    others, corner = (beside_each(label, hexagonal), CORNER[hexagonal]) if beside else (None, 1.0)
     blur = np.full(len(own), FIRST_EDGE_BLUR)
     fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others)
     bright = bool(own.sign[0] > 0)

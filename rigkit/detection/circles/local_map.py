@@ -58,7 +58,7 @@ class PlaneMap:
     slope_gain: FloatArray
 
 
-CORNERS = {False: np.sqrt(2.0), True: np.sqrt(4.0 / 3.0)}
+CORNER = {False: np.sqrt(2.0), True: np.sqrt(4.0 / 3.0)}
 """How much farther from a circle the corners of its cell are than the sides, in a square and in a hexagonal lattice."""
 
 
