@@ -15,7 +15,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel import edge_fit, subpixel
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, refine
+from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, Promise, refine
 
 BLUR_PX, COLUMNS, ROWS = 1.6, 9, 6
 MATRIX = np.array([[1.0, 0.1], [-0.07, 0.96]])
@@ -91,12 +91,16 @@ def test_a_board_that_is_expected_promises_more_until_there_is_one(scene: tuple[
     doubtful = replace(sure, blur_px=20.0 * sure.blur_px)
     own = Evidence.of(doubtful).score
     assert own < 0.0
-    promise = lattices_of_images._promise([(ROWS, COLUMNS)], 12)
+
+    def promised(sizes: list[tuple[int, int]]) -> Promise:
+        return lattices_of_images._promise(image, lattices_of_images.Sought(12, sizes))
+
+    promise = promised([(ROWS, COLUMNS)])
     assert promise(doubtful, []) == own + OF_EXPECTED_SIZE
     assert promise(doubtful, [(large, sure)]) == own
     assert promise(sure, []) == Evidence.of(sure).score
     # What has more rows may lose them; a row that is not there is not found.
     shorter = doubtful.cut(slice(0, ROWS - 1), slice(0, COLUMNS))
     assert promise(shorter, []) == Evidence.of(shorter).score
-    assert lattices_of_images._promise([(ROWS - 1, COLUMNS)], 12)(doubtful, []) == own + OF_EXPECTED_SIZE
-    assert lattices_of_images._promise([], 12)(doubtful, []) == own
+    assert promised([(ROWS - 1, COLUMNS)])(doubtful, []) == own + OF_EXPECTED_SIZE
+    assert promised([])(doubtful, []) == own
