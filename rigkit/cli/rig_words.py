@@ -72,7 +72,7 @@ def angles(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
 
 def transfers(rig: RigCalibration) -> list[tuple[str, str, float, float]]:
     """Return (from, to, px at the middle corner, px at the worst) of every two cameras that see the same places."""
-    from rigkit.calibration.rig.uncertainty import transfer_uncertainty
+    from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 
     found = [transfer_uncertainty(rig, a, b) for a, b in combinations([c.name for c in rig.cameras], 2)]
     return [(t.a, t.b, t.median_px, t.worst_px) for t in found if t is not None]

@@ -15,8 +15,8 @@ import numpy as np
 
 from rigkit.calibration.choosing.begun import BegunCalibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.coach.guide import GuideOptions, worth_beside
 from rigkit.core.arrays import Pixels

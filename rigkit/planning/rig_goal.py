@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.arrays import FloatArray, Points

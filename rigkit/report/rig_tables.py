@@ -8,8 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from rigkit.calibration.rig.board_rig import BoardRig
+from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.verdicts import lag_words
 from rigkit.core.tables import Cell, Column, Table, cells, columns, verdict_cell
 from rigkit.core.truth import Feature

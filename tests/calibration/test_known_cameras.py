@@ -9,7 +9,7 @@ from helpers.rig_scenes import NOISE_PX, mounts, rig_views, sizes
 
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.known import KnownCameras
+from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.cameras.base import Camera
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.geometry.rigid3 import Rigid3

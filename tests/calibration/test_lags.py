@@ -12,8 +12,8 @@ import pytest
 from helpers.calibration_scenes import BOARD, SIZE, lens
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.lags import times_of
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.lags import times_of
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3

@@ -11,11 +11,11 @@ from helpers.rig_scenes import MODELS, NOISE_PX, mounts, rig_views, sizes
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.moments import Moments
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians
-from rigkit.calibration.rig.solver import rig_normal
-from rigkit.calibration.rig.state import RigObservations, RigState
-from rigkit.calibration.rig.uncertainty import transfer_covariance, transfer_uncertainty
+from rigkit.calibration.rig.certainty.uncertainty import transfer_covariance, transfer_uncertainty
+from rigkit.calibration.rig.solving.moments import Moments
+from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.solving.solver import rig_normal
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.camera_prior import camera_prior
 from rigkit.calibration.solving.clustered import Clustered
 from rigkit.calibration.solving.normal_equations import SchurStep

@@ -10,8 +10,8 @@ from calibration.test_rig import SIGMAS
 from helpers.rig_scenes import NOISE_PX, Views, mounts, rig_views, sizes
 
 from rigkit.calibration.rig.calibrate import calibrate_rig
-from rigkit.calibration.rig.observations import Observation
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.views.observations import Observation
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError

@@ -12,8 +12,8 @@ from helpers.rig_scenes import MODELS, rig_views, sizes
 
 from rigkit.calibration.result import Rival
 from rigkit.calibration.rig import assemble
-from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.calibrate import calibrate_rig
+from rigkit.calibration.rig.certainty.between_models import between_rig_models
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.verdicts import _worse
 

@@ -11,7 +11,7 @@ import pytest
 from helpers.calibration_scenes import SIZE, lens, random_views
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.workflows import session_page
+from rigkit.workflows.calibration import session_page
 
 
 def test_of_many_images_the_worst_are_shown(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:

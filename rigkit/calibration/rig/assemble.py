@@ -11,17 +11,17 @@ from rigkit.calibration.assemble import board_shapes, view_results
 from rigkit.calibration.certainty.covariance import GlobalCovariance
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.pupil import SolvedPupil, without_pupil
-from rigkit.calibration.rig.between_models import between_rig_models
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.displaced import lens_modes
-from rigkit.calibration.rig.flatness import shape_error
-from rigkit.calibration.rig.frame_covariance import frame_covariance
+from rigkit.calibration.rig.certainty.between_models import between_rig_models
+from rigkit.calibration.rig.certainty.displaced import lens_modes
+from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.lags import lags_of
-from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians
 from rigkit.calibration.rig.result import RigCalibration, RigCamera
-from rigkit.calibration.rig.state import RigState
+from rigkit.calibration.rig.solving.flatness import shape_error
+from rigkit.calibration.rig.solving.lags import lags_of
+from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians
+from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.clustered import Clustered, effective_freedom
 from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera, far_camera
 from rigkit.core.arrays import FloatArray, IntArray

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.joint import solve_jointly
-from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
+from rigkit.calibration.rig.views.board_places import board_places
+from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.findings import Finding

@@ -18,14 +18,14 @@ from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.posed import posed_calibration
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.assemble import assemble_rig
-from rigkit.calibration.rig.board_places import board_places
 from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import BAD, solve_jointly
-from rigkit.calibration.rig.known import KnownCameras
-from rigkit.calibration.rig.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
-from rigkit.calibration.rig.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.known import KnownCameras
 from rigkit.calibration.rig.verdicts import judge_rig
+from rigkit.calibration.rig.views.board_places import board_places
+from rigkit.calibration.rig.views.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
+from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
 from rigkit.calibration.with_pupil import require_known, surely_moves
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView

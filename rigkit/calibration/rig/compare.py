@@ -20,7 +20,7 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import projection_design
 from rigkit.calibration.compare import SAME_CHANCE
 from rigkit.calibration.rig.board_rig import BoardRig
-from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.solving.clustered import drawn_errors
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import compare_cameras, grid_pixels

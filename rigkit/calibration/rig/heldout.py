@@ -6,8 +6,8 @@ import numpy as np
 
 from rigkit.calibration.choosing.heldout import MIN_IMAGES_OF_FIT
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.solver import refine_frames, solve_rig
-from rigkit.calibration.rig.state import RigObservations
+from rigkit.calibration.rig.solving.solver import refine_frames, solve_rig
+from rigkit.calibration.rig.solving.state import RigObservations
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.calibration.solving.state import weighted_squares
 

@@ -9,8 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.board_sizes import sizes_apart
-from rigkit.calibration.rig.disagree import (
+from rigkit.calibration.rig.solving.known import KnownCameras
+from rigkit.calibration.rig.solving.lags import times_of, with_lags
+from rigkit.calibration.rig.solving.shape import common_shape
+from rigkit.calibration.rig.solving.solver import solve_rig
+from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
+from rigkit.calibration.rig.views.board_sizes import sizes_apart
+from rigkit.calibration.rig.views.disagree import (
     DISAGREES,
     MIN_PX,
     bad_ones,
@@ -23,13 +28,8 @@ from rigkit.calibration.rig.disagree import (
     usual_distance_px,
     why,
 )
-from rigkit.calibration.rig.frames import apart, first_frames, mounts_of, places_of, turned_alike
-from rigkit.calibration.rig.known import KnownCameras
-from rigkit.calibration.rig.lags import times_of, with_lags
-from rigkit.calibration.rig.observations import FrameObservations, RigViews
-from rigkit.calibration.rig.shape import common_shape
-from rigkit.calibration.rig.solver import solve_rig
-from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.rig.views.frames import apart, first_frames, mounts_of, places_of, turned_alike
+from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.views.folds import folds_of
 from rigkit.calibration.views.observations import Observations

@@ -11,8 +11,8 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.judging.pupil import modelled_pupil
 from rigkit.calibration.judging.verdicts import UNSURE_PX, with_headline
+from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.calibration.rig.uncertainty import transfer_uncertainty
 from rigkit.core.findings import Finding
 
 FEW_SHARED = 5

@@ -16,8 +16,8 @@ from rigkit.calibration.certainty.coverage import outline_of_corners
 from rigkit.calibration.certainty.displaced import LensModes, with_modes
 from rigkit.calibration.pupil import SolvedPupil, require_of_frame
 from rigkit.calibration.rig.board_rig import BoardRig, MountedBoard
-from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.calibration.solving.clustered import effective_freedom, widening
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import NearCamera

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rigkit.calibration.certainty.displaced import lens_of
-from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.pose_jacobians import pose_jacobians_of_mount, summed_products
+from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.calibration.rig.solving.pose_jacobians import pose_jacobians_of_mount, summed_products
 from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.linearise import view_products
 from rigkit.calibration.solving.outliers import inliers, sigma_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.cameras.compare import grid_pixels
 from rigkit.core.boards import Board

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigkit.calibration.rig.known import KnownCameras
-from rigkit.calibration.rig.layout import Layout
+from rigkit.calibration.rig.solving.known import KnownCameras
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError

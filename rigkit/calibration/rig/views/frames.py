@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.choosing.board_orientation import same_looks
-from rigkit.calibration.rig.observations import (
+from rigkit.calibration.rig.solving.state import Key
+from rigkit.calibration.rig.views.observations import (
     FrameObservations,
     Observation,
     Places,
@@ -20,7 +21,6 @@ from rigkit.calibration.rig.observations import (
     outer_corners,
     turns_of,
 )
-from rigkit.calibration.rig.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points
 from rigkit.core.errors import InputError

@@ -19,12 +19,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.flatness import CHANCE_SIGMAS, STEP_DAMPING
-from rigkit.calibration.rig.frame_covariance import frame_covariance, residual_sigma
-from rigkit.calibration.rig.moments import Lag, Moments, ways_through
-from rigkit.calibration.rig.pose_jacobians import at_own_moment
-from rigkit.calibration.rig.solver import rig_normal, solve_rig
-from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.rig.certainty.frame_covariance import frame_covariance, residual_sigma
+from rigkit.calibration.rig.solving.flatness import CHANCE_SIGMAS, STEP_DAMPING
+from rigkit.calibration.rig.solving.moments import Lag, Moments, ways_through
+from rigkit.calibration.rig.solving.pose_jacobians import at_own_moment
+from rigkit.calibration.rig.solving.solver import rig_normal, solve_rig
+from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
 from rigkit.calibration.solving.clustered import LARGE_FREEDOM
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, Solution

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.solver import rig_normal
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.calibration.rig.solving.solver import rig_normal
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.errors import InputError

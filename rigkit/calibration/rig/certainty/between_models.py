@@ -14,8 +14,8 @@ import numpy as np
 from rigkit.calibration.certainty.uncertainty import followed
 from rigkit.calibration.choosing.between_models import same_model, spread_rays
 from rigkit.calibration.rig.joint import JointRig
-from rigkit.calibration.rig.solver import solve_rig
-from rigkit.calibration.rig.state import RigState
+from rigkit.calibration.rig.solving.solver import solve_rig
+from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
 from rigkit.cameras.base import Camera

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rigkit.calibration.certainty.covariance import PoseJacobians
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.core.arrays import FloatArray, IntArray, Mat3, Points
 from rigkit.geometry.rotation import skew
 

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import worst_direction
-from rigkit.calibration.rig.layout import Layout
 from rigkit.calibration.rig.result import RigCalibration
+from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.geometry.rotation import skew
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.moments import without_own_times
-from rigkit.calibration.rig.pose_jacobians import gone_in_cam, pose_jacobians
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.moments import without_own_times
+from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam, pose_jacobians
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.linearise import normal_equations
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.poses import refine_each

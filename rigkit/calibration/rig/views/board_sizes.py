@@ -11,8 +11,8 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.calibration.rig.frames import target_poses
-from rigkit.calibration.rig.observations import RigViews
+from rigkit.calibration.rig.views.frames import target_poses
+from rigkit.calibration.rig.views.observations import RigViews
 from rigkit.core.arrays import FloatArray
 from rigkit.core.findings import Finding
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN

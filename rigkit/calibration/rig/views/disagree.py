@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.observations import FrameObservations
-from rigkit.calibration.rig.state import Key, RigObservations, RigState
+from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
+from rigkit.calibration.rig.views.observations import FrameObservations
 from rigkit.calibration.solving.solver import Solution
 from rigkit.core.printing import digits
 

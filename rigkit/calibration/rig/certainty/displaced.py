@@ -13,8 +13,8 @@ import numpy as np
 
 from rigkit.calibration.certainty.displaced import LensModes, telling_modes
 from rigkit.calibration.certainty.uncertainty import FarProjection
-from rigkit.calibration.rig.pose_jacobians import gone_in_cam, pose_jacobians
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam, pose_jacobians
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.solving.state import State

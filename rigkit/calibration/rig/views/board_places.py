@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choosing.board_orientation import same_looks
-from rigkit.calibration.rig.observations import FrameObservations, Observation, RigViews, outer_corners
+from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews, outer_corners
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError

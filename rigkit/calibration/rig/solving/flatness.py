@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.rig.solver import rig_normal
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.solver import rig_normal
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.shape import SHAPES
 from rigkit.core.arrays import FloatArray
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from rigkit.calibration.certainty.covariance import GlobalCovariance
-from rigkit.calibration.rig.pose_jacobians import pose_products
-from rigkit.calibration.rig.solver import with_rig_priors
-from rigkit.calibration.rig.state import RigObservations, RigState
+from rigkit.calibration.rig.solving.pose_jacobians import pose_products
+from rigkit.calibration.rig.solving.solver import with_rig_priors
+from rigkit.calibration.rig.solving.state import RigObservations, RigState
 from rigkit.calibration.solving.solver import Solution
 from rigkit.core.arrays import IntArray
 from rigkit.core.errors import DegenerateError

@@ -19,10 +19,10 @@ from itertools import combinations
 
 import numpy as np
 
-from rigkit.calibration.rig.disagree import shared_keys
-from rigkit.calibration.rig.frames import apart, mounts_of, turned_alike
-from rigkit.calibration.rig.observations import FrameObservations, Observation, RigViews
-from rigkit.calibration.rig.state import Key
+from rigkit.calibration.rig.solving.state import Key
+from rigkit.calibration.rig.views.disagree import shared_keys
+from rigkit.calibration.rig.views.frames import apart, mounts_of, turned_alike
+from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigkit.calibration.choosing.board_orientation import board_turn, same_looks
 from rigkit.calibration.result import Calibration
-from rigkit.calibration.rig.state import Key
+from rigkit.calibration.rig.solving.state import Key
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.core.boards import Board

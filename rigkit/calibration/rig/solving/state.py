@@ -6,7 +6,7 @@ other, whose frame is that of the first of them. The camera c sees board b of th
     cam_from_board = cam_from_rig[c] rig_from_target[f] target_from_board[b].
 
 Where cameras lag, rig_from_target is that of the first camera's moment, and each sees the target where it has gone
-meanwhile (`rigkit.calibration.rig.moments`).
+meanwhile (`rigkit.calibration.rig.solving.moments`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.rig.layout import Layout
-from rigkit.calibration.rig.moments import Moments
+from rigkit.calibration.rig.solving.layout import Layout
+from rigkit.calibration.rig.solving.moments import Moments
 from rigkit.calibration.solving.normal_equations import SchurStep
 from rigkit.calibration.solving.shape import ShapeModel
 from rigkit.calibration.solving.state import State

@@ -1,0 +1,1 @@
+"""All cameras, mounts, targets and places by one least squares."""
