@@ -206,13 +206,13 @@ def errors_in_sigmas(dense: DenseScene, distance: np.ndarray) -> list[str]:
     flies = (sigmas > FLYING_SIGMAS) & (off * there > NEAR_REL)
     lines = []
     for words, which in (("patches", ~swept), ("sweep", swept)):
-        told = []
+        reported = []
         for near, far in pairwise(BESIDE_PX):
             k = which & np.isfinite(off) & (away >= near) & (away < far)
             if k.any():
                 most = "/".join(f"{q:.1f}" for q in np.quantile(sigmas[k], [0.68, 0.95]))
-                told.append(f"{near:g}-{far:g} px {most} ({100 * flies[k].mean():.1f} % fly)")
-        lines.append(f"{words}, 68/95 % within sigmas, from edges: {', '.join(told)}")
+                reported.append(f"{near:g}-{far:g} px {most} ({100 * flies[k].mean():.1f} % fly)")
+        lines.append(f"{words}, 68/95 % within sigmas, from edges: {', '.join(reported)}")
     known = np.isfinite(off)
     one, two = (100 * np.mean(sigmas[known] < most) for most in (1.0, 2.0))
     lines.append(f"{one:.1f} % within one sigma, {two:.1f} % within two")

@@ -34,7 +34,7 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import compare_cameras, grid_pixels
 from rigkit.coach.guide import Advice, CaptureGuide, GuideOptions
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import RigGuide
 from rigkit.coach.rig_whole import left_of_rig, whole_rig
 from rigkit.core.arrays import FloatArray, Pixels
@@ -122,7 +122,7 @@ def guided(name: str, goal_px: float, rng: np.random.Generator) -> Iterator[tupl
     width_deg = WIDTH_DEG[name] * (1.0 + GUESSED_WRONG * rng.uniform(-1.0, 1.0))
     reach = Reach(field_deg=lens.field_deg)
     guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=width_deg, goal_px=goal_px, reach=reach))
-    nothing = Glance(size_px=SIZE, view=None)
+    nothing = FrameObservation(size_px=SIZE, view=None)
     for k in range(MAX_FRAMES):
         began = time.process_time()
         advice = guide.advise(nothing)
@@ -159,7 +159,7 @@ def followed(name: str, frames: int, rng: np.random.Generator) -> tuple[FloatArr
 
 def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Session:
     """Hold boards into the outlines that the coach of a pair of cameras shows, until it says that there are enough."""
-    lens, empty = LENSES[name], Glance(size_px=SIZE, view=None)
+    lens, empty = LENSES[name], FrameObservation(size_px=SIZE, view=None)
     options = GuideOptions(
         boards=(BOARD,), hfov_deg=WIDTH_DEG[name], goal_px=goal_px, reach=Reach(field_deg=lens.field_deg)
     )
@@ -178,9 +178,11 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
                 for own, pose in zip(NAMES, (Rigid3.identity(), MOUNT), strict=True)
             ]
             if any(view is not None for view in views):
-                guide.add([Glance(size_px=SIZE, view=view) for view in views])
+                guide.add([FrameObservation(size_px=SIZE, view=view) for view in views])
                 break
-    whole = whole_rig([[glance.view for glance in frame] for frame in guide.frames], NAMES, [SIZE, SIZE])
+    whole = whole_rig(
+        [[frame_observation.view for frame_observation in frame] for frame in guide.frames], NAMES, [SIZE, SIZE]
+    )
     assert whole is not None
     left = left_of_rig(whole.rig, options)
     return Session(
@@ -230,12 +232,12 @@ def real(images: Images, goal_px: float, rng: np.random.Generator) -> Session:
     board = images.views[0].board
     guide = CaptureGuide(GuideOptions(boards=(board,), hfov_deg=CAPTURES_DEG.get(images.name, 70.0), goal_px=goal_px))
     left: Sequence[int] = rng.permutation(len(images.views)).tolist()
-    advice, longest = guide.advise(Glance(size_px=size_px, view=None)), 0.0
+    advice, longest = guide.advise(FrameObservation(size_px=size_px, view=None)), 0.0
     while left and not advice.enough:
         again = []
         for k in left:
             began = time.process_time()
-            seen = Glance(size_px=size_px, view=images.views[k], edge_px=2.0, moved_px=0.0, contrast=150.0)
+            seen = FrameObservation(size_px=size_px, view=images.views[k], edge_px=2.0, moved_px=0.0, contrast=150.0)
             advice = guide.advise(seen, photo=True)
             longest = max(longest, time.process_time() - began)
             if advice.enough:
@@ -247,7 +249,7 @@ def real(images: Images, goal_px: float, rng: np.random.Generator) -> Session:
         if len(again) == len(left):
             break
         left = again
-    advice = guide.advise(Glance(size_px=size_px, view=None))
+    advice = guide.advise(FrameObservation(size_px=size_px, view=None))
     found, said = ended(guide, advice, None, longest)
     true = compare_cameras(images.full.camera, found.camera, grid=GRID, mask=images.mask).rms_px
     return Session(true=true, **said)  # type: ignore[arg-type]

@@ -24,7 +24,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, log_so3
 from rigkit.planning.candidates import Reach
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames
 
 NAMES = ("left", "right")
@@ -55,9 +55,9 @@ def calibrated(views: Views, lens: Lens) -> RigCalibration:
     return calibrate_rig(views, dict.fromkeys(NAMES, SIZE), model=lens.camera.model, degree=degree, folds=0)
 
 
-def watched(rig: RigCalibration) -> Watched:
+def watched(rig: RigCalibration) -> Monitored:
     """Return a rig as its file would have it."""
-    return Watched(
+    return Monitored(
         names=tuple(c.name for c in rig.cameras),
         cameras=tuple(c.camera for c in rig.cameras),
         cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),

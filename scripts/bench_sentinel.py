@@ -59,11 +59,11 @@ from rigkit.planning.plan import plan_views
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
+from rigkit.validation.sentinel.change_aim import informative_views
 from rigkit.validation.sentinel.epipolar import check_scene
-from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
-from rigkit.validation.sentinel.telling import views_that_tell
-from rigkit.validation.sentinel.watch import watched_camera, watched_rig
+from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 from rigkit.validation.sentinel.whitened import Whitened
 
 BOARD = bench_planner.BOARD
@@ -87,15 +87,15 @@ def held(lens: Lens, count: int, rng: np.random.Generator) -> list[Rigid3]:
 
 def fresh_poses(lens: Lens, known: Calibration, rng: np.random.Generator) -> list[Rigid3]:
     """Return where boards are held for a check: where they tell changes best, as well as hands do."""
-    plan, _ = views_that_tell(watched_camera(known, "camera"), [BOARD], FRESH, Reach(field_deg=lens.field_deg))
+    plan, _ = informative_views(monitored_camera(known, "camera"), [BOARD], FRESH, Reach(field_deg=lens.field_deg))
     return [by_hand(view.cam_from_board, BOARD, rng).world_from_board for view in plan.views]
 
 
-def fresh_rig_poses(lens: Lens, watched: Watched, rng: np.random.Generator) -> list[Rigid3]:
+def fresh_rig_poses(lens: Lens, monitored: Monitored, rng: np.random.Generator) -> list[Rigid3]:
     """Return where boards are held for a check of a rig, in its frame."""
-    plan, _ = views_that_tell(watched, [BOARD], FRESH, Reach(field_deg=lens.field_deg))
+    plan, _ = informative_views(monitored, [BOARD], FRESH, Reach(field_deg=lens.field_deg))
     return [
-        watched.cam_from_rig[watched.names.index(view.seen_by[0])].inverse()
+        monitored.cam_from_rig[monitored.names.index(view.seen_by[0])].inverse()
         @ by_hand(view.cam_from_board, BOARD, rng).world_from_board
         for view in plan.views
     ]
@@ -165,13 +165,13 @@ def one_camera(name: str, seeds: int, noise_px: float) -> None:
         for seed in range(seeds):
             rng = np.random.default_rng([seed, 11])
             known = known_of(lens, views_of(lens.camera, held(lens, VIEWS, rng), noise_px, rng))
-            anyhow = free_poses(lens, rng, BOARD)
+            unplanned = free_poses(lens, rng, BOARD)
             for what, checks in found.items():
                 camera = changed(lens, what, rng)
                 poses = (
                     fresh_poses(lens, known, rng)
                     if how == "advised"
-                    else [next(anyhow).world_from_board for _ in range(FRESH)]
+                    else [next(unplanned).world_from_board for _ in range(FRESH)]
                 )
                 views = views_of(camera, poses, noise_px, rng)
                 checks.append(checked(known, views))
@@ -212,8 +212,8 @@ def departing(name: str, seeds: int, noise_px: float) -> None:
         }
         for what, own in fresh.items():
             for beyond in (False, True):
-                watched = watched_camera(known, "camera", beyond_model=beyond)
-                check = check_views(watched, [FreshView(v.image, 0, v) for v in own])
+                monitored = monitored_camera(known, "camera", beyond_model=beyond)
+                check = check_views(monitored, [FreshView(v.image, 0, v) for v in own])
                 found.setdefault((what, beyond), []).append(check)
     for (what, beyond), checks in found.items():
         counted = "counted" if beyond else "not counted"
@@ -222,8 +222,8 @@ def departing(name: str, seeds: int, noise_px: float) -> None:
 
 def best_chance(known: Calibration, views: Sequence[BoardView], change: FloatArray) -> float:
     """Return how often the best test of all, which knows the change but for its sign, finds it with as few alarms."""
-    watched = watched_camera(known, "camera")
-    whitened = Whitened.of(watched, evidence_of(watched, [FreshView(v.image, 0, v) for v in views]))
+    monitored = monitored_camera(known, "camera")
+    whitened = Whitened.of(monitored, evidence_of(monitored, [FreshView(v.image, 0, v) for v in views]))
     moved = whitened.by_theta[:, : len(change)] @ change
     size = float(np.sqrt(moved @ np.linalg.solve(whitened.covariance, moved)))
     limit = float(-ndtri(0.5 * ALARM_CHANCE))
@@ -252,7 +252,7 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
             ]
             return [FreshView(frame, c, view) for frame, c, view in both if view is not None]
 
-        watched = calibrated_rig(frames(held(lens, VIEWS, rng), camera, MOUNT), camera)
+        monitored = calibrated_rig(frames(held(lens, VIEWS, rng), camera, MOUNT), camera)
         turn = exp_so3(np.radians(TURNED_DEG) * unit(rng.standard_normal(3)))
         poses = {
             "rotation": Rigid3(turn @ MOUNT.rotation, turn @ MOUNT.translation_mm),
@@ -260,17 +260,17 @@ def stereo(seeds: int, noise_px: float, name: str) -> None:
         }
         for what, checks in found.items():
             second = changed(lens, what, rng)
-            fresh = fresh_rig_poses(lens, watched, rng)
-            checks.append(check_views(watched, frames(fresh, second, poses.get(what, MOUNT))))
+            fresh = fresh_rig_poses(lens, monitored, rng)
+            checks.append(check_views(monitored, frames(fresh, second, poses.get(what, MOUNT))))
     for what, checks in found.items():
         tell(f"rig {name}: {what}", checks, what)
 
 
-def calibrated_rig(views: Sequence[FreshView], camera: Camera) -> Watched:
+def calibrated_rig(views: Sequence[FreshView], camera: Camera) -> Monitored:
     """Return a rig of two as `views` calibrate it."""
     names = ("left", "right")
     own = {name: [(v.frame, v.view) for v in views if v.camera == c] for c, name in enumerate(names)}
-    return watched_rig(calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model))
+    return monitored_rig(calibrate_rig(own, dict.fromkeys(names, camera.size_px), model=camera.model))
 
 
 def rendered_view(camera: Camera, pose: Rigid3, name: str, rng: np.random.Generator) -> BoardView | None:
@@ -331,11 +331,11 @@ def scene(seeds: int, noise_px: float, name: str) -> None:
             for c, mount in enumerate((Rigid3.identity(), MOUNT)):
                 view = seen(camera, mount @ board, f"{k:02d}", noise_px, rng)
                 views += [] if view is None else [FreshView(f"{k:02d}", c, view)]
-        watched, walls = calibrated_rig(views, camera), Corner.of_a_room(seed)
+        monitored, walls = calibrated_rig(views, camera), Corner.of_a_room(seed)
         left = walls.image(camera, Rigid3.identity(), rng)
         for what, checks in found.items():
             pose = turned(MOUNT, SCENE_TURNED_DEG if what == "rotation" else 0.0, rng)
-            checks.append(check_scene(watched, [[left, walls.image(camera, pose, rng)]]))
+            checks.append(check_scene(monitored, [[left, walls.image(camera, pose, rng)]]))
     for what, checks in found.items():
         tell(f"scene {name}: {what}", checks, what)
 

@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 from detection_bench.blanks import BLANKS, blank
 from detection_bench.corner_bound import corner_information, position_bound
-from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, evaluate_pair
 from detection_bench.scenes import (
     BENCH_PHOTOMETRY,
     CONDITIONS,
@@ -323,7 +323,7 @@ def pairs(tables: Tables, count: int) -> list[Asked]:
         try:
             one, two = (detect_boards(v) for v in views)
             found = identify_pair(one, two, EQUAL_BOARDS, scene.camera1, scene.camera2)
-            verdict = judge_pair(scene, found.pairs(), found.ambiguous)
+            verdict = evaluate_pair(scene, found.pairs(), found.ambiguous)
         except RigkitError:
             verdict = PairVerdict.INCOMPLETE
         if verdict != PairVerdict.RIGHT:

@@ -199,9 +199,9 @@ def compare_rendered(count: int) -> None:
                 if parts
             )
             ratio = np.sqrt(np.concatenate(squared).mean() / np.concatenate(bounds).mean())
-            told = np.sqrt(np.concatenate(relative).mean())
+            reported = np.sqrt(np.concatenate(relative).mean())
             print(f"{board.board_id:10s} {lens:7s}", "; ".join(words), end="")
-            print(f"; rigkit {ratio:.2f} bounds, errors over sigmas {told:.2f}")
+            print(f"; rigkit {ratio:.2f} bounds, errors over sigmas {reported:.2f}")
 
 
 def compare_slanted(count: int) -> None:

@@ -332,8 +332,8 @@ def main() -> None:
     total = Comparison()
     workers: dict[str, dict[str, Find]] = {}
     for words in args.sets:
-        told, _, place = words.rpartition("=")
-        boards = [board_of_words(word) for word in told.split("+")]
+        declared, _, place = words.rpartition("=")
+        boards = [board_of_words(word) for word in declared.split("+")]
         kind = boards[0].pattern.type
         if kind not in workers:
             workers[kind] = peers_of(boards, args.peers_python)

@@ -94,7 +94,7 @@ def main() -> None:
             for what, one in compared(name, common_px, args.seeds):
                 found.setdefault(what, []).append(one)
             same = found["the same"]
-            told = ", ".join(
+            reported = ", ".join(
                 f"{what} {sum(c.verdict is CameraVerdict.OTHER for c in own)} of {len(own)}"
                 for what, own in found.items()
             )
@@ -104,7 +104,7 @@ def main() -> None:
             alarms += [c.chance for c in same]
             print(
                 f"{name}, {common_px} px in common of an image: expected {usual_px:.3f} px, "
-                f"found over expected {np.exp(np.log(ratio).mean()):.2f} (geometric mean); alarms: {told}",
+                f"found over expected {np.exp(np.log(ratio).mean()):.2f} (geometric mean); alarms: {reported}",
                 flush=True,
             )
     for common_px in COMMON_PX:

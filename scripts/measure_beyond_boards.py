@@ -93,18 +93,18 @@ def middle_of(views: Views, size_px: tuple[int, int], middle: tuple[float, float
 
 
 def bands_of(
-    small: Calibration, other: Camera | TrueLens, told: np.ndarray, stated_by: Calibration | None
+    small: Calibration, other: Camera | TrueLens, usable: np.ndarray, stated_by: Calibration | None
 ) -> dict[int, Band]:
-    """Return the bands of a session held against another camera where that is `told` (rows, columns), after the best
+    """Return the bands of a session held against another camera where that is `usable` (rows, columns), after the best
     rotation where the session had boards; what `stated_by` says is stated, too."""
     pixels = grid_pixels(small.camera.size_px, GRID)
     covered = covered_by_boards(small, pixels)
     there, seen = other.unproject(pixels)
-    both = covered & told & seen
+    both = covered & usable & seen
     turn = best_rotation(there[both], pixels[both], np.ones(int(both.sum())), small.camera)
     shown, valid = small.camera.project(np.where(seen[..., None], there, [0.0, 0.0, 1.0]) @ turn.T)
     rays, own = small.camera.unproject(pixels)
-    known = valid & seen & told & own
+    known = valid & seen & usable & own
     stated = np.full(known.shape, np.nan)
     stated[known] = np.trace(FarProjection.of(small).covariance(rays[known]), axis1=1, axis2=2)
     if stated_by is not None:
@@ -128,8 +128,8 @@ def against_truth(small: Calibration, truth: TrueLens) -> dict[int, Band]:
 
 def against_others(small: Calibration, others: Calibration) -> dict[int, Band]:
     """Hold a session against the calibration from the other images, where those had boards."""
-    told = covered_by_boards(others, grid_pixels(small.camera.size_px, GRID))
-    return bands_of(small, others.camera, told, others)
+    usable = covered_by_boards(others, grid_pixels(small.camera.size_px, GRID))
+    return bands_of(small, others.camera, usable, others)
 
 
 def sessions(name: str, loaded: Loaded, args: argparse.Namespace) -> list[dict[int, Band]]:

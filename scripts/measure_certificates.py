@@ -47,7 +47,7 @@ from rigkit.synthetic.scene import place_board
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import gradients, measured_points, variances
-from rigkit.validation.sentinel.watch import watched_camera, watched_rig
+from rigkit.validation.sentinel.watch import monitored_camera, monitored_rig
 
 SIZE_PX = (1280, 960)
 BOARD = Board("board", 9, 6, 40.0, 40.0)
@@ -151,7 +151,7 @@ def rig_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Generat
     sizes = dict.fromkeys(views, SIZE_PX)
     named = {name: [(view.image, view) for view in own] for name, own in views.items()}
     rig = calibrate_rig(named, sizes, model=session.model, degree=session.degree, folds=session.folds)
-    found = Instrument.of(watched_rig(rig))
+    found = Instrument.of(monitored_rig(rig))
     for quantity, task in TASKS.items():
         certificate = certify(found, task, cells=CELLS)
         use = certificate.in_view & ~certificate.coarse
@@ -179,7 +179,7 @@ def alone_trial(lenses: Sequence[Camera], session: Session, rng: np.random.Gener
     lens = lenses[0]
     (views,) = frames_of((lens,), (Rigid3.identity(),), session, rng)
     found = calibrate(views, SIZE_PX, model=session.model, degree=session.degree, folds=session.folds, board="flat")
-    alone = Instrument.of(watched_camera(found, "camera"))
+    alone = Instrument.of(monitored_camera(found, "camera"))
     certificate = certify(alone, ALONE, cells=CELLS)
     use = certificate.in_view & ~certificate.coarse
     rays, _ = lens.unproject(certificate.pixels[use])

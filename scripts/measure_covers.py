@@ -140,15 +140,15 @@ def scored(found: list[BoardDetection], truth: FloatArray, sides: FloatArray, ma
         off, side = apart.min(axis=1), sides[nearest]
         false = off > np.maximum(FALSE_CELLS * side, FALSE_PX)
         unsure = item.sigma_px > UNSURE_CELLS * side
-        usual = ~false & ~unsure
+        typical = ~false & ~unsure
         seen[nearest[~false]] = True
         score.add(
             Score(
                 false=int(false.sum()),
                 unsure=int(unsure.sum()),
                 worst_px=float(off[false].max(initial=0.0)),
-                squared=float((0.5 * (off / item.sigma_px)[usual] ** 2).sum()),
-                counted=int(usual.sum()),
+                squared=float((0.5 * (off / item.sigma_px)[typical] ** 2).sum()),
+                counted=int(typical.sum()),
             )
         )
     score.found = int((seen & in_view).sum()) if least else 0
@@ -186,8 +186,8 @@ def main() -> None:
     print("| set | cover | boards | in view | false (worst) | unsure | error / sigma |\n|:--|:--|--:|--:|--:|--:|--:|")
     total = {kind: Score() for kind in args.kinds}
     for words in args.sets:
-        told, _, place = words.rpartition("=")
-        board = board_of_words(told)
+        determined, _, place = words.rpartition("=")
+        board = board_of_words(determined)
         mine = {kind: Score() for kind in args.kinds}
         for path in images_of(Path(place), args.most):
             for kind, score in measured(path, board, args.kinds, args.share).items():

@@ -107,7 +107,7 @@ def shape_error_mm(found: Calibration, truth: Truth) -> tuple[str, float]:
 
 def camera_rows(name: str, found: Calibration, truth: Truth, camera: str) -> Iterator[tuple[str, ...]]:
     """Yield the lines of one camera."""
-    said = str(found.verdicts[0]) if found.verdicts else ""
+    message = str(found.verdicts[0]) if found.verdicts else ""
     corners = corner_errors(found, truth, camera)
     off, sigmas = projection_errors(found, truth.lenses[camera])
     worst = float(np.nanmax(np.linalg.norm(off, axis=1)))
@@ -120,7 +120,14 @@ def camera_rows(name: str, found: Calibration, truth: Truth, camera: str) -> Ite
         f"{1.414 * found.sigma_px:.4f} px",
         "",
     )
-    yield name, f"{camera}: lens", found_words, f"{rms(off):.4f} px (worst {worst:.3f})", f"{rms(sigmas):.4f} px", said
+    yield (
+        name,
+        f"{camera}: lens",
+        found_words,
+        f"{rms(off):.4f} px (worst {worst:.3f})",
+        f"{rms(sigmas):.4f} px",
+        message,
+    )
     kind, shape = shape_error_mm(found, truth)
     yield name, f"{camera}: board", kind, f"{shape:.4f} mm", "", ""
 
@@ -143,10 +150,10 @@ def measured(folder: Path) -> Iterator[tuple[str, ...]]:
     truth = Truth.read(folder / "truth.json")
     cameras = list(truth.lenses)
     places = [folder / (camera if len(cameras) > 1 else "images") for camera in cameras]
-    told = FolderOptions(boards=(str(folder / "board.toml"),))
+    declared = FolderOptions(boards=(str(folder / "board.toml"),))
     done = calibrate_sources(
         places,
-        told,
+        declared,
         CalibrateOptions(output=(folder if len(cameras) > 1 else places[0]) / "calibration.json", force=True),
     )
     if isinstance(done, SessionCalibration):

@@ -198,8 +198,8 @@ def record(data: Path, tests: Sequence[str]) -> None:
                 recorder.see(of_process.measured_contexts())
                 measured.get_data().update(of_process)
     measured.save()
-    told = {"seconds": recorder.seconds, "shared": recorder.shared, "uses": recorder.uses}
-    data.with_suffix(".json").write_text(json.dumps(told))
+    reported = {"seconds": recorder.seconds, "shared": recorder.shared, "uses": recorder.uses}
+    data.with_suffix(".json").write_text(json.dumps(reported))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,8 +230,8 @@ class Reach:
         used: dict[str, list[str]] = {}
         steps: list[tuple[str, str, int, int]] = []
         for data in paths:
-            told = json.loads(data.with_suffix(".json").read_text())
-            seconds, shared, used = seconds | told["seconds"], shared | told["shared"], used | told["uses"]
+            reported = json.loads(data.with_suffix(".json").read_text())
+            seconds, shared, used = seconds | reported["seconds"], shared | reported["shared"], used | reported["uses"]
             with sqlite3.connect(data) as base:
                 steps += base.execute(STEPS)
         tests = {test: k for k, test in enumerate(seconds)}

@@ -60,8 +60,8 @@ def runtimes() -> list[str]:
     """Return the runtimes of the sanitizers, to be loaded before Python."""
     found = []
     for name in ("libasan.so", "libubsan.so"):
-        said = subprocess.run([COMPILER, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
-        found.append(str(Path(said.stdout.strip()).resolve()))
+        message = subprocess.run([COMPILER, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+        found.append(str(Path(message.stdout.strip()).resolve()))
     missing = [path for path in found if not Path(path).is_file()]
     if missing:
         raise SystemExit(f"{COMPILER} has no {' and no '.join(missing)}; install the sanitizers of this compiler")

@@ -322,10 +322,10 @@ def summary(
     views, size = loaded
     likely, off = "", None
     if args.images is None:
-        low, usual, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
-        likely = f" (if sigmas are true {usual:.2f}, 95 % from {low:.2f} to {high:.2f})"
+        low, typical, high = own_scatter(views, size, len(found), args.model, len(name)).tolist()
+        likely = f" (if sigmas are true {typical:.2f}, 95 % from {low:.2f} to {high:.2f})"
         if not CAPTURES[name].rendered:
-            off = float(np.log(ratio / usual)), float(np.log(high / low)) / (2.0 * WITHIN_95)
+            off = float(np.log(ratio / typical)), float(np.log(high / low)) / (2.0 * WITHIN_95)
     print(
         f"{name} ({len(views)} images): geometric mean ratio {ratio:.2f}{likely}; another camera in {other} of "
         f"{len(found)}",

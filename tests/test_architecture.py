@@ -119,8 +119,8 @@ def test_the_layers_are_those_of_the_docstring() -> None:
     import rigkit
 
     rows = re.findall(r"^ {4}([ \d]\d)  (\w+(?: \| \w+)*)", rigkit.__doc__ or "", re.MULTILINE)
-    told = {int(level): set(names.split(" | ")) for level, names in rows}
-    assert told == {level: set(row) for level, row in enumerate(LAYERS)}
+    reported = {int(level): set(names.split(" | ")) for level, names in rows}
+    assert reported == {level: set(row) for level, row in enumerate(LAYERS)}
     assert set(LEVEL) == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
 
 

@@ -78,9 +78,9 @@ def test_every_verb_has_its_functions_on_the_page_of_python() -> None:
     rows = re.findall(
         r"^\| (`\w+`.*) \| (.*) \|$", (REPOSITORY / "docs/pages/python.md").read_text("utf-8"), re.MULTILINE
     )
-    verbs = {verb for told, _ in rows for verb in re.findall(r"`(\w+)`", told)}
+    verbs = {verb for reported, _ in rows for verb in re.findall(r"`(\w+)`", reported)}
     assert verbs == set(VERBS) - {"init", "schema"}
-    functions = {name for _, told in rows for name in re.findall(r"`(\w+)`", told)}
+    functions = {name for _, reported in rows for name in re.findall(r"`(\w+)`", reported)}
     assert functions <= set(rigkit.__all__)
 
 

@@ -181,21 +181,21 @@ def _next_chords(tangent: _Tangent, detection: BoardDetection) -> DirectionField
     padded = np.pad(_index_map(detection), 1, constant_values=-1)
     column, row = detection.grid[:, 0] + 1, detection.grid[:, 1] + 1
     own = tangent.sigma_px**2
-    chords, variances, ways = [], [], []
+    chords, variances, signs = [], [], []
     for right, down in ((1, 0), (0, 1), (1, 1)):
-        index = np.stack([padded[row + way * down, column + way * right] for way in (1, -1)], axis=1)
+        index = np.stack([padded[row + step_sign * down, column + step_sign * right] for step_sign in (1, -1)], axis=1)
         position, usable, _ = tangent.positions(index)
         ahead = usable[:, 0]
         chords.append(np.where(ahead[:, None], position[:, 0], -position[:, 1]))
         other = np.where(ahead, index[:, 0], index[:, 1])
         variances.append(np.where(usable.any(axis=1), tangent.sigma_px[other] ** 2 + own, np.nan))
-        ways.append(np.where(ahead, 1.0, -1.0))
+        signs.append(np.where(ahead, 1.0, -1.0))
     lone = ~_finite(chords[2])
     exact = [_chords(tangent, detection, axis) for axis in (0, 1)]
     chords[2] = np.where(lone[:, None], exact[0][0] + exact[1][0], chords[2])
     variances[2] = np.where(lone, sum(0.5 * np.trace(c, axis1=1, axis2=2) for _, c in exact), variances[2])
     vectors, eye = np.stack(chords, axis=1), np.eye(2)
-    shared = (ways[0] * ways[1] * own)[:, None, None] * eye
+    shared = (signs[0] * signs[1] * own)[:, None, None] * eye
     return DirectionField(vectors, _finite(vectors), np.stack(variances, axis=1)[..., None, None] * eye, shared)
 
 

@@ -257,8 +257,8 @@ def _nearest(first: _Features, second: _Features, block: int = 1024) -> tuple[In
             values[:, k] = similarity[each, top[:, k]]
             similarity[each, top[:, k]] = -np.inf
         distance = np.sqrt(np.maximum(2.0 - 2.0 * values, 0.0))
-        apart = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
-        other = np.where(apart, distance, np.inf).min(axis=1)
+        distinct = np.linalg.norm(second.pixels[top] - second.pixels[top[:, :1]], axis=-1) > SAME_POINT_PX
+        other = np.where(distinct, distance, np.inf).min(axis=1)
         # No rival among the nearest ones: the furthest of them is a bound.
         rival[rows] = np.where(np.isfinite(other), other, distance[:, -1])
         best[rows], nearest[rows] = top[:, 0], distance[:, 0]

@@ -28,7 +28,7 @@ What a calibration is called on its way::
     what the result says of each FittedModel            Candidate            result
     what it says of each RivalFit                       Rival                result
 
-`compare` tells two calibrations apart; `posed` and `hand_eye` are for a camera that is known.
+`compare` tells two calibrations separation; `posed` and `hand_eye` are for a camera that is known.
 
 `rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is.
 `solving` has steps, priors, steps between poses and the squares of what was left out; `clustered` what repeats;

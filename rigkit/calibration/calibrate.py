@@ -14,7 +14,7 @@ from rigkit.calibration.assemble import assemble, require_determined
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.choosing.begun import BegunCalibration, about_camera, begin
 from rigkit.calibration.choosing.between_models import rival_fits, rival_shapes, with_rivals
-from rigkit.calibration.choosing.choice import SURELY, FittedModel, HeldOut, choose, described, models_of
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, described, models_of
 from rigkit.calibration.choosing.lens_choice import ModelChoice, best_sizes, choose_lenses, twins
 from rigkit.calibration.choosing.models_tried import Request
 from rigkit.calibration.choosing.one_model import ModelOutcome, on_same_images
@@ -25,9 +25,9 @@ from rigkit.calibration.result import Calibration, Candidate
 from rigkit.calibration.with_pupil import (
     against_central,
     kept_central,
+    pupil_moves_significantly,
     require_known,
     solved_with_pupil,
-    surely_moves,
 )
 from rigkit.cameras.base import Camera
 from rigkit.cameras.moving_pupil import far_camera
@@ -96,7 +96,7 @@ def calibrate_together(
         done = (one.asked(name, views, request) for one in known)
         begun.append(next((one for one in done if one is not None), None) or begin(name, views, request))
     out: dict[int, Calibration] = {}
-    for group in twins([choose(one.tried, SURELY).fit.state.camera for one in begun]):
+    for group in twins([choose(one.tried, MIN_SIGMAS).fit.state.camera for one in begun]):
         out |= dict(zip(group, _finish([begun[k] for k in group]), strict=True))
     progress("cameras", len(cameras), len(cameras))
     return [out[k] for k in range(len(begun))]
@@ -138,7 +138,7 @@ def _better(found: Sequence[ModelOutcome], again: Sequence[ModelOutcome]) -> boo
     if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
         return False  # Nothing can be compared.
     if len(pairs) == 1:
-        return choose(pairs[0], SURELY).name == "again"
+        return choose(pairs[0], MIN_SIGMAS).name == "again"
     return HeldOut.of(pairs).chosen() == "again"
 
 
@@ -150,7 +150,7 @@ def _result(
     likely: Mapping[str, float],
 ) -> Calibration:
     """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
-    central, request = _judged(begun, found, tried, rivals, likely), begun.request
+    central, request = _with_verdicts(begun, found, tried, rivals, likely), begun.request
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
         return central
     moving = solved_with_pupil(found, begun.observations, request)
@@ -160,10 +160,10 @@ def _result(
         better, candidates = against_central(found, moving, request)
         moving = replace(moving, candidates=[*candidates, *moving.candidates])
         try:
-            result = _judged(begun, moving, tried, rivals, likely)
+            result = _with_verdicts(begun, moving, tried, rivals, likely)
         except DegenerateError:
             result = central
-        if result.pupil is not None and (request.pupil == "moving" or (better and surely_moves(result))):
+        if result.pupil is not None and (request.pupil == "moving" or (better and pupil_moves_significantly(result))):
             return result
         central = replace(central, candidates=(*central.candidates, *kept_central(candidates)))
     if request.pupil == "moving":
@@ -174,7 +174,7 @@ def _result(
     return central
 
 
-def _judged(
+def _with_verdicts(
     begun: BegunCalibration,
     found: ModelOutcome,
     tried: Sequence[FittedModel],
@@ -211,7 +211,7 @@ def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
     own = [option for option in tried if option.model == model]
     if not own:
         return []
-    against = choose(own, SURELY)
+    against = choose(own, MIN_SIGMAS)
     return described([*(o for o in tried if o not in own), against], against)[:-1]
 
 

@@ -28,7 +28,7 @@ SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera is no chance."""
 COVARIANCE_FLOOR_PX = 0.05
 """Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
-USUAL = 0.9
+TYPICAL = 0.9
 """Part of the differences of one and the same camera that is called usual."""
 IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
@@ -125,9 +125,9 @@ def compare_calibrations(
         covariance,
         drawn,
     )
-    chance, unusual = found.chance([_without(way, turn) for way in _touched(a.camera, pixels)])
-    usual = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - USUAL - unusual, 0.5, 1.0 - unusual)))
-    low, median, high = usual.tolist()
+    chance, unusual = found.chance([_without(step, turn) for step in _touched(a.camera, pixels)])
+    typical = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - TYPICAL - unusual, 0.5, 1.0 - unusual)))
+    low, median, high = typical.tolist()
     same_model = _kind(a.camera) == _kind(b.camera)
     return CalibrationComparison(difference, median, (low, high), chance, same_model)
 
@@ -182,13 +182,13 @@ class _Modes:
         null = turned.T @ (how @ (drawn / safe[:, None]))
         return cls(axes, modes, null, np.maximum(expected, 0.0), beyond)
 
-    def chance(self, ways: Sequence[FloatArray]) -> tuple[float, float]:
+    def chance(self, steps: Sequence[FloatArray]) -> tuple[float, float]:
         """Return the probability of a difference as large as the one found, and how unlikely one answer must be for
-        that to be 1 - USUAL: it is one of several.
+        that to be 1 - TYPICAL: it is one of several.
 
         What is large is asked in several ways, and the one that says most is compared with what it would say by chance
         (Tippett's combination). Of anything: the mean square, and the difference in units of what is expected
-        (Mahalanobis), in which each mode is judged by how far it may. Of each of the `ways` (2 N, k) to differ: how
+        (Mahalanobis), in which each mode is judged by how far it may. Of each of the `steps` (2 N, k) to differ: how
         much of it there is by generalised least squares, in standard deviations; where it is the way, no other test
         finds less of it. What is known better than COVARIANCE_FLOOR_PX is taken for known to so much: of the surest
         combinations a covariance from some images says least.
@@ -202,14 +202,14 @@ class _Modes:
                 (null / known).sum(axis=0),
             ),
         ]
-        for way in ways:
-            weighted = self.axes.T @ way / known
+        for step in steps:
+            weighted = self.axes.T @ step / known
             inverse = np.linalg.pinv(weighted.T @ (self.expected[:, None] * weighted), hermitian=True)
             size, by_chance = weighted.T @ self.found, weighted.T @ self.null
             null_size = np.einsum("in,ij,jn->n", by_chance, inverse, by_chance)
             likely.append(_exceeded(float(size @ inverse @ size), null_size))
         least = np.min(likely, axis=0)
-        return float(np.count_nonzero(least <= least[0]) / len(least)), float(np.quantile(least[1:], 1.0 - USUAL))
+        return float(np.count_nonzero(least <= least[0]) / len(least)), float(np.quantile(least[1:], 1.0 - TYPICAL))
 
 
 def _exceeded(size: float, null: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ along that axis. Turns about a second one, however few, count by how certain the
 OPEN_PART = 1e-12
 """A direction of which the corners know this part of what they know of the best is open: it is rounding."""
 HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
-HAND_EYE_STOP = Stop(steps=60, promise=1e-14)
+HAND_EYE_STOP = Stop(steps=60, predicted_gain=1e-14)
 UNKNOWNS = 12
 INVERSE_FITS_BETTER = 3.0
 """Robot poses taken the other way round are mistaken where they fit so many times better."""
@@ -113,7 +113,7 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
         problem.views[i].image: float(np.sqrt(squared[problem.image == i].sum(axis=1).mean()))
         for i in range(len(problem.views))
     }
-    apart_mm, apart_rad = _apart(*found.state, problem, [seen[i] for i in use])
+    apart_mm, apart_rad = _residuals(*found.state, problem, [seen[i] for i in use])
     return HandEye(
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
@@ -158,16 +158,16 @@ class _AllCorners:
         return DenseProblem(residual.reshape(-1), jacobian.reshape(-1, UNKNOWNS))
 
 
-def _apart(
+def _residuals(
     cam_from_mount: Rigid3, stand_from_board: Rigid3, problem: _AllCorners, seen: Sequence[Rigid3]
 ) -> tuple[FloatArray, FloatArray]:
     """Return how far the boards as they are seen are from where the robot has them, (N,) mm and (N,) rad."""
     off_mm, turned = [], []
     for view, arm, cam_from_board in zip(problem.views, problem.robot, seen, strict=True):
-        told = cam_from_mount @ arm @ stand_from_board
+        predicted = cam_from_mount @ arm @ stand_from_board
         middle = view.points().mean(axis=0)
-        off_mm.append(np.linalg.norm(cam_from_board.apply(middle) - told.apply(middle)))
-        turned.append(cam_from_board.rotation @ told.rotation.T)
+        off_mm.append(np.linalg.norm(cam_from_board.apply(middle) - predicted.apply(middle)))
+        turned.append(cam_from_board.rotation @ predicted.rotation.T)
     return np.array(off_mm), rotation_angle(np.array(turned))
 
 
@@ -202,9 +202,10 @@ def _refuse_open(covariance: FloatArray, seen: Sequence[Rigid3]) -> None:
     if np.isfinite(covariance).all():
         worst = max(float(np.linalg.eigvalsh(block)[-1]) for block in blocks) ** 0.5
     if not worst <= MAX_SIGMA_OF_DISTANCE * distance:
-        told = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
+        predicted = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
         raise DegenerateError(
-            f"hand-eye: the hand turned about one axis only, which leaves the place along it open{told}; turn it about "
+            f"hand-eye: the hand turned about one axis only, which leaves the place along it open{predicted}; turn it "
+            f"about "
             "two"
         )
 

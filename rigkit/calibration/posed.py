@@ -29,7 +29,7 @@ from rigkit.core.errors import DegenerateError
 from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
-MAX_LENS_MISFIT_PX = 1.0
+MAX_LENS_RESIDUAL_PX = 1.0
 """A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
 
 
@@ -76,7 +76,7 @@ def posed_calibration(
         convergence=fit.convergence,
         boards=board_shapes(observations, state.shape, state.unknowns),
     )
-    return replace(result, verdicts=judge(result, _misfit(result), in_force=("model", "board_shape")))
+    return replace(result, verdicts=judge(result, _large_residual(result), in_force=("model", "board_shape")))
 
 
 def _on_flat_boards(
@@ -119,8 +119,8 @@ def _shaped(
     return observations, replace(chosen.fit, state=state, data=data), chosen.heldout_px, tuple(candidates)
 
 
-def _misfit(result: Calibration) -> tuple[Finding, ...]:
-    if result.rms_px <= MAX_LENS_MISFIT_PX:
+def _large_residual(result: Calibration) -> tuple[Finding, ...]:
+    if result.rms_px <= MAX_LENS_RESIDUAL_PX:
         return ()
     message = f"the known lens leaves {result.rms_px:.2f} px: the lens of another camera, image size or focus?"
     return (Finding.bad(message, "calibrate it anew"),)

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import SURELY, FittedModel, choose, described
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import Request, compared, enough_agree, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome, chosen_of_sizes, on_same_images
 from rigkit.calibration.judging.pupil import BY_CHANCE
@@ -101,7 +101,7 @@ def against_central(central: ModelOutcome, moving: ModelOutcome, request: Reques
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
         options = compared(central.observations, options, request.folds, request.progress)
-    chosen = choose(options, SURELY)
+    chosen = choose(options, MIN_SIGMAS)
     return chosen.name == MOVING, described(options, chosen)
 
 
@@ -110,11 +110,11 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
     so by chance."""
     if not any(c.chosen and c.name == MOVING for c in candidates):
         return list(candidates)
-    said = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
-    return [replace(c, chosen=c.name == CENTRAL, reason=said[c.name]) for c in candidates]
+    message = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
+    return [replace(c, chosen=c.name == CENTRAL, reason=message[c.name]) for c in candidates]
 
 
-def surely_moves(calibration: Calibration) -> bool:
+def pupil_moves_significantly(calibration: Calibration) -> bool:
     """Say whether the images agree that the pupil of a calibration moves."""
     return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
 

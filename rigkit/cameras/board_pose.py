@@ -25,7 +25,7 @@ def cam_from_seen_board(camera: Camera, pixels: Pixels, points_mm: Points) -> Ri
     return board_pose(rays[valid], points_mm[valid]).cam_from_board
 
 
-def board_from_afar(camera: NearCamera, pixels: Pixels, points_mm: Points) -> Pixels:
+def board_with_fixed_pupil(camera: NearCamera, pixels: Pixels, points_mm: Points) -> Pixels:
     """Return where a board's corners `points_mm` (N, 3), seen at `pixels` (N, 2), would lie if the pupil did not move:
     for whatever takes the lens for central. Corners that the lens cannot see stay where they are.
 
@@ -35,10 +35,10 @@ def board_from_afar(camera: NearCamera, pixels: Pixels, points_mm: Points) -> Pi
 
 
 def _settled(camera: NearCamera, pixels: Pixels, points_mm: Points) -> tuple[Pixels, Rigid3]:
-    """Return the corners of `board_from_afar`, and the pose of the board that they and the pupil show."""
+    """Return the corners of `board_with_fixed_pupil`, and the pose of the board that they and the pupil show."""
     out, pose = pixels, cam_from_seen_board(camera.lens, pixels, points_mm)
     for _ in range(MAX_PUPIL_ROUNDS):
-        moved = camera.as_from_afar(pixels, pose.apply(points_mm))
+        moved = camera.as_with_fixed_pupil(pixels, pose.apply(points_mm))
         moved = np.where(np.isfinite(moved), moved, pixels)
         change = float(np.abs(moved - out).max())
         out = moved

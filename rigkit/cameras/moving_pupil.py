@@ -97,7 +97,7 @@ class NearCamera(Camera):
         _, ahead, _, _, valid = self._through_pupil(x, y, z)
         return np.where(valid[:, None], np.stack([x, y, ahead], axis=1), np.nan)
 
-    def as_from_afar(self, pixels: Pixels, points: Points) -> Pixels:
+    def as_with_fixed_pupil(self, pixels: Pixels, points: Points) -> Pixels:
         """Return where the pixels (N, 2) that show points (N, 3) at known places would lie if the pupil did not move;
         NaN where a point is not seen."""
         return np.asarray(pixels - self.project(points)[0] + self.lens.project(points)[0])
@@ -158,13 +158,13 @@ class NearCamera(Camera):
         return u, v, valid & near
 
 
-def as_other_from_afar(pixels: Pixels, points: Points, camera: Camera, other: Camera) -> Pixels:
-    """Return pixels (N, 2) of points (N, 3), which are `as_from_afar` by a camera, as they are by another that saw the
-    same; the pixels where one of the two is central, and of points that are not seen."""
+def as_other_with_fixed_pupil(pixels: Pixels, points: Points, camera: Camera, other: Camera) -> Pixels:
+    """Return pixels (N, 2) of points (N, 3), which are `as_with_fixed_pupil` by a camera, as they are by another
+    that saw the same; the pixels where one of the two is central, and of points that are not seen."""
     if not (isinstance(camera, NearCamera) and isinstance(other, NearCamera)):
         return pixels
-    seen = pixels - camera.as_from_afar(np.zeros_like(pixels), points)
-    again = other.as_from_afar(seen, points)
+    seen = pixels - camera.as_with_fixed_pupil(np.zeros_like(pixels), points)
+    again = other.as_with_fixed_pupil(seen, points)
     return np.where(np.isfinite(again), again, pixels)
 
 

@@ -12,7 +12,7 @@ from rigkit.core.errors import ExitCode, InputError
 def identify(args: argparse.Namespace) -> int:
     """Print which board the images show, write its file where one is named, and return the exit code."""
     from rigkit.cli.console import note, progress_on_stderr
-    from rigkit.detection.twins import ALIKE_REMEDY
+    from rigkit.detection.duplicate_marks import DUPLICATES_REMEDY
     from rigkit.io.boards.board_file import board_text
     from rigkit.io.disk.writing import ensure_writable, write_atomic
     from rigkit.io.media.video import is_video
@@ -43,7 +43,7 @@ def identify(args: argparse.Namespace) -> int:
         print(path)
     if found.alike:
         seen = f"{len(found.alike)} of {len(found.looked_at)} images, such as '{found.alike[0]}'"
-        note(f"two boards alike in {seen}: detect and calibrate find only one of them; {ALIKE_REMEDY}")
+        note(f"two boards alike in {seen}: detect and calibrate find only one of them; {DUPLICATES_REMEDY}")
     if found.either_pattern:
         note(
             "the pattern of OpenCV before 4.6 and the one of today differ in one column, which no image shows well: if "

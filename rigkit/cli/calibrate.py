@@ -50,7 +50,7 @@ def _one(args: argparse.Namespace) -> int:
 
     started = time.monotonic()
     done = _calibrated(args)
-    summary, words, passed = _said(done, json=args.json)
+    summary, words, passed = _summary(done, json=args.json)
     note(f"{_listed(done.written)} written, {time.monotonic() - started:.1f} s")
     print_json(summary) if args.json else print(words)
     for reason in done.unreadable.values():
@@ -76,7 +76,7 @@ def _calibrated(args: argparse.Namespace) -> SessionCalibration | RigSessionCali
     return calibrate_sources(args.source, folder_options(args), calibrate_options(args), progress=progress_on_stderr())
 
 
-def _said(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
+def _summary(done: SessionCalibration | RigSessionCalibration, *, json: bool) -> tuple[dict[str, Any], str, bool]:
     """Return the figures for `json` programs, the words for a person, and whether everything measured agrees."""
     from rigkit.cli import calibration_words, rig_words
     from rigkit.workflows.calibration.calibrate import SessionCalibration

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.core.findings import gravest_first
+from rigkit.core.findings import most_severe_first
 
 if TYPE_CHECKING:
     from rigkit.calibration.result import Calibration, Candidate
@@ -68,7 +68,7 @@ def describe(calibration: Calibration) -> str:
     lines += [f"  {name:>4} = {value}" for name, value in words.items()]
     lines += left_out(calibration)
     lines += _choices(calibration.candidates)
-    return "\n".join([*lines, *map(str, gravest_first(calibration.verdicts))])
+    return "\n".join([*lines, *map(str, most_severe_first(calibration.verdicts))])
 
 
 def left_out(calibration: Calibration) -> list[str]:

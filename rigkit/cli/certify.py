@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     done = certify_file(args.calibration, task, options_of(CertifyOptions, args))
     certificate, words = done.certificate, done.words
     if args.json:
-        told = {"passed": words.passed, "statement": words.headline, "basis": basis(certificate)}
-        print_json(certificate.to_dict() | told | {"page": words.to_dict()})
+        verdict_fields = {"passed": words.passed, "statement": words.headline, "basis": basis(certificate)}
+        print_json(certificate.to_dict() | verdict_fields | {"page": words.to_dict()})
     else:
         print_statement(words)
         print(tables_to_text([causes_table(certificate)]))

@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("check: --temperature goes into a register; give --register, too")
     ensure_writable((args.fix, args.report), force=args.force, inputs=board_files(args.board))
     boards = tuple(board_of_words(words) for words in args.board)
-    told = {"boards": boards, "length": length, "history": args.register, "temperature_c": args.temperature}
-    options = options_of(CheckOptions, args, **told)
+    given = {"boards": boards, "length": length, "history": args.register, "temperature_c": args.temperature}
+    options = options_of(CheckOptions, args, **given)
     done = check_pictures(args.calibration, args.images, options, progress=progress_on_stderr())
     check = done.check
     if args.json:

@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0.0 < args.goal < float("inf"):
         raise InputError(f"--goal {args.goal}: it must be positive")
-    told = [args.length, args.distance, args.goal_mm]
-    if any(value is not None for value in told) and None in told:
+    given = [args.length, args.distance, args.goal_mm]
+    if any(value is not None for value in given) and None in given:
         raise InputError("coach: --length, --distance and --goal-mm belong together")
     if not 1 <= args.cameras <= MAX_CAMERAS:
         raise InputError(f"--cameras {args.cameras}: 1 to {MAX_CAMERAS}")

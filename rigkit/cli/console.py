@@ -71,8 +71,8 @@ def options_of(kind: type[Options], args: Namespace, /, **others: Any) -> Option
     from dataclasses import fields
 
     own = {f.name for f in fields(kind) if f.name not in others}  # type: ignore[arg-type]
-    told = {name: tuple(v) if isinstance(v, list) else v for name, v in vars(args).items() if name in own}
-    return kind(**told, **others)
+    given = {name: tuple(v) if isinstance(v, list) else v for name, v in vars(args).items() if name in own}
+    return kind(**given, **others)
 
 
 def print_statement(facts: PageFacts) -> None:

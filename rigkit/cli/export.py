@@ -44,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
     from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera, export_rig
 
     size_px = None if args.size is None else size_of_words(args.size)
-    told = {"kind": args.to, "source_kind": args.source_format, "size_px": size_px}
-    options = options_of(ExportCameraOptions, args, **told)
+    passed_on = {"kind": args.to, "source_kind": args.source_format, "size_px": size_px}
+    options = options_of(ExportCameraOptions, args, **passed_on)
     if args.source_format is None and is_rig(args.source):
         rig = export_rig(args.source, options, tuple(args.names or ()))
         print(f"{', '.join(map(str, rig.written))}: {rig.kind}, at most {rig.max_error_px:.4g} px from the rig given")

@@ -10,14 +10,14 @@ from rigkit.cli.manifest_words import (
     angle_of,
     ask,
     cameras_of,
+    parse_angles,
+    parse_baselines,
+    parse_boards,
+    parse_calibrations,
+    parse_length,
+    parse_pose_types,
     pose_type_of,
-    require_told,
-    told_angles,
-    told_baselines,
-    told_boards,
-    told_calibrations,
-    told_length,
-    told_poses,
+    require_answers,
 )
 from rigkit.core.errors import ExitCode, InputError
 from rigkit.io.disk.reading import usable_path
@@ -32,37 +32,37 @@ def run_manifest(args: argparse.Namespace) -> int:
         raise InputError("init: --model goes with --session only; leave it out")
     if args.board and args.square_mm is not None:
         raise InputError("init: --board says how large squares are; leave --square-mm out")
-    told = told_boards(args.board)
+    declared = parse_boards(args.board)
     if args.square_mm is not None:
-        told_length("--square-mm", args.square_mm)
-    poses_told, angles_told = told_poses(args.pose_type), told_angles(args.angle_deg)
+        parse_length("--square-mm", args.square_mm)
+    given_poses, given_angles = parse_pose_types(args.pose_type), parse_angles(args.angle_deg)
     root = usable_path(args.folder).resolve()
     target = args.output or root / "dataset.toml"
     images = find_images(root)
-    calibrations = told_calibrations(args.calibration, target.parent)
+    calibrations = parse_calibrations(args.calibration, target.parent)
     read = [*images, *(target.parent / path for path in calibrations.values())]
     ensure_writable(target, force=args.force, inputs=read)
-    require_told(args)
-    found = find_pairs(root, images, [one.board for one in told], progress=progress_on_stderr())
+    require_answers(args)
+    found = find_pairs(root, images, [one.board for one in declared], progress=progress_on_stderr())
     for error in found.unreadable:
         note(f"left out: {error}")
     names = [pair.name for pair in found.pairs]
     for pair in found.pairs:
         note(f"pair '{pair.name}': {pair.first.image.name}, {pair.second.image.name}")
-    squares_mm = 0.0 if told else args.square_mm or told_length("--square-mm", ask("side of a square, mm"))
+    squares_mm = 0.0 if declared else args.square_mm or parse_length("--square-mm", ask("side of a square, mm"))
     if not calibrations:
-        calibrations = told_calibrations([ask("path of calibration.json")], target.parent)
+        calibrations = parse_calibrations([ask("path of calibration.json")], target.parent)
     cameras = cameras_of(names, calibrations, args.cameras)
-    poses = {name: pose_type_of(poses_told, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
+    poses = {name: pose_type_of(given_poses, name) or ask(f"pose type of '{name}'", POSE_TYPES) for name in names}
     new = NewManifest(
         name=args.name or name_of_folder(root),
         pairs=found.pairs,
-        told=told or squares_mm,
+        declared=declared or squares_mm,
         calibrations=calibrations,
         cameras=cameras,
         pose_types=poses,
-        baselines=told_baselines(args.baseline_mm, names),
-        angles={name: angle for name in names if (angle := angle_of(angles_told, name)) is not None},
+        baselines=parse_baselines(args.baseline_mm, names),
+        angles={name: angle for name in names if (angle := angle_of(given_angles, name)) is not None},
     )
     incomplete = write_manifest(new, target, force=args.force)
     print(target)

@@ -48,11 +48,11 @@ def _appending(path: Path) -> logging.Handler:
 class _InFile(logging.FileHandler):
     """Appends to a file; a disk that is full loses the rest of the log, which is said once, not results."""
 
-    told = False
+    given = False
 
     def handleError(self, record: logging.LogRecord) -> None:
-        if not self.told:
-            self.told = True
+        if not self.given:
+            self.given = True
             with suppress(OSError, ValueError):
                 print(f"--log-file '{self.baseFilename}' cannot grow: the log ends here", file=sys.stderr)
 

@@ -18,13 +18,13 @@ from rigkit.core.posetype import PoseType
 from rigkit.io.disk.reading import usable_path
 
 if TYPE_CHECKING:
-    from rigkit.io.manifests.manifest_writer import ToldBoard
+    from rigkit.io.manifests.manifest_writer import DeclaredBoard
 
 POSE_TYPES = tuple(map(str, PoseType))
 ONE_CAMERA, TWO_CAMERAS = ("camera",), ("camera1", "camera2")
 
 
-def require_told(args: argparse.Namespace) -> None:
+def require_answers(args: argparse.Namespace) -> None:
     """Raise InputError that names everything that nobody has said and that, without a terminal, nobody can be asked."""
     needed = {
         "--square-mm": ("side of a square, mm", args.square_mm or args.board or None),
@@ -33,22 +33,22 @@ def require_told(args: argparse.Namespace) -> None:
     }
     missing = {option: question for option, (question, value) in needed.items() if value is None}
     if missing and (sys.stdin is None or not sys.stdin.isatty()):
-        said = "; ".join(f"the {question}: {option}" for option, question in missing.items())
-        raise InputError(f"init: images cannot tell everything; say {said}")
+        message = "; ".join(f"the {question}: {option}" for option, question in missing.items())
+        raise InputError(f"init: images cannot tell everything; say {message}")
 
 
-def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
+def parse_calibrations(declared: Sequence[str], folder: Path) -> dict[str, str]:
     """Return camera -> path of its calibration, as it stands in a manifest in `folder`; paths are as typed, or from
     that folder. A rig's file stands for those of its cameras, under their names."""
-    told = _of_rigs(told)
-    usual = TWO_CAMERAS if len(told) == 2 else ONE_CAMERA
+    declared = _of_rigs(declared)
+    typical = TWO_CAMERAS if len(declared) == 2 else ONE_CAMERA
     out: dict[str, str] = {}
-    for k, words in enumerate(told):
+    for k, words in enumerate(declared):
         name, found, path = words.partition("=")
         if not found or usable_path(words).exists():
-            if len(told) > len(TWO_CAMERAS):
+            if len(declared) > len(TWO_CAMERAS):
                 raise InputError(f"--calibration {words}: of more than two cameras name each, such as wide={words}")
-            name, path = usual[k], words
+            name, path = typical[k], words
         if check_identifier(name, "camera") in out:
             raise InputError(f"--calibration: two are called '{name}'; name each differently")
         typed = usable_path(path)
@@ -58,41 +58,43 @@ def told_calibrations(told: Sequence[str], folder: Path) -> dict[str, str]:
     return out
 
 
-def _of_rigs(told: Sequence[str]) -> list[str]:
+def _of_rigs(declared: Sequence[str]) -> list[str]:
     """Return what is told with every rig's file replaced by those of its cameras, NAME=FILE."""
     from rigkit.io.calibrations.rig_file import is_rig_file
     from rigkit.workflows.inputs.camera_files import own_files
 
     out: list[str] = []
-    for words in told:
+    for words in declared:
         path = usable_path(words)
         of_rig = own_files(path) if is_rig_file(path) else None
         out += [words] if of_rig is None else [f"{name}={own}" for name, own in of_rig.items()]
     return out
 
 
-def told_boards(words: Sequence[str]) -> list[ToldBoard]:
+def parse_boards(words: Sequence[str]) -> list[DeclaredBoard]:
     """Return the boards that are told: files keep their names, words are called plane1, plane2, ... in their order."""
     from rigkit.io.boards.board_file import load_board
     from rigkit.io.boards.board_words import board_in_words
-    from rigkit.io.manifests.manifest_writer import ToldBoard
+    from rigkit.io.manifests.manifest_writer import DeclaredBoard
 
     out = []
     for number, text in enumerate(words, start=1):
         board = board_in_words(text)
         if board is None:
-            out.append(ToldBoard(load_board(text), Path(text)))
+            out.append(DeclaredBoard(load_board(text), Path(text)))
         else:
-            out.append(ToldBoard(replace(board, board_id=f"plane{number}")))
+            out.append(DeclaredBoard(replace(board, board_id=f"plane{number}")))
     return out
 
 
-def cameras_of(pairs: Sequence[str], calibrations: dict[str, str], told: Sequence[str]) -> dict[str, tuple[str, str]]:
+def cameras_of(
+    pairs: Sequence[str], calibrations: dict[str, str], declared: Sequence[str]
+) -> dict[str, tuple[str, str]]:
     """Return the cameras of every pair; raises InputError for cameras that are not there, or pairs of more than two
     that nobody gives cameras to."""
     known = list(calibrations)
     patterns: list[tuple[str, tuple[str, str]]] = []
-    for words in told:
+    for words in declared:
         pattern, found, both = words.rpartition("=")
         first, comma, second = both.partition(",")
         if not found or not comma:
@@ -103,18 +105,18 @@ def cameras_of(pairs: Sequence[str], calibrations: dict[str, str], told: Sequenc
         patterns.append((pattern, (first, second)))
     out = {}
     for pair in pairs:
-        usual = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
-        found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), usual)
+        typical = (known[0], known[-1]) if len(known) <= len(TWO_CAMERAS) else None
+        found_cameras = next((cameras for pattern, cameras in patterns if fnmatch(pair, pattern)), typical)
         if found_cameras is None:
             raise InputError(f"init: nothing says which cameras took pair '{pair}'; add --cameras {pair}=ONE,TWO")
         out[pair] = found_cameras
     return out
 
 
-def told_poses(told: Sequence[str]) -> list[tuple[str, str]]:
+def parse_pose_types(declared: Sequence[str]) -> list[tuple[str, str]]:
     """Return (pattern of pairs, pose type)."""
     out = []
-    for words in told:
+    for words in declared:
         pattern, _, pose_type = words.rpartition("=")
         if pose_type not in POSE_TYPES:
             raise InputError(f"--pose-type {words}: '{pose_type}' is unknown; known: {', '.join(POSE_TYPES)}")
@@ -122,15 +124,15 @@ def told_poses(told: Sequence[str]) -> list[tuple[str, str]]:
     return out
 
 
-def pose_type_of(told: Sequence[tuple[str, str]], name: str) -> str | None:
+def pose_type_of(declared: Sequence[tuple[str, str]], name: str) -> str | None:
     """Return the first pose type that is told of the pair `name`, or None."""
-    return next((value for pattern, value in told if fnmatch(name, pattern)), None)
+    return next((value for pattern, value in declared if fnmatch(name, pattern)), None)
 
 
-def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
+def parse_baselines(declared: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple[float, float]]:
     """Return pair -> (mm, sigma mm) from PAIR=MM+-SIGMA; raises InputError for other pairs and what is no length."""
     out = {}
-    for text in told:
+    for text in declared:
         name, of, value = text.partition("=")
         number, _, sigma = value.partition("+-")
         if not of:
@@ -138,14 +140,14 @@ def told_baselines(told: Sequence[str], pairs: Sequence[str]) -> dict[str, tuple
         if pairs and name not in pairs:
             raise InputError(f"init: --baseline-mm names '{name}'; pairs found: {', '.join(sorted(pairs))}")
         what = f"--baseline-mm '{text}': write PAIR=MM+-SIGMA, such as {name}=300+-2"
-        out[name] = (told_length(what, number), told_length(what, sigma))
+        out[name] = (parse_length(what, number), parse_length(what, sigma))
     return out
 
 
-def told_angles(told: Sequence[str]) -> list[tuple[str, float, float]]:
+def parse_angles(declared: Sequence[str]) -> list[tuple[str, float, float]]:
     """Return (pattern of pairs, degrees, sigma) from [PAIRS=]DEG+-SIGMA; raises InputError for what is no angle."""
     out = []
-    for text in told:
+    for text in declared:
         pattern, _, value = text.rpartition("=")
         number, _, sigma = value.partition("+-")
         try:
@@ -158,12 +160,12 @@ def told_angles(told: Sequence[str]) -> list[tuple[str, float, float]]:
     return out
 
 
-def angle_of(told: Sequence[tuple[str, float, float]], name: str) -> tuple[float, float] | None:
+def angle_of(declared: Sequence[tuple[str, float, float]], name: str) -> tuple[float, float] | None:
     """Return the first angle, with its sigma, that is told of the pair `name`, or None."""
-    return next(((value, sigma) for pattern, value, sigma in told if fnmatch(name, pattern)), None)
+    return next(((value, sigma) for pattern, value, sigma in declared if fnmatch(name, pattern)), None)
 
 
-def told_length(what: str, value: str | float) -> float:
+def parse_length(what: str, value: str | float) -> float:
     """Return a length in mm; raises InputError where it is no positive number."""
     try:
         number = float(value)

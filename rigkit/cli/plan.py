@@ -69,22 +69,22 @@ def _planned(args: argparse.Namespace) -> PlannedSession:
     from rigkit.cli.console import progress_on_stderr
     from rigkit.io.boards.board_words import board_files, board_of_words
     from rigkit.io.disk.writing import ensure_writable
-    from rigkit.workflows.capture.plan import USUAL_SIGMA_PX, LensOptions, plan_lens, plan_session
+    from rigkit.workflows.capture.plan import TYPICAL_SIGMA_PX, LensOptions, plan_lens, plan_session
 
     if (args.source is None) == (args.lens is None):
         raise InputError("plan: give a calibration or a session, or describe a lens with --lens, --size and --board")
     if args.check and (args.lens is not None or args.length is not None):
         raise InputError("plan: --check is about a calibration or a rig; leave --lens and --length away")
     if args.lens is None:
-        told = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
-        if told:
-            raise InputError(f"plan: --{told[0].replace('_', '-')} goes with --lens; '{args.source}' says it itself")
+        given = [name for name in ("size", "board", "model", "sigma_px") if getattr(args, name)]
+        if given:
+            raise InputError(f"plan: --{given[0].replace('_', '-')} goes with --lens; '{args.source}' says it itself")
         return plan_session(args.source, _options(args, 3), progress=progress_on_stderr())
     if not (args.size and args.board):
         raise InputError("plan: --lens needs --size 1280x960 and --board 9x6x25")
     size_px = size_of_words(args.size)
     ensure_writable(args.report, force=args.force, inputs=board_files(args.board))
-    sigma = USUAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
+    sigma = TYPICAL_SIGMA_PX if args.sigma_px is None else args.sigma_px
     if not 0.0 < sigma < float("inf"):
         raise InputError(f"--sigma-px {sigma}: it must be positive")
     lens = LensOptions(
@@ -103,5 +103,5 @@ def _options(args: argparse.Namespace, count: int) -> PlanOptions:
 
     if args.views is not None and not 1 <= args.views <= MAX_VIEWS:
         raise InputError(f"--views {args.views}: 1 to {MAX_VIEWS}")
-    told = {"count": args.views or count, "length": length_of(args, "plan"), "reach": reach_of(args)}
-    return options_of(PlanOptions, args, **told)
+    given = {"count": args.views or count, "length": length_of(args, "plan"), "reach": reach_of(args)}
+    return options_of(PlanOptions, args, **given)

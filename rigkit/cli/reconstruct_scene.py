@@ -69,8 +69,8 @@ def run_scene(args: argparse.Namespace) -> int:
             raise InputError(f"reconstruct: {option} names two, or with --rig three and more; got {len(given)}")
     name = (args.correspondences or args.images[0]).stem
     out = results_folder(args, name)
-    told = {"output": out, "rig_names": tuple(args.names) if args.names else None, "grow": not args.sparse}
-    options = options_of(SceneOptions, args, **told, **_written(args))
+    passed_on = {"output": out, "rig_names": tuple(args.names) if args.names else None, "grow": not args.sparse}
+    options = options_of(SceneOptions, args, **passed_on, **_written(args))
     done = reconstruct_views(options, progress=progress_on_stderr())
     scene, r = done.scene, done.scene.reconstruction
     for words in r.notes:

@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 from rigkit.cli import calibration_words
-from rigkit.core.findings import gravest_first
+from rigkit.core.findings import most_severe_first
 from rigkit.core.printing import length_words
 
 if TYPE_CHECKING:
@@ -112,9 +112,9 @@ def describe(rig: RigCalibration, checks: Sequence[Check]) -> str:
             f"({c.how}), off by {c.k:.1f} combined sigmas"
         )
     # What is wrong with the rig comes before what that did to its cameras.
-    lines += map(str, gravest_first(rig.verdicts))
+    lines += map(str, most_severe_first(rig.verdicts))
     lines += [f"frame {frame}, board '{board}' left out: {reason}" for frame, board, reason in rig.left_out]
     for camera, alone in zip(rig.cameras, rig.single, strict=True):
         lines += [f"{camera.name}: {line}" for line in calibration_words.left_out(alone)]
-        lines += [f"{camera.name} alone: {verdict}" for verdict in gravest_first(alone.verdicts)]
+        lines += [f"{camera.name} alone: {verdict}" for verdict in most_severe_first(alone.verdicts)]
     return "\n".join(lines)

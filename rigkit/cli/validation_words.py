@@ -34,14 +34,14 @@ def show(done: DatasetValidation, out: Path, *, json: bool) -> int:
         print_json(result | failed_pairs(done.failures))
     else:
         print(tables_to_text([summary_table([pair.best for pair in done.pairs])]))
-        _say_failures(done.reports, done.crosschecks)
+        _print_failures(done.reports, done.crosschecks)
         for cause in done.causes:
             if done.passed:
                 note(f"to look at: {cause.text}")
             else:
                 print(f"probable cause: {cause.text}")
         # What is no cause comes after the causes: first it would be taken for one.
-        _say_notes(done.reports, done.crosschecks)
+        _print_notes(done.reports, done.crosschecks)
         failed = "NOT every pair was validated" if done.failures else "a check FAILED"
         page = "report.html" if "report.html" in done.files else "tables.md"
         print(f"{'all checks passed' if done.passed else failed}; {out / page}, {done.seconds:.1f} s")
@@ -63,14 +63,14 @@ def show_paper(done: PaperValidation, options: PaperOptions, *, json: bool) -> i
     return exit_code_of(done.failures, ExitCode.WELL)
 
 
-def _say_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
+def _print_failures(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
     from rigkit.report.pages.validation_verdict import failed_facts
 
     for fact in failed_facts(reports, compared):
         print(" ".join(filter(None, [fact.what, fact.pair_id, ",".join(fact.methods), fact.words])))
 
 
-def _say_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
+def _print_notes(reports: Sequence[ValidationReport], compared: Sequence[CrossCheckReport]) -> None:
     for other in compared:
         for words in other.skipped:
             note(f"{other.pair_id}: not cross-checked by {words}")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rigkit.coach.guide import GuideOptions
 from rigkit.coach.keeper import Keeper
-from rigkit.coach.look import Glance, glance_at
+from rigkit.coach.look import FrameObservation, observe_frame
 from rigkit.coach.rig import RigAdvice, RigGuide
 from rigkit.core.errors import InputError
 from rigkit.io.media.images import announced_sizes, quiet_opencv
@@ -82,7 +82,7 @@ class Coach:
         self.finished: str | None = None
         self._finish, self._tell = finish, tell
         self._lock = threading.Lock()
-        self._last: list[Glance | None] = [None] * len(keeper.names)
+        self._last: list[FrameObservation | None] = [None] * len(keeper.names)
         self._shrink = [1] * len(keeper.names)
         self._names: list[str] = []
         self._marks: dict[bytes, str] = {}
@@ -91,10 +91,10 @@ class Coach:
         self._shown: dict[str, Any] = self.guide.state(None, None) | {"looks": 0}
         for name, images in keeper.images():
             seen = [
-                glance_at(image, options.boards, name, camera=camera)
+                observe_frame(image, options.boards, name, camera=camera)
                 for image, camera in zip(images, self._called, strict=True)
             ]
-            if any(glance.view is not None for glance in seen):
+            if any(frame_observation.view is not None for frame_observation in seen):
                 self._add(name, seen, images)
 
     def look(
@@ -117,44 +117,46 @@ class Coach:
             raise InputError(f"coach: {len(images)} images of {len(names)} cameras ({', '.join(names)})")
         with self._lock:
             whole = photo or take is Take.YES
-            glances = self._glances(images, whole=whole, photo=photo)
-            advice = self.guide.advise(glances, photo=photo)
+            frame_observations = self._observe(images, whole=whole, photo=photo)
+            advice = self.guide.advise(frame_observations, photo=photo)
             # A folder is looked through from its beginning again when the coach is started again.
             again = self._marks.get(_mark(images)) if photo else None
             kept = take is Take.YES or (take is Take.WORTH and advice.take and again is None)
             taken = None
-            if kept and any(glance.view is not None for glance in glances):
+            if kept and any(frame_observation.view is not None for frame_observation in frame_observations):
                 if not whole:
-                    glances = self._glances(images, whole=True, photo=photo)
-                taken = self._keep(images, glances, source)
-                advice = self.guide.advise(glances)
-            self._last = list(glances)
+                    frame_observations = self._observe(images, whole=True, photo=photo)
+                taken = self._keep(images, frame_observations, source)
+                advice = self.guide.advise(frame_observations)
+            self._last = list(frame_observations)
             self._offered = None if taken else (images, photo)
             show(images)
-            self._show(glances, advice, taken=taken)
+            self._show(frame_observations, advice, taken=taken)
             if photo and not taken:
-                reason = f"it is {again} already" if again else _reason(glances, advice)
+                reason = f"it is {again} already" if again else _reason(frame_observations, advice)
                 self._tell(f"{source or 'photo'}: not taken, as {reason}")
                 self.say(f"Not taken, as {reason}. {self._shown['words']}")
             return self._shown
 
-    def _keep(self, images: Sequence[Image], glances: Sequence[Glance], source: str) -> str:
+    def _keep(self, images: Sequence[Image], frame_observations: Sequence[FrameObservation], source: str) -> str:
         """Write a frame and go on with it; return its name."""
         name = self.keeper.keep(images)
-        self._add(name, glances, images)
+        self._add(name, frame_observations, images)
         self._tell(f"{source}: taken as {name}" if source else f"{name} taken")
         return name
 
-    def _add(self, name: str, glances: Sequence[Glance], images: Sequence[Image]) -> None:
+    def _add(self, name: str, frame_observations: Sequence[FrameObservation], images: Sequence[Image]) -> None:
         self._names.append(name)
         self._marks[_mark(images)] = name
-        self.guide.add(glances)
+        self.guide.add(frame_observations)
 
-    def _show(self, glances: Sequence[Glance] | None, advice: RigAdvice | None, **more: Any) -> None:
+    def _show(
+        self, frame_observations: Sequence[FrameObservation] | None, advice: RigAdvice | None, **more: Any
+    ) -> None:
         looks = self._shown["looks"] + (advice is not None)
-        self._shown = self.guide.state(glances, advice) | {"looks": looks, "finished": self.finished, **more}
+        self._shown = self.guide.state(frame_observations, advice) | {"looks": looks, "finished": self.finished, **more}
 
-    def _glances(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[Glance]:
+    def _observe(self, images: Sequence[Image], *, whole: bool, photo: bool) -> list[FrameObservation]:
         """Return what all cameras show; what is not `whole` is looked at quickly, and where that is slow, in a
         smaller picture."""
         out, boards = [], self.guide.options.boards
@@ -163,16 +165,16 @@ class Coach:
         for c, (image, name, lens) in enumerate(zip(images, self.keeper.names, self.guide.lenses, strict=True)):
             shrink = 1 if whole else self._shrink[c]
             began = time.thread_time()
-            glance = glance_at(
+            frame_observation = observe_frame(
                 image, boards, frame, self._last[c], shrink=shrink, quick=not whole, camera=self._called[c]
             )
             if not whole:
                 # The work grows with the picture's area.
                 spent = (time.thread_time() - began) * shrink**2
                 self._shrink[c] = int(np.clip(np.ceil(np.sqrt(spent / LOOK_S)), 1, MAX_SHRINK))
-            if lens.size_px not in (None, glance.size_px):
-                raise InputError(f"coach: frames of {glance.size_px} px; '{name}' has {lens.size_px} so far")
-            out.append(glance.as_photo() if photo else glance)
+            if lens.size_px not in (None, frame_observation.size_px):
+                raise InputError(f"coach: frames of {frame_observation.size_px} px; '{name}' has {lens.size_px} so far")
+            out.append(frame_observation.as_photo() if photo else frame_observation)
         return out
 
     def say(self, words: str) -> None:
@@ -183,7 +185,10 @@ class Coach:
         """Return what was said last: for pages whose frames come from this machine, or are photos."""
         if self._shown.get("waits"):
             with self._lock:
-                none = [Glance(size_px=glance.size_px, view=None) for glance in self.guide.frames[-1]]
+                none = [
+                    FrameObservation(size_px=frame_observation.size_px, view=None)
+                    for frame_observation in self.guide.frames[-1]
+                ]
                 advice = self.guide.advise(none)
                 if not advice.waits:
                     self._show(none, advice)
@@ -200,21 +205,21 @@ class Coach:
     def choose(self, frames: Sequence[Sequence[Image]], show: Callable[[Sequence[Image]], None]) -> None:
         """Take the frames that help most out of a recording, the best first, each of which is shown, until there are
         enough or none that is left helps."""
-        glances: list[list[Glance]] = []
+        frame_observations: list[list[FrameObservation]] = []
         left = list(range(len(frames)))
         for images in frames:
-            self.say(f"Looking closely: {len(glances) + 1} of {len(frames)}")
-            glances.append(self._glances(images, whole=True, photo=True))
+            self.say(f"Looking closely: {len(frame_observations) + 1} of {len(frames)}")
+            frame_observations.append(self._observe(images, whole=True, photo=True))
         while left:
-            advice = [self.guide.advise(glances[k]) for k in left]
+            advice = [self.guide.advise(frame_observations[k]) for k in left]
             if advice[0].enough or max(a.worth for a in advice) < MIN_WORTH:
                 return
             best = left.pop(int(np.argmax([a.worth for a in advice])))
             with self._lock:
-                self._keep(frames[best], glances[best], "")
+                self._keep(frames[best], frame_observations[best], "")
                 show(frames[best])
                 chosen = f"Choosing frames: {len(self.guide.frames)} so far"
-                self._show(glances[best], self.guide.advise(glances[best]), words=chosen)
+                self._show(frame_observations[best], self.guide.advise(frame_observations[best]), words=chosen)
 
     def undo(self) -> dict[str, Any]:
         """Set the last frame aside; raises InputError where there is none."""
@@ -227,8 +232,8 @@ class Coach:
             self._marks = {mark: name for mark, name in self._marks.items() if name != dropped}
             frames = self.guide.frames[:-1]
             self.guide = RigGuide(self.keeper.names, self.guide.options, self._executor)
-            for glances in frames:
-                self.guide.add(glances)
+            for frame_observations in frames:
+                self.guide.add(frame_observations)
             self._show(None, None)
             return self._shown
 
@@ -245,10 +250,10 @@ def _mark(images: Sequence[Image]) -> bytes:
     return sha256(b"".join(np.ascontiguousarray(image).tobytes() for image in images)).digest()
 
 
-def _reason(glances: Sequence[Glance], advice: RigAdvice) -> str:
+def _reason(frame_observations: Sequence[FrameObservation], advice: RigAdvice) -> str:
     """Return why a picture is not taken."""
-    seeing = [glance for glance in glances if glance.view is not None]
-    wrong = next((glance.complaint for glance in seeing if glance.complaint), "")
+    seeing = [frame_observation for frame_observation in frame_observations if frame_observation.view is not None]
+    wrong = next((frame_observation.complaint for frame_observation in seeing if frame_observation.complaint), "")
     if not seeing:
         return "no board is seen"
     if wrong:

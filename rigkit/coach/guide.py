@@ -16,7 +16,7 @@ from rigkit.calibration.views.repeats import cluster_numbers
 from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.cameras.compare import grid_pixels
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.whole import WholeCalibrations, whole_calibration
 from rigkit.core.arrays import Pixels
 from rigkit.core.boards import Board
@@ -36,16 +36,16 @@ FIRST_FRAMES = 4
 ENOUGH_FRAMES = 8
 """With fewer nobody can tell whether the lens model fits."""
 CHECKING = "Wait a moment: is it enough?"
-WORTH_TAKING = 0.6
+MIN_GAIN = 0.6
 """A frame that brings this part of what the outline would bring is taken, wherever the board is."""
-WORTH_OF_PHOTO = 0.2
+MIN_GAIN_OF_PHOTO = 0.2
 """A photo is there already, and another like the outline may never come: five of these bring as much. One that takes
-WORTH_GOING_ON of the error away is taken, too, however much more the outline would."""
-WORTH_GOING_ON = 0.05
+MIN_GAIN_TO_CONTINUE of the error away is taken, too, however much more the outline would."""
+MIN_GAIN_TO_CONTINUE = 0.05
 """Where two more frames would bring less than this, there are enough."""
 MODELS_TRIED = (("brown", 5), ("kannala_brandt", None))
 LIVE_GRID = (24, 16)
-USUAL_ERROR = CornerError(0.15, 0.05)
+TYPICAL_ERROR = CornerError(0.15, 0.05)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,31 +175,31 @@ class CaptureGuide:
         if self._whole.go_on(self.views, self.size_px):
             self._plan = self._map = None
 
-    def advise(self, glance: Glance, *, photo: bool = False) -> Advice:
+    def advise(self, frame_observation: FrameObservation, *, photo: bool = False) -> Advice:
         """Return what to do, and whether to take this frame, or `photo`."""
         self._go_on()
-        plan = self._planned(glance.size_px)
-        target = self.asked(glance.size_px)
+        plan = self._planned(frame_observation.size_px)
+        target = self.asked(frame_observation.size_px)
         where = placement(plan.knowledge.camera, target.board, target.cam_from_board)
-        worth, min_worth = self._worth(glance.view, plan, photo=photo), min_worth_of(photo=photo)
+        worth, min_gain = self._gain(frame_observation.view, plan, photo=photo), min_gain_of(photo=photo)
         left = () if self.calibration is None else self._left_now
         would_do = bool(left) and self.has_many
-        would_do = would_do and (all(own.reached for own in left) or plan.gain < WORTH_GOING_ON)
+        would_do = would_do and (all(own.reached for own in left) or plan.gain < MIN_GAIN_TO_CONTINUE)
         steady = self._whole.steady(len(self.views)) if would_do else False
         words = f"Hold the board: {where}"
         if steady is None:
             words = CHECKING
         elif steady:
             words = enough_words(left, plan.gain, plan.knowledge.camera)
-        elif glance.view is not None and worth >= min_worth and glance.complaint:
-            words = glance.complaint.capitalize()
+        elif frame_observation.view is not None and worth >= min_gain and frame_observation.complaint:
+            words = frame_observation.complaint.capitalize()
         elif would_do:
             words = f"One more, to see that it is steady: {where}"
         return Advice(
             words=words,
             target_px=where.outline_px,
             worth=worth,
-            take=not glance.complaint and worth >= min_worth and steady is False,
+            take=not frame_observation.complaint and worth >= min_gain and steady is False,
             enough=steady is True,
             waits=steady is None,
             left=left,
@@ -272,7 +272,7 @@ class CaptureGuide:
             knowledge = Knowledge.of(self.calibration)
         else:
             knowledge, later = (
-                Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), USUAL_ERROR),
+                Knowledge.guessed(guessed_camera(self.options.hfov_deg, size_px), TYPICAL_ERROR),
                 self.views,
             )
         for view in later:
@@ -285,7 +285,7 @@ class CaptureGuide:
         """Say whether the board was not moved since a frame that is taken: the two count as one."""
         return _distinct([*self.views, view]) == _distinct(self.views)
 
-    def _worth(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
+    def _gain(self, view: BoardView | None, plan: Plan, *, photo: bool) -> float:
         """Return what this frame brings, as a part of what the outline would: nothing where the board was not moved
         since one that is taken, for the two count as one. A photo that is new is worth taking as one of the first, and
         where it takes enough off the error."""
@@ -296,16 +296,16 @@ class CaptureGuide:
             return 0.0
         known = plan.knowledge
         more = known.of_views(held_view(view, pose), view.board.board_id)[0]
-        worth = worth_beside(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
+        worth = relative_gain(plan, float(plan.goal.error(covariance_of(known.information + more))), photo=photo)
         # So few frames do not tell what others would bring.
-        return max(worth, WORTH_OF_PHOTO) if photo and not self.has_many else worth
+        return max(worth, MIN_GAIN_OF_PHOTO) if photo and not self.has_many else worth
 
 
-def worth_beside(plan: Plan, after: float, *, photo: bool) -> float:
+def relative_gain(plan: Plan, after: float, *, photo: bool) -> float:
     """Return what a frame that leaves the error `after` brings, as a part of what the first of the plan would; of a
     photo also what it takes off the error counts."""
     brings = (plan.error - after) / max(plan.error - plan.views[0].error, 1e-12)
-    return max(brings, WORTH_OF_PHOTO / WORTH_GOING_ON * (1.0 - after / plan.error)) if photo else brings
+    return max(brings, MIN_GAIN_OF_PHOTO / MIN_GAIN_TO_CONTINUE * (1.0 - after / plan.error)) if photo else brings
 
 
 def stated_words(left: Sequence[RemainingError]) -> str:
@@ -316,16 +316,16 @@ def stated_words(left: Sequence[RemainingError]) -> str:
 
 def enough_words(left: Sequence[RemainingError], gain: float, camera: Camera | None = None) -> str:
     """Return that there are enough frames, in words; of one `camera` also what an error comes to."""
-    said = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
+    message = ", ".join(map(str, left)) if camera is None or len(left) > 1 else px_words(camera, left[0].error)
     missed = [f"{own.requirement.wanted:g} {own.requirement.goal.unit}" for own in left if not own.reached]
     if not missed:
-        return f"Enough: {said}; two more pictures would bring {100.0 * gain:.0f} %"
-    return f"Enough: {said}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"
+        return f"Enough: {message}; two more pictures would bring {100.0 * gain:.0f} %"
+    return f"Enough: {message}, not {' and '.join(missed)}, but two more pictures would bring only {100.0 * gain:.0f} %"
 
 
-def min_worth_of(*, photo: bool) -> float:
+def min_gain_of(*, photo: bool) -> float:
     """Return what a frame has to be worth to be taken."""
-    return WORTH_OF_PHOTO if photo else WORTH_TAKING
+    return MIN_GAIN_OF_PHOTO if photo else MIN_GAIN
 
 
 def _distinct(views: Sequence[BoardView]) -> int:

@@ -81,17 +81,17 @@ class Keeper:
         """Set a frame aside: it stays on disk, under a name that no session reads."""
         for path in (place / name for place in self._places):
             if path.exists():
-                path.rename(_aside(path))
+                path.rename(_dropped_path(path))
 
 
-def _aside(path: Path) -> Path:
+def _dropped_path(path: Path) -> Path:
     """Return a name for a frame set aside that no other has: after it is undone, the next one is called as it was."""
-    aside = path.with_suffix(".png.dropped")
+    dropped = path.with_suffix(".png.dropped")
     again = 1
-    while aside.exists():
+    while dropped.exists():
         again += 1
-        aside = path.with_suffix(f".png.dropped-{again}")
-    return aside
+        dropped = path.with_suffix(f".png.dropped-{again}")
+    return dropped
 
 
 def _number(name: str) -> int:

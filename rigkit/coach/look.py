@@ -25,7 +25,7 @@ MIN_BOARD_CONTRAST = 30.0
 """Grey levels of 255 between black and white squares, at the least."""
 MAX_CLIPPED = 0.2
 """Part of the board's pixels that may be white without any detail."""
-TOLD_BY = 60_000
+MAX_SAMPLED_PIXELS = 60_000
 """So many pixels of the board tell its light and its edges as well as all."""
 DARK_AND_BRIGHT = (5.0, 95.0)
 STEEPEST = 99.0
@@ -33,7 +33,7 @@ STEEPEST = 99.0
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Glance:
+class FrameObservation:
     """What a frame shows.
 
     Attributes
@@ -64,7 +64,7 @@ class Glance:
     def exposed(self) -> bool:
         return self.contrast >= MIN_BOARD_CONTRAST and self.clipped <= MAX_CLIPPED
 
-    def as_photo(self) -> Glance:
+    def as_photo(self) -> FrameObservation:
         """Return the glance at a picture that was taken by itself, of a board that was held as still as it shows."""
         return self if self.view is None else replace(self, moved_px=0.0)
 
@@ -96,16 +96,16 @@ class Glance:
         return "" if self.sharp else "not sharp: hold still, or farther away"
 
 
-def glance_at(
+def observe_frame(
     image: NDArray[Any],
     boards: Sequence[Board],
     name: str,
-    last: Glance | None = None,
+    last: FrameObservation | None = None,
     *,
     shrink: int = 1,
     quick: bool = False,
     camera: str | None = None,
-) -> Glance:
+) -> FrameObservation:
     """Return what a frame shows, `last` having been seen before it; the board is looked for at a `shrink`-th of the
     size, and quickly, which takes less time and places corners less well. Parts of boards are called after the frame's
     `name`, and after its `camera` where there are several."""
@@ -117,7 +117,7 @@ def glance_at(
     )
     views, _ = views_of_image(name, detect_boards(smaller, boards, quick=quick), boards, camera)
     if not views:
-        return Glance(size_px=size_px, view=None)
+        return FrameObservation(size_px=size_px, view=None)
     view = max(views, key=lambda v: len(v.grid))
     if shrink > 1:
         full = np.clip((view.pixels + 0.5) * shrink - 0.5, -0.5, np.array(size_px) - 0.5)
@@ -126,7 +126,7 @@ def glance_at(
     cut = image[int(max(low[1], 0)) : int(high[1]) + 1, int(max(low[0], 0)) : int(high[0]) + 1]
     top = 255.0 if image.dtype == np.uint8 else float(np.iinfo(image.dtype).max)
     part = np.asarray(grey_image(cut), dtype=np.float32) * np.float32(255.0 / top)
-    every = 1 + int(np.sqrt(part.size / TOLD_BY))
+    every = 1 + int(np.sqrt(part.size / MAX_SAMPLED_PIXELS))
     dark, bright = np.percentile(part[::every, ::every], DARK_AND_BRIGHT)
     # Differences of neighbours, of some pixels.
     inner = part[1:-1:every, 1:-1:every]
@@ -134,24 +134,24 @@ def glance_at(
     across = part[1:-1:every, 2::every][:, :columns] - part[1:-1:every, :-2:every][:, :columns]
     down = part[2::every, 1:-1:every][:rows] - part[:-2:every, 1:-1:every][:rows]
     steepest = float(np.percentile(0.5 * np.hypot(across, down), STEEPEST)) if inner.size else 0.0
-    return Glance(
+    return FrameObservation(
         size_px=size_px,
         view=view,
         edge_px=float(bright - dark) / max(steepest, 1e-6),
-        moved_px=_way(view, last),
+        moved_px=_median_displacement_px(view, last),
         contrast=float(bright - dark),
         clipped=float((part[::every, ::every] >= 254.0).mean()),
     )
 
 
-def _way(view: BoardView, last: Glance | None) -> float | None:
+def _median_displacement_px(view: BoardView, last: FrameObservation | None) -> float | None:
     """Return the median way, px, of the corners that were seen last time, too."""
     if last is None or last.view is None or last.view.board.board_id != view.board.board_id:
         return None
     before = {(int(c), int(r)): p for (c, r), p in zip(last.view.grid, last.view.pixels, strict=True)}
-    ways: list[FloatArray] = [
+    displacements: list[FloatArray] = [
         p - before[int(c), int(r)]
         for (c, r), p in zip(view.grid, view.pixels, strict=True)
         if (int(c), int(r)) in before
     ]
-    return float(np.median(np.linalg.norm(ways, axis=1))) if ways else None
+    return float(np.median(np.linalg.norm(displacements, axis=1))) if displacements else None

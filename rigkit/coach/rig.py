@@ -18,15 +18,15 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import (
     CHECKING,
     ENOUGH_FRAMES,
-    WORTH_GOING_ON,
+    MIN_GAIN_TO_CONTINUE,
     Advice,
     CaptureGuide,
     GuideOptions,
     enough_words,
     held_view,
-    min_worth_of,
+    min_gain_of,
 )
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig_whole import RigKnown, whole_rig
 from rigkit.coach.whole import WholeCalibrations
 from rigkit.core.arrays import Pixels
@@ -58,7 +58,7 @@ class RigAdvice:
     mount_px : how wrong the mounts are; None where nobody knows.
     worth : what the frames bring, as a part of what a board in the outline would.
     enough, waits : whether there are enough frames; whether nothing is asked for until that is known.
-    speaks : the number of the camera that the words are about.
+    advised_camera : the number of the camera that the words are about.
     targets : by camera the outline (K, 2) to hold the board into, None for none.
     left, gain : once the rig was calibrated, what that leaves of what is to become small, and the part of the worst of
         it that two more frames would take away.
@@ -71,7 +71,7 @@ class RigAdvice:
     take: bool = False
     enough: bool = False
     waits: bool = False
-    speaks: int = 0
+    advised_camera: int = 0
     targets: tuple[Pixels | None, ...] = ()
     left: tuple[RemainingError, ...] = ()
     gain: float | None = None
@@ -79,7 +79,7 @@ class RigAdvice:
     @property
     def more_percent(self) -> float | None:
         """What two more frames would bring."""
-        return self.lenses[self.speaks].more_percent if self.gain is None else 100.0 * self.gain
+        return self.lenses[self.advised_camera].more_percent if self.gain is None else 100.0 * self.gain
 
 
 class RigGuide:
@@ -92,91 +92,98 @@ class RigGuide:
         self.lenses = tuple(CaptureGuide(alone, executor) for _ in names)
         self._whole = WholeCalibrations(executor or Here(), whole_rig)
         self._known: RigKnown | None = None
-        self.frames: list[tuple[Glance, ...]] = []
+        self.frames: list[tuple[FrameObservation, ...]] = []
         self._shared: dict[int, SharedViews | None] = {}
         self._asked: dict[int, tuple[str, list[Pixels | None]]] = {}
 
-    def add(self, glances: Sequence[Glance]) -> None:
+    def add(self, frame_observations: Sequence[FrameObservation]) -> None:
         """Take a frame of every camera."""
-        self.frames.append(tuple(glances))
+        self.frames.append(tuple(frame_observations))
         self._shared.clear()
         self._asked.clear()
-        for lens, glance in zip(self.lenses, glances, strict=True):
-            if glance.view is not None:
-                lens.add(glance.view, glance.size_px)
+        for lens, frame_observation in zip(self.lenses, frame_observations, strict=True):
+            if frame_observation.view is not None:
+                lens.add(frame_observation.view, frame_observation.size_px)
 
-    def advise(self, glances: Sequence[Glance], *, photo: bool = False) -> RigAdvice:
+    def advise(self, frame_observations: Sequence[FrameObservation], *, photo: bool = False) -> RigAdvice:
         """Return what to do, and whether to take these frames, or photos."""
-        lenses = tuple(lens.advise(glance, photo=photo) for lens, glance in zip(self.lenses, glances, strict=True))
+        lenses = tuple(
+            lens.advise(frame_observation, photo=photo)
+            for lens, frame_observation in zip(self.lenses, frame_observations, strict=True)
+        )
         mounts = {c: self._mount_px(c) for c in range(1, len(lenses))}
         open_mounts = [c for c, px in mounts.items() if px is None or px > self.options.goal_px]
         known_px = [px for px in mounts.values() if px is not None]
         mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
-        said = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
+        message = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
         alone = all(advice.enough for advice in lenses)
         if len(lenses) > 1 and not open_mounts and (alone or self._rig_is_enough(lenses)):
-            said = self._of_rig(said, glances, photo=photo)
+            message = self._of_rig(message, frame_observations, photo=photo)
         elif len(lenses) == 1 or not alone:
-            said = self._of_lenses(said, glances)
+            message = self._of_lenses(message, frame_observations)
         else:
-            speaks = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
-            said = self._of_mount(replace(said, speaks=speaks), glances)
-        seeing, min_worth = [g for g in glances if g.view is not None], min_worth_of(photo=photo)
+            advised_camera = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
+            message = self._of_mount(replace(message, advised_camera=advised_camera), frame_observations)
+        seeing, min_gain = [g for g in frame_observations if g.view is not None], min_gain_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
-        if said.enough or said.waits or not seeing or said.worth < min_worth:
-            return said
-        return replace(said, take=not complaint, words=complaint.capitalize() or TAKING)
+        if message.enough or message.waits or not seeing or message.worth < min_gain:
+            return message
+        return replace(message, take=not complaint, words=complaint.capitalize() or TAKING)
 
-    def _of_lenses(self, said: RigAdvice, glances: Sequence[Glance]) -> RigAdvice:
+    def _of_lenses(self, message: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return what the lens that is worst off says; where nobody knows an error, that with the fewest frames."""
-        lenses = said.lenses
+        lenses = message.lenses
         badly = [(a.enough, a.waits, -a.share, len(lens.views)) for lens, a in zip(self.lenses, lenses, strict=True)]
-        speaks = min(range(len(lenses)), key=lambda c: badly[c])
-        own = lenses[speaks]
+        advised_camera = min(range(len(lenses)), key=lambda c: badly[c])
+        own = lenses[advised_camera]
         return replace(
-            said,
-            words=own.words if len(lenses) == 1 else f"{self.names[speaks]}: {own.words}",
+            message,
+            words=own.words if len(lenses) == 1 else f"{self.names[advised_camera]}: {own.words}",
             worth=max(
-                [a.worth for a, g in zip(lenses, glances, strict=True) if not (a.enough or a.waits) and g.view],
+                [
+                    a.worth
+                    for a, g in zip(lenses, frame_observations, strict=True)
+                    if not (a.enough or a.waits) and g.view
+                ],
                 default=0.0,
             ),
             enough=own.enough,
             waits=own.waits,
-            speaks=speaks,
-            targets=tuple(a.target_px if c == speaks and not a.waits else None for c, a in enumerate(lenses)),
+            advised_camera=advised_camera,
+            targets=tuple(a.target_px if c == advised_camera and not a.waits else None for c, a in enumerate(lenses)),
         )
 
-    def _of_mount(self, said: RigAdvice, glances: Sequence[Glance]) -> RigAdvice:
+    def _of_mount(self, message: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return what the camera whose mount is least sure says."""
-        c = said.speaks
+        c = message.advised_camera
         if c not in self._asked:
             self._asked[c] = self._shared_target(c)
         words, targets = self._asked[c]
-        return replace(said, words=words, targets=tuple(targets), worth=self._shared_worth(c, glances))
+        return replace(message, words=words, targets=tuple(targets), worth=self._mount_gain(c, frame_observations))
 
-    def _of_rig(self, said: RigAdvice, glances: Sequence[Glance], *, photo: bool) -> RigAdvice:
+    def _of_rig(self, message: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
         """Return what the rig's calibration says, once lenses and mounts seem good enough."""
         self._go_on()
         steady = self._whole.steady(len(self.frames))
         if steady is None:
-            return replace(said, words=CHECKING, waits=True)
+            return replace(message, words=CHECKING, waits=True)
         if self._whole.latest is None:
-            return self._of_mount(replace(said, speaks=1), glances)
+            return self._of_mount(replace(message, advised_camera=1), frame_observations)
         try:
             known = self._known_by(self._whole.latest)
         except DegenerateError as error:
-            return replace(said, words=str(error))
-        said = replace(said, left=known.left, gain=known.plan.gain)
-        would_do = known.reached or known.plan.gain < WORTH_GOING_ON
+            return replace(message, words=str(error))
+        message = replace(message, left=known.left, gain=known.plan.gain)
+        would_do = known.reached or known.plan.gain < MIN_GAIN_TO_CONTINUE
         if steady and would_do:
-            return replace(said, words=enough_words(known.left, known.plan.gain), enough=True)
+            return replace(message, words=enough_words(known.left, known.plan.gain), enough=True)
         words, targets = known.target()
         if would_do:
             words = f"One more, to see that it is steady: {words[0].lower()}{words[1:]}"
-        frame = [glance.view for glance in glances]
+        frame = [frame_observation.view for frame_observation in frame_observations]
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
         worth = known.worth(frame, photo=photo) if new else 0.0
-        return replace(said, words=words, targets=tuple(targets), worth=worth)
+        return replace(message, words=words, targets=tuple(targets), worth=worth)
 
     def _rig_is_enough(self, lenses: Sequence[Advice]) -> bool:
         """Say whether the rig's calibration says so although some lens alone does not, as cameras help each other."""
@@ -197,7 +204,7 @@ class RigGuide:
         not find it again."""
         if not all(lens.is_calibrated for lens in self.lenses):
             return
-        frames = [[glance.view for glance in frame] for frame in self.frames]
+        frames = [[frame_observation.view for frame_observation in frame] for frame in self.frames]
         begun = [lens.begun for lens in self.lenses if lens.begun is not None]
         if self._whole.go_on(frames, self.names, [lens.size_px for lens in self.lenses], begun):
             self._known = None
@@ -230,7 +237,7 @@ class RigGuide:
         cameras = [self.lenses[c].camera(size) for c, size in zip((a, b), sizes, strict=True)]
         return SharedViews(cameras[0], cameras[1], in_a, in_b, self.lenses[b].corner_error(sizes[1]))
 
-    def _held_by(self, a: int, b: int, frame: Sequence[Glance]) -> tuple[HeldBoards, HeldBoards] | None:
+    def _held_by(self, a: int, b: int, frame: Sequence[FrameObservation]) -> tuple[HeldBoards, HeldBoards] | None:
         first, second = frame[a].view, frame[b].view
         if first is None or second is None or first.board.board_id != second.board.board_id:
             return None
@@ -245,9 +252,9 @@ class RigGuide:
             return None
         return float(mount_error_px(shared, mount_information(shared).sum(axis=0)))
 
-    def _shared_worth(self, c: int, glances: Sequence[Glance]) -> float:
+    def _mount_gain(self, c: int, frame_observations: Sequence[FrameObservation]) -> float:
         """Return what this frame brings to the mount of camera `c`, as a part of what one more usual frame would."""
-        pair, shared = self._held_by(self._partner(c), c, glances), self._shared_of(c)
+        pair, shared = self._held_by(self._partner(c), c, frame_observations), self._shared_of(c)
         if pair is None:
             return 0.0
         if shared is None or len(shared.in_a) < 2:
@@ -255,8 +262,8 @@ class RigGuide:
         known = mount_information(shared).sum(axis=0)
         fresh = self._views(self._partner(c), c, *pair)
         before, after = mount_error_px(shared, np.stack([known, known + mount_information(fresh)[0]]))
-        usual = 1.0 - np.sqrt(len(shared.in_a) / (len(shared.in_a) + 1.0))
-        return float((before - after) / max(before * usual, 1e-12))
+        typical = 1.0 - np.sqrt(len(shared.in_a) / (len(shared.in_a) + 1.0))
+        return float((before - after) / max(before * typical, 1e-12))
 
     def _shared_target(self, c: int) -> tuple[str, list[Pixels | None]]:
         """Return where to hold the board for the mount of camera `c`, in words and outlines: where both see all of it,
@@ -275,18 +282,18 @@ class RigGuide:
         if not both.any():
             return words, targets
         in_a, in_b = in_a.chosen(both), in_b.chosen(both)
-        told = mount_information(SharedViews(shared.a, shared.b, in_a, in_b, shared.error))
+        gained = mount_information(SharedViews(shared.a, shared.b, in_a, in_b, shared.error))
         known = mount_information(shared).sum(axis=0)
-        best = int(np.argmin(mount_error_px(shared, known + told)))
+        best = int(np.argmin(mount_error_px(shared, known + gained)))
         where = placement(shared.a, board, in_a.pose(best))
         targets[a], targets[c] = where.outline_px, placement(shared.b, board, in_b.pose(best)).outline_px
         return f"{words}: {where} of {self.names[a]}", targets
 
-    def state(self, glances: Sequence[Glance] | None, advice: RigAdvice | None) -> dict[str, Any]:
+    def state(self, frame_observations: Sequence[FrameObservation] | None, advice: RigAdvice | None) -> dict[str, Any]:
         """Return what the page shows."""
         out: dict[str, Any] = {"frames": len(self.frames), "least_frames": ENOUGH_FRAMES}
         if advice is not None:
-            left = advice.left or advice.lenses[advice.speaks].left
+            left = advice.left or advice.lenses[advice.advised_camera].left
             out |= {
                 "words": advice.words,
                 "take": advice.take,
@@ -306,8 +313,8 @@ class RigGuide:
             target = None if advice is None else advice.targets[c]
             if target is not None:
                 own["target"] = np.round(target[np.isfinite(target).all(axis=1)], 1).tolist()
-            if glances is not None:
-                own |= glances[c].shown()
+            if frame_observations is not None:
+                own |= frame_observations[c].shown()
             cameras.append(own)
         return out | {"cameras": cameras}
 

@@ -18,7 +18,7 @@ from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.layout import Layout
 from rigkit.cameras.board_pose import cam_from_seen_board
-from rigkit.coach.guide import GuideOptions, worth_beside
+from rigkit.coach.guide import GuideOptions, relative_gain
 from rigkit.core.arrays import Pixels
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -26,9 +26,9 @@ from rigkit.planning.goal import RemainingError, Requirement, projection_goal
 from rigkit.planning.plan import Plan, covariance_of
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.planning.words import placement
-from rigkit.validation.sentinel.evidence import Watched, told_by
+from rigkit.validation.sentinel.evidence import Monitored, board_information
 from rigkit.validation.sentinel.frames import Frames
-from rigkit.validation.sentinel.watch import watched_rig
+from rigkit.validation.sentinel.watch import monitored_rig
 
 Views = Sequence[BoardView | None]
 """What the cameras saw at one moment, one a camera."""
@@ -78,21 +78,21 @@ def left_of_rig(rig: RigCalibration, options: GuideOptions) -> tuple[RemainingEr
 class RigKnown:
     """What is known of a rig by its calibration, and what that leaves."""
 
-    watched: Watched
+    monitored: Monitored
     left: tuple[RemainingError, ...]
     options: GuideOptions
 
     @classmethod
     def of(cls, rig: RigCalibration, options: GuideOptions) -> Self:
         """Raises DegenerateError where what is to be measured is nowhere in view."""
-        return cls(watched_rig(rig), left_of_rig(rig, options), options)
+        return cls(monitored_rig(rig), left_of_rig(rig, options), options)
 
     @cached_property
     def plan(self) -> Plan:
         """The next two frames for what is farthest from what is wanted."""
         farthest, boards = max(self.left, key=lambda own: own.share), self.options.boards
-        return Frames.of(self.watched, boards, self.options.reach).plan(
-            self.watched, boards, farthest.requirement.goal, 2
+        return Frames.of(self.monitored, boards, self.options.reach).plan(
+            self.monitored, boards, farthest.requirement.goal, 2
         )
 
     @property
@@ -101,13 +101,13 @@ class RigKnown:
 
     def target(self) -> tuple[str, list[Pixels | None]]:
         """Return where to hold the board next, in words and as outlines."""
-        asked, names = self.plan.views[0], self.watched.names
+        asked, names = self.plan.views[0], self.monitored.names
         first = names.index(asked.seen_by[0])
-        rig_from_board = self.watched.cam_from_rig[first].inverse() @ asked.cam_from_board
+        rig_from_board = self.monitored.cam_from_rig[first].inverse() @ asked.cam_from_board
         targets: list[Pixels | None] = [None] * len(names)
         for name in asked.seen_by:
             c = names.index(name)
-            held = placement(self.watched.cameras[c], asked.board, self.watched.cam_from_rig[c] @ rig_from_board)
+            held = placement(self.monitored.cameras[c], asked.board, self.monitored.cam_from_rig[c] @ rig_from_board)
             targets[c] = held.outline_px
         where = placement(asked.camera, asked.board, asked.cam_from_board)
         together = f" where {' and '.join(asked.seen_by)} see it" if len(asked.seen_by) > 1 else ""
@@ -115,8 +115,8 @@ class RigKnown:
 
     def worth(self, frame: Views, *, photo: bool) -> float:
         """Return what a frame brings, as a part of what the one asked for would."""
-        watched, plan = self.watched, self.plan
-        for camera, mount, view in zip(watched.cameras, watched.cam_from_rig, frame, strict=True):
+        monitored, plan = self.monitored, self.plan
+        for camera, mount, view in zip(monitored.cameras, monitored.cam_from_rig, frame, strict=True):
             if view is None:
                 continue
             try:
@@ -127,7 +127,9 @@ class RigKnown:
             for own, other in zip(seen, frame, strict=True):
                 if other is not None and other.board.board_id == view.board.board_id:
                     own[0, view.board.index(other.grid)] = True
-            told = told_by(watched, view.board, held.rotation[None], held.translation_mm[None], list(seen))[0]
-            after = plan.goal.error(covariance_of(plan.knowledge.information + told / watched.fresh_sigma_px**2))
-            return worth_beside(plan, float(after), photo=photo)
+            gained = board_information(
+                monitored, view.board, held.rotation[None], held.translation_mm[None], list(seen)
+            )[0]
+            after = plan.goal.error(covariance_of(plan.knowledge.information + gained / monitored.fresh_sigma_px**2))
+            return relative_gain(plan, float(after), photo=photo)
         return 0.0

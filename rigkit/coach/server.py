@@ -121,8 +121,8 @@ def _refused(request: Request, token: str, hosts: tuple[str, ...]) -> Response |
 
 async def _body_of(request: Request) -> bytes | None:
     """Return what was sent; None where it is too much, without reading it all."""
-    told = request.headers.get("content-length", "0")
-    if not told.isdecimal() or len(told) > len(str(MAX_UPLOAD_BYTES)) or int(told) > MAX_UPLOAD_BYTES:
+    announced = request.headers.get("content-length", "0")
+    if not announced.isdecimal() or len(announced) > len(str(MAX_UPLOAD_BYTES)) or int(announced) > MAX_UPLOAD_BYTES:
         return None
     parts, size = [], 0
     async for chunk in request.stream():
@@ -138,8 +138,8 @@ def _parts(data: bytes, sizes: str | None) -> list[bytes]:
     raises InputError where these are not the whole."""
     if sizes is None:
         return [data] if data else []
-    told = sizes.split(",")
-    counts = [int(part) if part.isdecimal() and len(part) < 10 else -1 for part in told]
+    announced = sizes.split(",")
+    counts = [int(part) if part.isdecimal() and len(part) < 10 else -1 for part in announced]
     if min(counts) < 0 or sum(counts) != len(data):
         raise InputError("coach: the pictures are not as long as said")
     ends = list(accumulate(counts))

@@ -30,7 +30,7 @@ class Frame(NamedTuple):
     source: str = ""
 
 
-def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
+def frames_of_folders(folders: Sequence[Path], *, until_idle_s: float = float("inf")) -> Iterator[Frame]:
     """Return every picture in a folder, those to come as well, by name; of several folders, one a camera, those of one
     name, or of one number, as soon as all are there. Ends when none has come for `until_idle_s`.
 
@@ -40,10 +40,10 @@ def watched_frames(folders: Sequence[Path], *, until_idle_s: float = float("inf"
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"coach: '{folder}' is not a folder; give one in which pictures will appear")
-    return _watched(folders, until_idle_s)
+    return _polled_frames(folders, until_idle_s)
 
 
-def _watched(folders: Sequence[Path], until_idle_s: float) -> Iterator[Frame]:
+def _polled_frames(folders: Sequence[Path], until_idle_s: float) -> Iterator[Frame]:
     seen: set[str] = set()
     unread: dict[str, tuple[tuple[int, int], ...]] = {}
     last = time.monotonic()

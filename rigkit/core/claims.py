@@ -56,7 +56,7 @@ class Verdict:
         return f"holds in {self.holds_in} of {self.comparisons} comparisons only; {self.against}"
 
 
-def judge_claim(text: str, comparisons: Iterable[Comparison]) -> Verdict | None:
+def evaluate_claim(text: str, comparisons: Iterable[Comparison]) -> Verdict | None:
     """Return the verdict on a claim; None where there is nothing to compare, which bears nothing out."""
     holds, total, against, excess = 0, 0, "", -np.inf
     for c in comparisons:

@@ -56,7 +56,7 @@ class Finding:
         return self.message if self.remedy is None else f"{self.message}; {self.remedy}"
 
 
-def gravest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def most_severe_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return `findings` in the order of their severity, the gravest first; equally grave ones keep theirs."""
     order = list(Severity)
     return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))

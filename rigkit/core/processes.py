@@ -132,7 +132,7 @@ class _Pool(ProcessPoolExecutor):
         with _terminal_silent():
             future = super().submit(fn, *args, **kwargs)
         # What waits is cancelled before the workers end; the pool would then stumble, loudly, over telling it so.
-        future.set_exception = functools.partial(_tell, future)  # type: ignore[method-assign]
+        future.set_exception = functools.partial(_set_exception, future)  # type: ignore[method-assign]
         return future
 
     def _launch_processes(self) -> None:
@@ -141,7 +141,7 @@ class _Pool(ProcessPoolExecutor):
             super()._launch_processes()  # type: ignore[misc]
 
 
-def _tell(future: Future[Any], error: BaseException | None) -> None:
+def _set_exception(future: Future[Any], error: BaseException | None) -> None:
     with suppress(InvalidStateError):
         Future.set_exception(future, error)
 

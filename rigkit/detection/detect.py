@@ -16,7 +16,7 @@ from rigkit.detection.saddles.bad_pixels import without_bad_pixels
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import grey_image
 from rigkit.detection.targets.base import Search
-from rigkit.detection.targets.registry import FINDERS, check_sought
+from rigkit.detection.targets.registry import FINDERS, check_searchable
 from rigkit.kernels.front import near_any
 
 SAME_CORNER_PX = 2.0
@@ -57,7 +57,7 @@ def detect_boards(
     InputError
         `image` is not an image of a supported type, or nothing looks for the pattern of one of `boards`.
     """
-    check_sought(boards or ())
+    check_searchable(boards or ())
     stored = without_mosaic(grey_image(image))
     search = Search(without_bad_pixels(stored), boards or (), min_corners, camera, stored, quick=quick)
     found: list[BoardDetection] = []

@@ -26,20 +26,20 @@ from rigkit.detection.checks.validate import (
     too_large,
     trustworthy,
 )
-from rigkit.detection.lattice.grow import MAX_FRUITLESS, grow_all
+from rigkit.detection.lattice.grow import MAX_FAILED_GROWTHS, grow_all
 from rigkit.detection.lattice.lattice import Lattice, build_lattices
 from rigkit.detection.lattice.links import find_links
 from rigkit.detection.lattice.split import join_parts, split_at_turns, split_necks
 from rigkit.detection.saddles.response import GreyImage, Level, grey_image, pyramid
 from rigkit.detection.saddles.saddle import Corners, Saddles, each_once, find_corners, joined
-from rigkit.detection.subpixel.evened import LOOKED_AT_PX, evened
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import small_scatter
-from rigkit.detection.subpixel.subpixel import Promise, refine
+from rigkit.detection.subpixel.subpixel import EvidenceScore, refine
+from rigkit.detection.subpixel.uniform_blur import LOOKED_AT_PX, with_uniform_blur
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.kernels.front import near_any
 
-Promising = Callable[[GreyImage, Level, Lattice], bool]
+IsPlausible = Callable[[GreyImage, Level, Lattice], bool]
 
 MIN_PART_CORNERS = 6
 """Corners of the smallest part of a board that something lies across."""
@@ -84,22 +84,22 @@ def find_lattices(
     grey = grey_image(image)
     size_px = (grey.shape[1], grey.shape[0])
     sought = Sought(min_corners, sizes, vouched)
-    seen, promising = Seen.of(grey), _Counting(_promising if vouched is None else _or_vouched(vouched))
+    seen, plausible = Seen.of(grey), _Counting(_is_plausible if vouched is None else _or_vouched(vouched))
 
     def looked(at: Seen, more_than: int = 0) -> list[RefinedLattice]:
-        boards = candidates(at, min_corners, promising)
+        boards = candidates(at, min_corners, plausible)
         if sum(item.count for item in boards) <= more_than:
             return []
         out = fitted(grey, boards, sought)
-        promising.in_vain += 0 if out else len(boards)
+        plausible.rejected += 0 if out else len(boards)
         return out
 
     found = looked(seen)
-    if _worth_another_look(seen, found, sizes):
+    if _needs_second_search(seen, found, sizes):
         found = max(looked(seen.with_smeared()), found, key=_corners_of)
     for k in range(1, len(seen.levels)):
         # The squares of clutter do meet.
-        if _whole(found, sizes) or promising.in_vain >= MAX_FRUITLESS:
+        if _whole(found, sizes) or plausible.rejected >= MAX_FAILED_GROWTHS:
             break
         coarser = seen.coarser(k)
         if coarser is None:
@@ -148,12 +148,12 @@ class Seen:
 class _Counting:
     """Says which lattices are promising, and counts those that are not, or turn out to be no boards."""
 
-    promising: Promising
-    in_vain: int = 0
+    plausible: IsPlausible
+    rejected: int = 0
 
     def __call__(self, grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
-        good = self.promising(grey, finest, lattice)
-        self.in_vain += not good
+        good = self.plausible(grey, finest, lattice)
+        self.rejected += not good
         return good
 
 
@@ -167,7 +167,7 @@ def _whole(found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) ->
     return not whole.isdisjoint(map(frozenset, sizes)) if sizes else bool(whole)
 
 
-def _worth_another_look(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
+def _needs_second_search(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequence[tuple[int, int]]) -> bool:
     """Return whether corners that only motion explains may show more than was `found`: no whole board of `sizes`, or
     without these none at all, or one that moved."""
     if sizes and _whole(found, sizes):
@@ -177,15 +177,15 @@ def _worth_another_look(seen: Seen, found: Sequence[RefinedLattice], sizes: Sequ
     return (bool(sizes) or not found) and len(seen.saddles.smeared) >= SMEARED_CORNERS
 
 
-def candidates(seen: Seen, min_corners: int, promising: Promising) -> list[Lattice]:
+def candidates(seen: Seen, min_corners: int, plausible: IsPlausible) -> list[Lattice]:
     """Return the lattices of an image that may be boards, before the sub-pixel fit.
 
-    `promising` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
+    `plausible` says of a lattice, on the image and the finest level of its pyramid, whether it is worth growing.
     """
     size_px = (seen.grey.shape[1], seen.grey.shape[0])
     level = seen.levels[0]
     lattices = build_lattices(seen.corners, find_links(seen.corners, level))
-    grown = grow_all(lattices, seen.saddles, level, functools.partial(promising, seen.grey, seen.finest))
+    grown = grow_all(lattices, seen.saddles, level, functools.partial(plausible, seen.grey, seen.finest))
     grown = [item for item in grown if item.count >= MIN_PART_CORNERS]
     if not any(item.solid or min_corners < MIN_BOARD_CORNERS for item in grown):
         return []
@@ -199,23 +199,23 @@ def fitted(grey: GreyImage, boards: Sequence[Lattice], sought: Sought) -> list[R
 
     Those whose blur is uneven are fitted where it is made even (`RefinedLattice.picture`).
     """
-    refined = refine(grey, boards, _promise(grey, sought))
+    refined = refine(grey, boards, _evidence_score(grey, sought))
     found = _fitted(grey, boards, refined, sought)
     if any(known_median(item.blur_px) <= LOOKED_AT_PX for item in found):
         # What is blurred beside a board that is sharp lies in the background.
         return found
     for board, item in zip(boards, refined, strict=True):
-        picture = evened(grey, board, item)
+        picture = with_uniform_blur(grey, board, item)
         if picture is None:
             continue
         there = [replace(board, pixels=picture.of(board.pixels))]
         room = replace(sought, sizes=sought.sizes if len(found) < len(sought.sizes) else ())
-        again = refine(picture.grey, there, _promise(picture.grey, room), radius_px=picture.radius_px)
+        again = refine(picture.grey, there, _evidence_score(picture.grey, room), radius_px=picture.radius_px)
         found = _with_better(found, [one.out_of(picture) for one in _fitted(picture.grey, there, again, room)])
     return found
 
 
-def _promise(grey: GreyImage, sought: Sought) -> Promise:
+def _evidence_score(grey: GreyImage, sought: Sought) -> EvidenceScore:
     """Return the score that the evidence for a lattice is judged by, beside those that are placed (`_confirmed`)."""
     sizes = sought.sizes
     every = {frozenset({(c, r), (r, c)}) for c, r in sizes}
@@ -267,7 +267,7 @@ def _fitted(
         # The edges on the other side of a discontinuity had a say in these corners.
         alone = [part.lattice.trimmed() for part in parts]
         own_parts = [part for part in alone if large(part, sought.min_corners)]
-        out += _fitted(grey, own_parts, refine(grey, own_parts, _promise(grey, sought)), sought)
+        out += _fitted(grey, own_parts, refine(grey, own_parts, _evidence_score(grey, sought)), sought)
     return out
 
 
@@ -318,12 +318,12 @@ def _of_size(lattice: Lattice, sizes: Sequence[tuple[int, int]]) -> bool:
     return lattice.count >= MIN_EXPECTED_CORNERS and frozenset(lattice.size) in {frozenset(size) for size in sizes}
 
 
-def _promising(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
+def _is_plausible(grey: GreyImage, finest: Level, lattice: Lattice) -> bool:
     """Return whether `lattice` may be a board, as far as a quick look at its edges and a sample of it tell."""
     return not (lattice.solid and has_edge_offset(lattice, finest)) and _sampled(grey, finest, lattice)
 
 
-def _or_vouched(vouched: Vouched) -> Promising:
+def _or_vouched(vouched: Vouched) -> IsPlausible:
     """Return the judgement of lattices that may have markers in their squares."""
     return lambda grey, finest, lattice: _sampled(grey, finest, lattice) or vouched(grey, lattice)
 
@@ -333,13 +333,13 @@ def _sampled(grey: GreyImage, _: Level, lattice: Lattice) -> bool:
     sample = sample_of(lattice)
     if sample is None:
         return True
-    (refined,) = refine(grey, [sample], _promise(grey, Sought(0)))
+    (refined,) = refine(grey, [sample], _evidence_score(grey, Sought(0)))
     if trustworthy(refined, sample.count, 0):
         return True
     # Clutter leaves few corners.
-    picture = evened(grey, sample, refined) if refined.lattice.count >= MIN_BOARD_CORNERS else None
+    picture = with_uniform_blur(grey, sample, refined) if refined.lattice.count >= MIN_BOARD_CORNERS else None
     if picture is None:
         return False
     there = [replace(sample, pixels=picture.of(sample.pixels))]
-    (again,) = refine(picture.grey, there, _promise(grey, Sought(0)), radius_px=picture.radius_px)
+    (again,) = refine(picture.grey, there, _evidence_score(grey, Sought(0)), radius_px=picture.radius_px)
     return trustworthy(again, sample.count, 0)

@@ -16,21 +16,21 @@ from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 from rigkit.core.processes import in_threads
 from rigkit.core.progress import Progress, silent
-from rigkit.detection.circles.unknown import CircleSightings, guessed_circles
+from rigkit.detection.circles.unknown import CircleObservations, guessed_circles
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.saddles.mosaic import without_mosaic
 from rigkit.detection.saddles.response import GreyImage, sample
-from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
-from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagSightings, guessed_grids
+from rigkit.detection.tags.unknown_charuco import MarkerObservations, guessed_charuco
+from rigkit.detection.tags.unknown_tags import ARUCO_TAGS, GuessedGrid, TagObservations, guessed_grids
 from rigkit.detection.whole_charuco import next_row, of_pattern
 from rigkit.detection.whole_grids import (
     MIN_IMAGES_OF_GUESS,
     MIN_SURE_CORNERS,
     GridSeen,
     Size,
+    board_size_in,
     grid_seen,
-    sizes_beside,
-    told_size,
+    other_sizes,
     whole_sizes,
 )
 
@@ -40,7 +40,7 @@ LOOKING = "looking which board it is"
 WITHIN_SQUARES = np.linspace(0.2, 0.8, 9)
 """Where in a square its levels are looked at, along either side."""
 
-MAX_LEVELS_APART = 0.35
+MAX_LEVEL_DIFFERENCE = 0.35
 """Levels within an empty square differ by less, of black to white: shade and noise; a marker's by all of it, or by half
 where it is blurred."""
 
@@ -73,7 +73,7 @@ class BoardGuess:
     marked: bool = False
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         return not self.sizes and not self.rough and self.either is None
 
 
@@ -87,7 +87,7 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
     """
     # The pixels of a mosaic look like marks in every square.
     images = [without_mosaic(image) for image in images]
-    tags, markers = TagSightings(), MarkerSightings()
+    tags, markers = TagObservations(), MarkerObservations()
     plain: list[list[GridSeen]] = []
     sure: list[int] = []
     for k, found in enumerate(in_threads(detect_boards, images)):
@@ -114,8 +114,8 @@ def guess_board(images: Sequence[GreyImage], progress: Progress = silent) -> Boa
 def _guess_of(
     images: Sequence[GreyImage],
     plain: Sequence[Sequence[GridSeen]],
-    tags: TagSightings,
-    markers: MarkerSightings,
+    tags: TagObservations,
+    markers: MarkerObservations,
     *,
     marked: bool,
 ) -> BoardGuess | None:
@@ -132,27 +132,31 @@ def _guess_of(
         sizes = () if more is False else (board.size,)
         return BoardGuess(board=board, images=tuple(markers.images), sizes=sizes, either_pattern=not sure)
     guess = _plain_guess(images, plain)
-    told = guess is not None and guess.told
+    determined = guess is not None and guess.determined
     # A chessboard may hang on the wall, and an unread mark be taken for ink in its squares.
     unexplained = [k for k in range(len(images)) if guess is None or k not in guess.images]
-    if told and not unexplained and not (marked and guess is not None and guess.board.pattern.type == Chessboard.type):
+    if (
+        determined
+        and not unexplained
+        and not (marked and guess is not None and guess.board.pattern.type == Chessboard.type)
+    ):
         return guess
-    grids = _rarer_grids(images, unexplained or range(len(images)), told=told)
+    grids = _rarer_grids(images, unexplained or range(len(images)), determined=determined)
     return _of_grids(grids) if grids else guess
 
 
-def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, told: bool) -> list[GuessedGrid]:
+def _rarer_grids(images: Sequence[GreyImage], some: Sequence[int], *, determined: bool) -> list[GuessedGrid]:
     """Return the grids of tags that are white on black, if `some` of the images show tags, or, where no other board is
-    `told`, of ArUco markers."""
-    white = TagSightings(inverted=True)
+    `determined`, of ArUco markers."""
+    white = TagObservations(inverted=True)
     for k in some:
         white.look(k, images[k])
     for k in (k for k in range(len(images)) if white.seen and k not in some):
         white.look(k, images[k])
     grids = guessed_grids(white)
     # Last, as the markers of ChArUco boards stand in rows, too.
-    for inverted in (False, True) if not grids and not told else ():
-        aruco = TagSightings(ARUCO_TAGS, inverted=inverted)
+    for inverted in (False, True) if not grids and not determined else ():
+        aruco = TagObservations(ARUCO_TAGS, inverted=inverted)
         for k, image in enumerate(images):
             aruco.look_alone(k, image)
         grids = grids or guessed_grids(aruco)
@@ -185,7 +189,7 @@ def _without_marks(image: GreyImage, found: BoardDetection) -> bool:
     if not odd.any() or odd.all():
         return False
     contrast = abs(float(levels[:, odd].mean() - levels[:, ~odd].mean()))
-    return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVELS_APART * contrast for of in (odd, ~odd))
+    return all(float(np.median(np.ptp(levels[:, of], axis=0))) < MAX_LEVEL_DIFFERENCE * contrast for of in (odd, ~odd))
 
 
 def _in_most(plain: Sequence[Sequence[GridSeen]]) -> bool:
@@ -196,18 +200,18 @@ def _in_most(plain: Sequence[Sequence[GridSeen]]) -> bool:
 
 def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]]) -> BoardGuess | None:
     """Return the chessboard, or grid of circles, that most of the images show; None where none is seen."""
-    circles, settled = CircleSightings(), _in_most(plain)
+    circles, settled = CircleObservations(), _in_most(plain)
     for k, (image, found) in enumerate(zip(images, plain, strict=True)):
         if not (found and settled):
             circles.look(k, image)
-    best = told_size(plain)
+    best = board_size_in(plain)
     grid = guessed_circles(circles)
     if grid is not None and (best is None or len(grid[1]) > len(best[1])):
         return BoardGuess(board=grid[0], images=grid[1])
     if best is not None:
         sizes, shown = best
         board = Board("board", *sizes[0], 1.0, 1.0)
-        others = tuple(Board("board", *size, 1.0, 1.0) for size in sizes_beside(plain, sizes[0], shown))
+        others = tuple(Board("board", *size, 1.0, 1.0) for size in other_sizes(plain, sizes[0], shown))
         return BoardGuess(board=board, images=shown, beside=others, sizes=sizes if len(sizes) > 1 else ())
     shown = tuple(k for k, found in enumerate(plain) if found)
     if len(shown) < 0.5 * len(plain) or not shown:
@@ -218,35 +222,35 @@ def _plain_guess(images: Sequence[GreyImage], plain: Sequence[Sequence[GridSeen]
 
 def difference(guess: Board, declared: Board) -> str | None:
     """Return in words what is to be changed in a declared board so that it is the one seen; None for nothing."""
-    seen, said = guess.pattern, declared.pattern
+    seen, declared_pattern = guess.pattern, declared.pattern
     size = f"{guess.columns // seen.points_per_count} x {guess.rows // seen.points_per_count} {seen.count_word}"
-    if type(seen) is not type(said):
+    if type(seen) is not type(declared_pattern):
         word = "" if seen.type.endswith("board") else " board"
         return f'{_article(seen.type)}{word} of {size} is seen; set type = "{seen.type}"'
     if (
         isinstance(seen, Charuco | AprilGrid)
-        and isinstance(said, Charuco | AprilGrid)
-        and seen.inverted != said.inverted
+        and isinstance(declared_pattern, Charuco | AprilGrid)
+        and seen.inverted != declared_pattern.inverted
     ):
         negation = "" if seen.inverted else "not "
         return f"black and white are {negation}exchanged: set inverted = {str(seen.inverted).lower()}"
-    if isinstance(seen, Charuco) and isinstance(said, Charuco):
-        if seen.legacy != said.legacy and guess.rows % 2 == 1:
+    if isinstance(seen, Charuco) and isinstance(declared_pattern, Charuco):
+        if seen.legacy != declared_pattern.legacy and guess.rows % 2 == 1:
             words = "this is the legacy pattern" if seen.legacy else "this is not the legacy pattern"
             return f"{words}: set legacy_pattern = {str(seen.legacy).lower()}"
-        if seen.dictionary.rpartition("_")[0] != said.dictionary.rpartition("_")[0]:
+        if seen.dictionary.rpartition("_")[0] != declared_pattern.dictionary.rpartition("_")[0]:
             return f'the markers are of {seen.dictionary}: set dictionary = "{seen.dictionary}"'
-    if isinstance(seen, Circles) and isinstance(said, Circles):
+    if isinstance(seen, Circles) and isinstance(declared_pattern, Circles):
         for name in ("layout", "inverted"):
-            if getattr(seen, name) != getattr(said, name):
-                shown, told = (str(getattr(pattern, name)).lower() for pattern in (seen, said))
-                return f"{name} is {told} in the board file, {shown} in the images"
+            if getattr(seen, name) != getattr(declared_pattern, name):
+                shown, determined = (str(getattr(pattern, name)).lower() for pattern in (seen, declared_pattern))
+                return f"{name} is {determined} in the board file, {shown} in the images"
     if set(guess.size) != set(declared.size) or (seen.identified and guess.size != declared.size):
-        per = said.points_per_count
+        per = declared_pattern.points_per_count
         return f"{size} are seen, {declared.columns // per} x {declared.rows // per} are declared"
     if seen.identified:
         # Lengths are for a ruler to say.
-        own, other = seen.key_values(), said.key_values()
+        own, other = seen.key_values(), declared_pattern.key_values()
         for name in own:
             if not name.endswith("_mm") and name != "dictionary" and _differs(own[name], other[name]):
                 return f"{name} is {other[name]} in the board file, {own[name]} in the images"

@@ -142,9 +142,9 @@ def _for_the_second(boards: Sequence[Board], image: GreyImage) -> tuple[float, i
     own, others = (_squares_of(board) for board in boards)
     steps, counts = np.unique(own - others, axis=0, return_counts=True)
     others = others + steps[counts.argmax()]
-    apart = np.flatnonzero((own != others).any(axis=1))
-    ways = [
-        np.nan_to_num(likeness_at(image, found.lattice(), at[apart], pattern.first_marker + apart, boards[0]))
+    differing = np.flatnonzero((own != others).any(axis=1))
+    likenesses = [
+        np.nan_to_num(likeness_at(image, found.lattice(), at[differing], pattern.first_marker + differing, boards[0]))
         for at in (own, others)
     ]
-    return float(ways[1].sum() - ways[0].sum()), sum(int(np.count_nonzero(way)) for way in ways)
+    return float(likenesses[1].sum() - likenesses[0].sum()), sum(int(np.count_nonzero(way)) for way in likenesses)

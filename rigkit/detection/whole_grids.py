@@ -38,7 +38,7 @@ MIN_IMAGES_OF_GUESS = 2
 MAX_SHARE_ALIKE_PARTS = 0.5
 """Parts of a board that the frame cuts are of one size in fewer of the images."""
 
-MIN_SHARE_BESIDE = 0.5
+MIN_SHARE_OF_OTHERS = 0.5
 """Of the images that show a board, those with another beside it, at least: what clutter shows changes."""
 
 FEW, MANY = 0.25, 0.5
@@ -147,7 +147,7 @@ def whole_sizes(seen: Sequence[GridSeen]) -> set[Size]:
     return {grid.size for grid in seen if grid.whole}
 
 
-def told_size(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
+def board_size_in(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tuple[int, ...]] | None:
     """Return the size of the chessboard that images show, and the images that show it; several sizes where they do not
     decide, None where they tell nothing.
 
@@ -161,12 +161,12 @@ def told_size(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tu
     hidden = Counter(size for grids in plain for size in {g.size for g in grids if any(g.ends) and not g.cut})
     # A part of a board that the frame cuts, or a tiled floor, comes in many sizes; the whole board in one.
     often = [size for seen in (wholes, hidden) for size in _by_count(seen) if seen[size] >= MIN_IMAGES_OF_GUESS]
-    ways = [(size, _showing(plain, size)) for size in often]
+    options = [(size, _showing(plain, size)) for size in often]
     parts = _size_of_parts(plain)
-    ways += [] if parts is None else [parts]
-    weighed = [(_weighed(plain, size, shown), shown) for size, shown in ways]
+    options += [] if parts is None else [parts]
+    weighed = [(_weighed(plain, size, shown), shown) for size, shown in options]
     if weighed:
-        return min(weighed, key=lambda way: len(way[0]))
+        return min(weighed, key=lambda option: len(option[0]))
     full = Counter(size for grids in plain for size in {grid.size for grid in grids})
     once = _by_count(wholes) or [size for size in _by_count(full) if full[size] > MAX_SHARE_ALIKE_PARTS * len(plain)]
     if not once or _more(plain, once[0]):
@@ -174,12 +174,14 @@ def told_size(plain: Sequence[Sequence[GridSeen]]) -> tuple[tuple[Size, ...], tu
     return (once[0],), _showing(plain, once[0])
 
 
-def sizes_beside(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
+def other_sizes(plain: Sequence[Sequence[GridSeen]], size: Size, shown: Sequence[int]) -> tuple[Size, ...]:
     """Return the sizes of grids that most of the images that show a board of this size show beside it, as far as they
     are seen."""
     counts = Counter(other for k in shown for other in {grid.size for grid in plain[k]} - {size})
     return tuple(
-        other for other in _by_count(counts) if counts[other] >= max(MIN_IMAGES_OF_GUESS, MIN_SHARE_BESIDE * len(shown))
+        other
+        for other in _by_count(counts)
+        if counts[other] >= max(MIN_IMAGES_OF_GUESS, MIN_SHARE_OF_OTHERS * len(shown))
     )
 
 
@@ -227,14 +229,14 @@ def _size_of_parts(plain: Sequence[Sequence[GridSeen]]) -> tuple[Size, tuple[int
     for size in ((long, short) for long in lengths for short in lengths if long > short):
         fit = [[g for g in grids if any(g.ends) and g.may_be_of(size)] for grids in plain]
         shown = tuple(k for k, grids in enumerate(fit) if grids)
-        told = Counter(side for grids in fit for side in _sides_told(grids, size))
-        enough = min(told[0], told[1]) >= MIN_IMAGES_OF_GUESS
+        sides_seen = Counter(side for grids in fit for side in _complete_sides(grids, size))
+        enough = min(sides_seen[0], sides_seen[1]) >= MIN_IMAGES_OF_GUESS
         if enough and (best is None or len(shown) > best[0]):
             best = len(shown), size, shown
     return None if best is None else best[1:]
 
 
-def _sides_told(grids: Sequence[GridSeen], size: Size) -> set[int]:
+def _complete_sides(grids: Sequence[GridSeen], size: Size) -> set[int]:
     """Return which sides (0 : the longer, 1) of a board of this size an image's grids show from end to end."""
     whole = {n for g in grids for n, ends in zip(g.lengths, g.ends, strict=True) if ends}
     return {k for k, side in enumerate(size) if side in whole}

@@ -29,7 +29,7 @@ from rigkit.identification.placements import BoardKind, Placement, board_kinds, 
 
 LOG_ODDS = float(np.log(1000.0))
 """Odds of a thousand to one decide between two assignments; below, the geometry leaves a tie."""
-MISFIT_FLOOR_PX = 0.01
+RESIDUAL_FLOOR_PX = 0.01
 """No camera and no printed board is truer than this: smaller misfits decide nothing."""
 
 
@@ -82,10 +82,10 @@ def identify_pair(
     fitting = ids_by_angles(identity, [b for b in boards if b.board_id not in given], angles)
     if not fitting:
         return identity
-    said = f"boards {', '.join(sorted(fitting[0]))} look alike and were identified by the measured angles"
+    message = f"boards {', '.join(sorted(fitting[0]))} look alike and were identified by the measured angles"
     if len(fitting) > 1:
-        said += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
-    notes = (*identity.notes, f"{said}; a layout would say for certain which is which")
+        message += f", which {len(fitting)} orders of the names fit: the one with the fewest changes was taken"
+    notes = (*identity.notes, f"{message}; a layout would say for certain which is which")
     return replace(_result(winner, tied, views, kinds, boards, layout, fitting[0]), notes=notes)
 
 
@@ -128,7 +128,7 @@ def _log_odds(
     sigma2 += [np.mean(views[1].observations[j].sigma_px ** -2.0) for j in second]
     constraints = 6 * (len(best.matches) - 1)
     noise = free / max(2 * sum(counts) - 6 * len(counts), 1)
-    floor = max(constraints, 1) * max(noise, MISFIT_FLOOR_PX**2 * float(np.mean(sigma2)))
+    floor = max(constraints, 1) * max(noise, RESIDUAL_FLOOR_PX**2 * float(np.mean(sigma2)))
     excess = max(float(best.chi2_1[first].sum() + best.chi2_2[second].sum()) - free, floor)
     return 0.5 * constraints * float(np.log((excess + max(other.chi2 - best.chi2, 0.0)) / excess))
 

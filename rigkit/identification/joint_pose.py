@@ -160,9 +160,9 @@ def joint_residuals(
         if k == 0:
             residual, by_x = point_residuals(image.rays, image.bases, x)
         else:
-            swung = x @ motion[:3, :3].T
-            residual, by_y = point_residuals(image.rays, image.bases, swung + motion[:3, 3])
-            jacobian[:, :, 0] = np.concatenate([-by_y @ skew(swung), by_y], axis=-1)
+            rotated = x @ motion[:3, :3].T
+            residual, by_y = point_residuals(image.rays, image.bases, rotated + motion[:3, 3])
+            jacobian[:, :, 0] = np.concatenate([-by_y @ skew(rotated), by_y], axis=-1)
             by_x = by_y @ motion[:3, :3]
         jacobian[np.arange(n), :, 1 + image.board] = np.concatenate([-by_x @ skew(turned), by_x], axis=-1)
         columns = [jacobian.reshape(2 * n, -1)]

@@ -105,9 +105,9 @@ def _sized(
     points = board.points(match.placement2.grid_of(view2.detections[match.second]))
     placed = points @ match.cam1_from_board[:3, :3].T + match.cam1_from_board[:3, 3]
     turned = placed @ cam2_from_cam1[:3, :3].T
-    grows = np.cross(observed.rays, turned)
-    stays = np.cross(observed.rays, np.broadcast_to(cam2_from_cam1[:3, 3], turned.shape))
-    factor = -float((grows * stays).sum() / (grows**2).sum())
+    scaled_part = np.cross(observed.rays, turned)
+    constant_part = np.cross(observed.rays, np.broadcast_to(cam2_from_cam1[:3, 3], turned.shape))
+    factor = -float((scaled_part * constant_part).sum() / (scaled_part**2).sum())
     if factor <= 0.0:
         return np.inf, factor
     off, _ = point_residuals(observed.rays, observed.bases, factor * turned + cam2_from_cam1[:3, 3])

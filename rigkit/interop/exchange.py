@@ -17,7 +17,7 @@ from rigkit.core.errors import InputError
 from rigkit.core.printing import digits
 
 MM_PER_M = 1000.0
-WORTH_A_WORD_PX = 0.1
+MIN_REPORTED_PX = 0.1
 """Where a refit is off by more, what would lose nothing is said."""
 
 
@@ -87,7 +87,7 @@ def best_accepted(
         if c.covered < 1.0:
             reach = min(np.degrees(c.reach_rad), np.degrees(c.camera.max_angle_rad))
             note += f" within {reach:.0f} degrees of the axis ({100.0 * c.covered:.0f} % of the image); wrong beyond"
-        if c.max_px > WORTH_A_WORD_PX:
+        if c.max_px > MIN_REPORTED_PX:
             degree = "" if kind.model != camera.model else f" and degree = {kind.order}"
             note += f'; with model = "{kind.model}"{degree} in the session nothing is lost'
         cost = max(c.max_px, OUTSIDE_WEIGHT * c.outside_px)

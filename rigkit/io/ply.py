@@ -93,8 +93,8 @@ def ply_bytes(
     if confidence:
         sigma = cloud.normal_sigma_rad
         known = np.isfinite(sigma) & (sigma > 0.0)
-        usual = float(np.median(sigma[known])) if known.any() else 1.0
-        normals = normals * (usual / np.where(known, sigma, usual))[:, None]
+        typical = float(np.median(sigma[known])) if known.any() else 1.0
+        normals = normals * (typical / np.where(known, sigma, typical))[:, None]
     # A scene without boards has no places on them.
     on_boards = (("board", cloud.board_index), *zip(("column", "row"), cloud.grid.T, strict=True))
     columns: list[tuple[str, str, NDArray[np.generic]]] = [
@@ -184,8 +184,8 @@ def ply_unit(path: str | Path) -> str:
     """Return the unit of a file's lengths as its header says it, mm where it says none; raises as `read_ply`."""
     data = read_bytes(path, "point cloud")
     start = _header(data, Path(path))[-1]
-    said = re.search(rb"^comment units (\S+)$", data[:start], re.MULTILINE)
-    return "mm" if said is None else said[1].decode("utf-8", errors="replace")
+    described = re.search(rb"^comment units (\S+)$", data[:start], re.MULTILINE)
+    return "mm" if described is None else described[1].decode("utf-8", errors="replace")
 
 
 def _unit_normals(normals: FloatArray) -> FloatArray:

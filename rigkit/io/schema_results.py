@@ -12,6 +12,7 @@ from rigkit.io.disk.schema_words import (
     TEXT,
     Schema,
     array,
+    described,
     file,
     matrix,
     nullable,
@@ -20,7 +21,6 @@ from rigkit.io.disk.schema_words import (
     optional,
     row,
     rows,
-    said,
     table,
 )
 from rigkit.study.table import StudyCell
@@ -30,7 +30,7 @@ from rigkit.validation.fitted_planes import AngleResult
 from rigkit.validation.planes import NormalErrors
 
 _VALUE = nullable(NUMBER)
-_CHECKS = said(array(of_dataclass(Check)), "every quantity measured beside ours")
+_CHECKS = described(array(of_dataclass(Check)), "every quantity measured beside ours")
 _ANGLE = of_dataclass(AngleResult)
 _ANGLE["properties"] |= dict.fromkeys(ANGLE_ERRORS, _VALUE)
 _NORMALS = of_dataclass(NormalErrors)
@@ -43,9 +43,9 @@ _BOARD_RESULT = obj(
         "normal_sigma_deg?": _VALUE,
         "flatness_rms_mm?": NUMBER,
         "flatness_peak_mm?": NUMBER,
-        "normal_errors": said(_NORMALS, "of the estimated normals against the plane"),
-        "coplanar_normal_errors?": said(nullable(_NORMALS), "against the plane of coplanar points"),
-        "lattice_normal_errors?": said(nullable(_NORMALS), "against the plane of the board's known lattice"),
+        "normal_errors": described(_NORMALS, "of the estimated normals against the plane"),
+        "coplanar_normal_errors?": described(nullable(_NORMALS), "against the plane of coplanar points"),
+        "lattice_normal_errors?": described(nullable(_NORMALS), "against the plane of the board's known lattice"),
         "square_x_ratio?": NUMBER,
         "square_y_ratio?": NUMBER,
         "skew_deg?": NUMBER,
@@ -59,15 +59,15 @@ VALIDATION_FILE = file(
     "rigkit.validation/1",
     "The verdict on one pair by one estimator",
     {
-        "pair": said(TEXT, "its name"),
+        "pair": described(TEXT, "its name"),
         **optional(_OF_REPORT["properties"]),
-        "passed": said(BOOLEAN, "whether everything measured was checked, and every check passed"),
-        "points?": said(INTEGER, "reconstructed"),
-        "sampson_rms_px?": said(_VALUE, "of the corners from their epipolar curves"),
+        "passed": described(BOOLEAN, "whether everything measured was checked, and every check passed"),
+        "points?": described(INTEGER, "reconstructed"),
+        "sampson_rms_px?": described(_VALUE, "of the corners from their epipolar curves"),
         "checks": _CHECKS,
-        "unchecked": said(array(TEXT), "what could not be checked, and why"),
-        "angles": said(array(_ANGLE), "between each two boards"),
-        "boards": said(array(_BOARD_RESULT), "plane, normals and frame of each board"),
+        "unchecked": described(array(TEXT), "what could not be checked, and why"),
+        "angles": described(array(_ANGLE), "between each two boards"),
+        "boards": described(array(_BOARD_RESULT), "plane, normals and frame of each board"),
         "notes?": array(TEXT),
     },
 )
@@ -92,7 +92,7 @@ CROSSCHECK_FILE = file(
             }
         ),
         "checks": _CHECKS,
-        "skipped?": said(array(TEXT), "methods that could not be used, and why"),
+        "skipped?": described(array(TEXT), "methods that could not be used, and why"),
         "diagnosis?": array(TEXT),
     },
 )
@@ -104,7 +104,7 @@ _CELL: Schema = {
             {
                 "value": {ANY_OF: [_VALUE, TEXT]},
                 "sigma?": NUMBER,
-                "paper?": said(NUMBER, "what the paper printed there"),
+                "paper?": described(NUMBER, "what the paper printed there"),
                 "best?": BOOLEAN,
                 "failed?": BOOLEAN,
             }
@@ -116,56 +116,56 @@ _TABLES = rows(
         "key": TEXT,
         "title": TEXT,
         "note?": TEXT,
-        "units?": said(table(TEXT), "by column"),
-        "rows": said(array(table(_CELL)), "by column"),
+        "units?": described(table(TEXT), "by column"),
+        "rows": described(array(table(_CELL)), "by column"),
     }
 )
 TABLES_FILE = file("rigkit.tables/1", "Tables of a result", {"tables": _TABLES})
 _PAGE = {
-    "headline": said(TEXT, "the result in the user's units"),
-    "badge": said(TEXT, "the verdict in a word or two; empty: none"),
-    "passed": said(nullable(BOOLEAN), "null: neither good nor bad"),
-    "sentences": said(array(TEXT), "below the headline"),
-    "basis": said(TEXT, "what the result rests on"),
-    "tables": said(_TABLES, "every table of the page"),
+    "headline": described(TEXT, "the result in the user's units"),
+    "badge": described(TEXT, "the verdict in a word or two; empty: none"),
+    "passed": described(nullable(BOOLEAN), "null: neither good nor bad"),
+    "sentences": described(array(TEXT), "below the headline"),
+    "basis": described(TEXT, "what the result rests on"),
+    "tables": described(_TABLES, "every table of the page"),
 }
 PAGE_FILE = file(
     "rigkit.page/1",
     "What a page says, the `page` of `--json`",
-    {**_PAGE, "parts": said(table(obj(_PAGE)), "the same of each camera or pair, by name")},
+    {**_PAGE, "parts": described(table(obj(_PAGE)), "the same of each camera or pair, by name")},
 )
 _GRID = array(array(_VALUE))
 CERTIFICATE_FILE = file(
     "rigkit.certificate/1",
     "How wrong a measurement may be",
     {
-        "quantity": said(TEXT, "length, depth, plane or angle"),
+        "quantity": described(TEXT, "length, depth, plane or angle"),
         "size_mm?": NUMBER,
         "distance_mm?": NUMBER,
         "confidence?": NUMBER,
         "cameras?": array(TEXT),
-        "unit": said(TEXT, "of all bounds and sigmas"),
+        "unit": described(TEXT, "of all bounds and sigmas"),
         "worst": _VALUE,
         "median?": _VALUE,
-        "in_view?": said(NUMBER, "share of the image that sees all of it"),
-        "shares_where_worst?": said(table(NUMBER), "of the variance, by cause"),
+        "in_view?": described(NUMBER, "share of the image that sees all of it"),
+        "shares_where_worst?": described(table(NUMBER), "of the variance, by cause"),
         "findings?": array(TEXT),
-        "u_px?": said(array(NUMBER), "columns of the grid"),
-        "v_px?": said(array(NUMBER), "rows of the grid"),
-        "bound": said(_GRID, "over the grid; null: out of view"),
-        "sigma?": said(table(_GRID), "by cause"),
+        "u_px?": described(array(NUMBER), "columns of the grid"),
+        "v_px?": described(array(NUMBER), "rows of the grid"),
+        "bound": described(_GRID, "over the grid; null: out of view"),
+        "sigma?": described(table(_GRID), "by cause"),
     },
 )
 STUDY_RESULT_FILE = file(
     "rigkit.study_result/1",
     "The numbers of a synthetic study",
     {
-        "study": said({"type": "object"}, "the study, as its file has it"),
+        "study": described({"type": "object"}, "the study, as its file has it"),
         "cells": array(of_dataclass(StudyCell)),
         "claims": rows(
             {
                 **optional(of_dataclass(Verdict)["properties"], "against", "comparisons", "holds_in"),
-                "verdict": said(TEXT, "in words"),
+                "verdict": described(TEXT, "in words"),
             }
         ),
     },
@@ -181,7 +181,9 @@ HISTORY_FILE = file(
             "digest",
             "baseline",
         ),
-        "amounts": said(table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"),
+        "amounts": described(
+            table(row(2)), "by cause and unit: value and standard deviation, as if it alone had changed"
+        ),
     },
 )
 _ROBOT_POSE = matrix(3, 4)
@@ -189,16 +191,18 @@ HAND_EYE_FILE = file(
     "rigkit.hand_eye/1",
     "Where a camera sits on a robot",
     {
-        "cam_from_hand?": said(_ROBOT_POSE, "of a camera on the hand"),
-        "base_from_board?": said(_ROBOT_POSE, "with it"),
-        "cam_from_base?": said(_ROBOT_POSE, "of a camera that stands before a robot"),
-        "hand_from_board?": said(_ROBOT_POSE, "with it"),
-        "covariance": said(matrix(), "of both poses (rad, mm), twelve by twelve"),
-        "freedom?": said(nullable(NUMBER), "degrees of freedom of the covariance, which is Student's; null: infinite"),
+        "cam_from_hand?": described(_ROBOT_POSE, "of a camera on the hand"),
+        "base_from_board?": described(_ROBOT_POSE, "with it"),
+        "cam_from_base?": described(_ROBOT_POSE, "of a camera that stands before a robot"),
+        "hand_from_board?": described(_ROBOT_POSE, "with it"),
+        "covariance": described(matrix(), "of both poses (rad, mm), twelve by twelve"),
+        "freedom?": described(
+            nullable(NUMBER), "degrees of freedom of the covariance, which is Student's; null: infinite"
+        ),
         "rms_px": NUMBER,
-        "image_rms_px?": said(table(NUMBER), "by image"),
-        "median_apart_mm?": said(NUMBER, "of the boards' middles as seen from where the robot has them, median"),
-        "median_apart_deg?": said(NUMBER, "of the boards' turns, likewise"),
-        "left_out_deg?": said(table(NUMBER), "images whose pose does not go with them, and by what angle"),
+        "image_rms_px?": described(table(NUMBER), "by image"),
+        "median_apart_mm?": described(NUMBER, "of the boards' middles as seen from where the robot has them, median"),
+        "median_apart_deg?": described(NUMBER, "of the boards' turns, likewise"),
+        "left_out_deg?": described(table(NUMBER), "images whose pose does not go with them, and by what angle"),
     },
 )

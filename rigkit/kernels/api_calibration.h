@@ -19,7 +19,7 @@ typedef struct {
     ARRAY(const double, u, count);
     ARRAY(const double, v, count);
     ARRAY(const double, residuals, count, 2);
-    ARRAY(const uint8_t, told, count);
+    ARRAY(const uint8_t, usable, count);
     ARRAY(const int64_t, counts, views);
     int64_t count, parameters, views, width, height;
 } lens_corners_t;

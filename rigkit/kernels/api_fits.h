@@ -50,7 +50,7 @@ EXPORT void uneven_factors(
     ARRAY(const double, products, count, LAGS), ARRAY(const double, pairs, count, LAGS), ARRAY(const double, noise, count),
     ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2), ARRAY(const double, blur, count),
     ARRAY(const double, used, count), ARRAY(const uint8_t, good, count), ARRAY(const int64_t, owner, count), int64_t count,
-    int64_t boards, ARRAY(const double, usual, boards), const factor_rules_t *rules, RESULT(double, out, count));
+    int64_t boards, ARRAY(const double, typical, boards), const factor_rules_t *rules, RESULT(double, out, count));
 
 /* curvatures.c */
 
@@ -105,19 +105,19 @@ EXPORT double fit_perspective(
 EXPORT int64_t fit_polynomials(
     ARRAY(const double, places, count, 2), ARRAY(const double, values, count, 2), int64_t count, int64_t terms,
     double max_leverage, SCRATCH(double, basis, terms, count), SCRATCH(double, scratch, FIT_SCRATCH, count),
-    RESULT(double, unit, 3), ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2),
+    RESULT(double, unit, 3), ARRAY(double, triangle, terms, terms), RESULT(double, basis_values, terms, 2),
     RESULT(double, misses, SURFACE_DEGREE + 1), RESULT(double, off, count), RESULT(double, gain, count),
     RESULT(double, scatter, 1));
 EXPORT int64_t fit_map(
     ARRAY(const double, places, count, 2), ARRAY(const double, pixels, count, 2), int64_t count, int64_t terms,
     double max_leverage, double nearest, SCRATCH(double, rest, count, 2), SCRATCH(double, basis, terms, count),
     SCRATCH(double, scratch, FIT_SCRATCH, count), RESULT(double, homography, 3, 3), RESULT(double, unit, 3),
-    ARRAY(double, triangle, terms, terms), RESULT(double, told, terms, 2), RESULT(double, misses, SURFACE_DEGREE + 1),
+    ARRAY(double, triangle, terms, terms), RESULT(double, basis_values, terms, 2), RESULT(double, misses, SURFACE_DEGREE + 1),
     RESULT(double, off, count), RESULT(double, gain, count), RESULT(double, scatter, 1));
 EXPORT void add_polynomial(
     ARRAY(const double, wanted, count, 2), int64_t count, ARRAY(const double, unit, 3), int64_t terms, int64_t degree,
-    ARRAY(const double, triangle, terms, terms), ARRAY(const double, told, terms, 2),
-    ARRAY(const double, misses, SURFACE_DEGREE + 1), int64_t surest, ARRAY(double, out, count, SURFACE_COLUMNS));
+    ARRAY(const double, triangle, terms, terms), ARRAY(const double, basis_values, terms, 2),
+    ARRAY(const double, misses, SURFACE_DEGREE + 1), int64_t most_certain, ARRAY(double, out, count, SURFACE_COLUMNS));
 
 /* tag_board.c and tag_rounds.c */
 
@@ -147,7 +147,7 @@ typedef struct {
     double first_blur, few_corners, min_contrast, rough_px, better_known, bent_sigmas, wide_blur, max_gain, margin_px;
     double moved_cells, added_contrast, added_residual, max_sigma_cells, narrow_blurs, code_contrast, likeness;
     double scatter_floor, outlier, judging_gain, displaced_cells;
-    int64_t min_foretelling, min_guiding;
+    int64_t min_predicting, min_guiding;
 } tag_corner_rules_t;
 
 /* detection.tags.placing.TagBoard, its corners row by row; whether squares join its tags; the border in sides of a tag. */
@@ -312,7 +312,7 @@ EXPORT void fit_circles(
 /* What comes out of a step of the light: u, v of the corner, its standard deviation, direction, place and width of the step,
  * the light left, whether there is one. What is unknown of both, how far from a corner a step is sought, px,
  * and how many pixels are taken at once: so much room there must be beyond the last. */
-enum { LIGHT_OUTCOMES = 8, LIGHT_UNKNOWNS = 11, LIGHT_ASIDE = 11, LIGHT_BLOCK = 32 };
+enum { LIGHT_OUTCOMES = 8, LIGHT_UNKNOWNS = 11, LIGHT_LATERAL = 11, LIGHT_BLOCK = 32 };
 
 /* The constants of detection.subpixel.shadows, under their names there. */
 typedef struct {
@@ -324,7 +324,7 @@ typedef struct {
 EXPORT void lit_unevenly(
     IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, aside, count), ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts,
-    double max_aside, double min_px, double uneven, RESULT(truth_t, out, count));
+    double max_lateral, double min_px, double uneven, RESULT(truth_t, out, count));
 EXPORT void fit_light_steps(
     IMAGE(grey), int64_t count, ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2),
     ARRAY(const double, curvature, count, 2), ARRAY(const double, aside, count), double blur,

@@ -122,8 +122,8 @@ typedef struct {
     fit_rules_t predictions[2];
     const ring_rules_t *ring;
     ARRAY(const double, along, places);
-    int64_t places, min_places, tried, min_foretelling;
-    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_aside, min_area;
+    int64_t places, min_places, tried, min_predicting;
+    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_lateral, min_area;
 } growth_rules_t;
 
 /* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */

@@ -168,18 +168,18 @@ void sigma_factors(
     double *out)
 {
     for (int64_t board = 0; board < boards; board++) {
-        double usual = 0.0;
+        double typical = 0.0;
         int64_t seen = 0, clear = 0;
         for (int64_t i = 0; i < count; i++)
             if (owner[i] == board && good[i] && pairs[LAGS * i] > 0.0) {
-                usual += log(noise[i]);
+                typical += log(noise[i]);
                 seen++;
             }
-        usual = exp(usual / (double)(seen > 0 ? seen : 1));
+        typical = exp(typical / (double)(seen > 0 ? seen : 1));
         known_t known;
         memset(&known, 0, sizeof known);
         for (int64_t i = 0; i < count; i++)
-            if (owner[i] == board && good[i] && pairs[LAGS * i] > 0.0 && noise[i] <= rules->covered_times * usual) {
+            if (owner[i] == board && good[i] && pairs[LAGS * i] > 0.0 && noise[i] <= rules->covered_times * typical) {
                 add_known(
                     products + LAGS * i, pairs + LAGS * i, noise[i], pixels + 2 * i, sides + 4 * i, blur[i], used[i], &known);
                 clear++;
@@ -191,16 +191,16 @@ void sigma_factors(
     }
 }
 
-/* Set `out` to the factors of the sigmas of corners beside those of their boards, `usual` (boards): 1 but for corners beside
+/* Set `out` to the factors of the sigmas of corners beside those of their boards, `typical` (boards): 1 but for corners beside
  * which there is more than noise (reference.correlation.uneven_factors). */
 void uneven_factors(
     const double *products, const double *pairs, const double *noise, const double *pixels, const double *sides, const double *blur,
-    const double *used, const uint8_t *good, const int64_t *owner, int64_t count, int64_t boards, const double *usual,
+    const double *used, const uint8_t *good, const int64_t *owner, int64_t count, int64_t boards, const double *typical,
     const factor_rules_t *rules, double *out)
 {
     (void)boards;
     for (int64_t i = 0; i < count; i++) {
-        const double *own_products = products + LAGS * i, *own_pairs = pairs + LAGS * i, board = usual[owner[i]];
+        const double *own_products = products + LAGS * i, *own_pairs = pairs + LAGS * i, board = typical[owner[i]];
         out[i] = 1.0;
         if (!good[i] || !(own_pairs[0] > 0.0))
             continue;

@@ -7,7 +7,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Pixels
 from rigkit.kernels import kernels
 
-USUAL_PARTNERS = 2
+TYPICAL_PARTNERS = 2
 """Room for so many pairs a point at first; where there are more of them, they are sought again."""
 
 
@@ -23,7 +23,7 @@ def covered_pixels(grid: IntArray, corners: Pixels, counts: IntArray, squares: f
 def pairs_within(points: FloatArray, reach: float, ends: IntArray) -> IntArray:
     """Return the pairs (P, 2) of points (N, D) that are within `reach` of each other along every axis; the partners of
     each are sought between the first and the second, and the third and the fourth of its `ends` (N, 4)."""
-    pairs = np.empty((USUAL_PARTNERS * len(points), 2), np.int64)
+    pairs = np.empty((TYPICAL_PARTNERS * len(points), 2), np.int64)
     found = kernels().close_pairs(points, reach, ends, pairs)
     if found > len(pairs):
         pairs = np.empty((found, 2), np.int64)

@@ -96,7 +96,7 @@ EXPORT FOR_EACH_PROCESSOR void lens_products(const lens_corners_t *c, double *me
         while (n < stop) {
             int64_t used = 0;
             for (; n < stop && used < CORNERS; n++)
-                if (c->told[n])
+                if (c->usable[n])
                     write_rows(c, scale, n, across, rows + 2 * across * used++);
             add_products(rows, 2 * used, across, sums);
         }

@@ -26,7 +26,7 @@ class LensCorners(Struct):
         lever: FloatArray,
         pixels: tuple[FloatArray, FloatArray],
         residuals: FloatArray,
-        told: BoolArray,
+        usable: BoolArray,
         counts: IntArray,
         size_px: tuple[int, int],
     ) -> LensCorners:
@@ -38,7 +38,7 @@ class LensCorners(Struct):
         sigmas : (P,) units in which parameters count.
         lever : (3, N) from the board's origin to the corner, in the camera frame, mm.
         pixels : u and v, (N,) each, where the corners project.
-        residuals, told : (N, 2) px, and (N,) which corners tell anything.
+        residuals, usable : (N, 2) px, and (N,) which corners tell anything.
         """
         return cls.of(
             d_pixels_d_point=d_pixels_d_point,
@@ -48,7 +48,7 @@ class LensCorners(Struct):
             u=pixels[0],
             v=pixels[1],
             residuals=residuals,
-            told=told,
+            usable=usable,
             counts=counts,
             width=size_px[0],
             height=size_px[1],

@@ -92,9 +92,9 @@ def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> F
     return np.asarray(kernels().sigma_factors(*corners, boards, rules))
 
 
-def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
+def uneven_factors(corners: NoiseOfCorners, typical: FloatArray, rules: FactorRules) -> FloatArray:
     """Return what `detection.subpixel.correlation.uneven_factors` does."""
-    return np.asarray(kernels().uneven_factors(*corners, usual, rules))
+    return np.asarray(kernels().uneven_factors(*corners, typical, rules))
 
 
 def line_curvatures(

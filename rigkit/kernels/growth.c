@@ -11,7 +11,7 @@ static const double LINEAR_PULL = 1e-9;
 
 /* A cell's polynomial: see LocalFit. */
 typedef struct {
-    double pixel[2], along_column[2], along_row[2], bend_column[2], bend_row[2], support, gain;
+    double pixel[2], along_column[2], along_row[2], curvature_column[2], curvature_row[2], support, gain;
 } fit_t;
 
 /* Solve the n x n symmetric `matrix` for three right-hand sides in place (LDL'). */
@@ -153,8 +153,8 @@ INLINE void fit_polynomial(
     for (int side = 0; side < 2; side++) {
         out->along_column[side] = solved[1][side];
         out->along_row[side] = solved[2][side];
-        out->bend_column[side] = degree > 1 ? 2.0 * solved[3][side] : 0.0;
-        out->bend_row[side] = degree > 1 ? 2.0 * solved[5][side] : 0.0;
+        out->curvature_column[side] = degree > 1 ? 2.0 * solved[3][side] : 0.0;
+        out->curvature_row[side] = degree > 1 ? 2.0 * solved[5][side] : 0.0;
     }
     out->support = (double)at.support;
     out->gain = gain_of(&at, degree, solved);
@@ -271,7 +271,7 @@ INLINE int fits(
         const double weakest = rules->contrast_ratio * (there < *contrast ? there : *contrast);
         double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
         aside = aside > rules->min_aside ? aside : rules->min_aside;
-        aside = aside < rules->max_aside ? aside : rules->max_aside;
+        aside = aside < rules->max_lateral ? aside : rules->max_lateral;
         if (!edge_seen(level->image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, side, aside, weakest))
             return 0;
     }
@@ -285,7 +285,7 @@ INLINE int try_cell(
 {
     fit_t fit;
     fit_cell(sheet->pixels, sheet->rows, sheet->columns, row, column, prediction, bell, &fit);
-    if (fit.support < (double)rules->min_foretelling)
+    if (fit.support < (double)rules->min_predicting)
         return 0;
     const double place_u = (fit.pixel[0] - level->offset) / level->scale;
     const double place_v = (fit.pixel[1] - level->offset) / level->scale;

@@ -9,7 +9,7 @@ enum { X, Y, T1, T2, S, A, B, TOWARDS, PLACE, WIDTH, LEFT, UNKNOWNS };
 _Static_assert((int)UNKNOWNS == (int)LIGHT_UNKNOWNS, "both sides count alike");
 
 /* Places of an edge, and the strips beside and between them. */
-enum { PLACES = 2 * LIGHT_ASIDE + 1, STRIPS = PLACES + 1 };
+enum { PLACES = 2 * LIGHT_LATERAL + 1, STRIPS = PLACES + 1 };
 /* Sums over pixels, of products of 1, the pattern E and the brightness I. */
 enum { ONE, E, EE, I, EI, II, SUMS };
 /* Pixels are dealt with so many at a time; their rows are the derivatives and what is left. */
@@ -95,7 +95,7 @@ INLINE void strip_sums(const lit_t *lit, double c, double s, double sums[STRIPS]
 {
     memset(sums, 0, STRIPS * SUMS * sizeof(double));
     for (int64_t n = 0; n < lit->count; n++) {
-        const double place = ceil(lit->u[n] * c + lit->v[n] * s + LIGHT_ASIDE - ON_EDGE);
+        const double place = ceil(lit->u[n] * c + lit->v[n] * s + LIGHT_LATERAL - ON_EDGE);
         const int64_t strip = place < 0.0 ? 0 : place > STRIPS - 1 ? STRIPS - 1 : (int64_t)place;
         const double e = lit->pattern[n], i = lit->value[n], terms[SUMS] = {1.0, e, e * e, i, e * i, i * i};
         for (int k = 0; k < SUMS; k++)
@@ -126,7 +126,7 @@ INLINE int seek_step(const lit_t *lit, const light_rules_t *rules, double x[UNKN
                 continue;
             best = here.squares + beyond.squares;
             x[TOWARDS] = angle;
-            x[PLACE] = (double)(place - LIGHT_ASIDE);
+            x[PLACE] = (double)(place - LIGHT_LATERAL);
             x[A] = here.level;
             x[B] = here.contrast;
             x[LEFT] = left;
@@ -332,14 +332,14 @@ static int uneven_at(
 
 void lit_unevenly(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_aside, double min_px,
+    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px,
     double uneven, uint8_t *out)
 {
     for (int64_t n = 0; n < count; n++) {
         const double *side = sides + 4 * n, length[2] = {hypot(side[0], side[1]), hypot(side[2], side[3])};
         double off[2], nearest = INFINITY;
         for (int line = 0; line < 2; line++) {
-            off[line] = fmin(max_aside, aside[n] / fmax(length[line], 1e-9));
+            off[line] = fmin(max_lateral, aside[n] / fmax(length[line], 1e-9));
             nearest = fmin(nearest, off[line] * length[line]);
         }
         /* Where the board may end, only the nearest places are looked at. */

@@ -12,7 +12,7 @@ from rigkit.kernels import kernels
 from rigkit.kernels.calls import Struct, structure
 from rigkit.kernels.declarations import header
 
-LIGHT_ASIDE, LIGHT_BLOCK = (header().constants[name] for name in ("LIGHT_ASIDE", "LIGHT_BLOCK"))
+LIGHT_LATERAL, LIGHT_BLOCK = (header().constants[name] for name in ("LIGHT_LATERAL", "LIGHT_BLOCK"))
 
 
 @structure("light_rules_t")
@@ -43,7 +43,7 @@ def lit_unevenly(
     aside: FloatArray,
     ends: BoolArray,
     along: FloatArray,
-    max_aside: float,
+    max_lateral: float,
     min_px: float,
     uneven: float,
 ) -> BoolArray:
@@ -51,7 +51,7 @@ def lit_unevenly(
 
     The last four are its constants.
     """
-    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, max_aside, min_px, uneven))
+    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, max_lateral, min_px, uneven))
 
 
 @structure("paper_rules_t")

@@ -27,8 +27,8 @@ class PaintedTile(Struct):
     ) -> PaintedTile:
         """Return a tile of (rows, TILE_NODES) and (TILE_NODES, columns) weights; `rays` (rows, columns, 3) where they
         are not to be interpolated from those at the `nodes`, (TILE_NODES, TILE_NODES, 3)."""
-        told = np.empty((0, weights_u.shape[1], 3)) if rays is None else rays
-        return cls.of(weights_v=weights_v, weights_u=weights_u, nodes=nodes, rays=told, per_pixel=per_pixel)
+        given_rays = np.empty((0, weights_u.shape[1], 3)) if rays is None else rays
+        return cls.of(weights_v=weights_v, weights_u=weights_u, nodes=nodes, rays=given_rays, per_pixel=per_pixel)
 
 
 @structure("surface_t")

@@ -192,10 +192,10 @@ void find_paper(
         const int64_t close = witnesses(&all, every, number, every + k, rules->near_witness, near);
         for (int64_t i = 0; i < close; i++)
             values[i] = contrast[every[near[i]].who];
-        const double usual = median_of(values, close);
+        const double typical = median_of(values, close);
         for (int64_t i = 0; i < close; i++)
             values[i] = blur[every[near[i]].who];
-        read_end(&all, &image, every + k, rules, usual, median_of(values, close), scratch);
+        read_end(&all, &image, every + k, rules, typical, median_of(values, close), scratch);
     }
     for (int64_t k = 0; k < number; k++) {
         /* Sheets are cut straight, and paper is alike: what noise makes of a single reading, its neighbours do not say. */

@@ -84,7 +84,7 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
     for (int64_t first = 0; first < N; first += POINTS) {
         const int64_t count = N - first < POINTS ? N - first : POINTS;
         scales_t of;
-        double told[POINTS];
+        double inside[POINTS];
         const double *xs = at->x + first, *ys = at->y + first, *zs = at->z + first;
 #pragma omp simd
         for (int64_t i = 0; i < count; i++) {
@@ -93,7 +93,7 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
             const double angle = angle_of(r * per, z * per), t = angle * angle, per_r = 1.0 / r;
             const double ratio = r2 > 0.0 ? angle * per_r : per;
             const double limit = length2 < INFINITY ? max_angle : -1.0, ahead = r2 > 0.0 ? 1.0 : z;
-            told[i] = angle <= limit ? ahead : 0.0;
+            inside[i] = angle <= limit ? ahead : 0.0;
             const double scale = ratio * (1.0 + t * (k1 + t * (k2 + t * (k3 + t * k4))));
             const double slope = 1.0 + t * (3.0 * k1 + t * (5.0 * k2 + t * (7.0 * k3 + t * 9.0 * k4)));
             /* d theta / d r = z / |X|^2, d theta / d z = -r / |X|^2. */
@@ -105,7 +105,7 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_kannala_brandt(
             of.factor[i] = t;
         }
         for (int64_t i = 0; i < count; i++)
-            valid[first + i] = told[i] > 0.0;
+            valid[first + i] = inside[i] > 0.0;
         write_points(at, &of, first, count, d_pixels_d_point, u, v);
         if (!at->rows)
             continue;
@@ -150,13 +150,13 @@ INLINE void look(
     const radial_points_t *at, int64_t first, int64_t count, double max_angle, directions_t *out, uint8_t *valid)
 {
     const double *xs = at->x + first, *ys = at->y + first, *zs = at->z + first;
-    double told[POINTS];
+    double inside[POINTS];
 #pragma omp simd
     for (int64_t i = 0; i < count; i++) {
         const double x = xs[i], y = ys[i], z = zs[i];
         const double r2 = x * x + y * y, length2 = r2 + z * z, per = 1.0 / sqrt(length2), r = sqrt(r2) * per;
         const double theta = angle_of(r, z * per), limit = length2 < INFINITY ? max_angle : -1.0;
-        told[i] = theta <= limit ? length2 : 0.0;
+        inside[i] = theta <= limit ? length2 : 0.0;
         out->angle[i] = theta <= limit ? theta : 0.0;
         out->sine[i] = theta <= limit ? r : 0.0;
         out->minus_sine[i] = theta <= limit ? -r : 0.0;
@@ -164,7 +164,7 @@ INLINE void look(
         out->per[i] = per;
     }
     for (int64_t i = 0; i < count; i++)
-        valid[i] = told[i] > 0.0;
+        valid[i] = inside[i] > 0.0;
 }
 
 EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(

@@ -147,7 +147,7 @@ INLINE void terms_at(double x, double y, int64_t terms, double *row)
 /* Make column `k` of the `basis` orthogonal to those before it and of length 1, or 0 where they say the same (Gram and
  * Schmidt, modified: monomials up to degree 8 stay orthogonal to 1e-10), and take its share of the values, `left`. */
 FOR_EACH_PROCESSOR static void add_column(
-    double *basis, int64_t count, int64_t terms, int64_t k, double *triangle, double *told, double *left, double *gain)
+    double *basis, int64_t count, int64_t terms, int64_t k, double *triangle, double *basis_values, double *left, double *gain)
 {
     double *own = basis + k * count, before = 0.0, after = 0.0, u = 0.0, v = 0.0;
 #pragma omp simd reduction(+ : before)
@@ -177,8 +177,8 @@ FOR_EACH_PROCESSOR static void add_column(
         u += own[i] * left[i];
         v += own[i] * left_v[i];
     }
-    told[2 * k] = u;
-    told[2 * k + 1] = v;
+    basis_values[2 * k] = u;
+    basis_values[2 * k + 1] = v;
 #pragma omp simd
     for (int64_t i = 0; i < count; i++) {
         left[i] -= u * own[i];
@@ -207,7 +207,7 @@ INLINE void terms_of_degree(
 
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
     const double *places, const double *values, int64_t count, int64_t terms, double max_leverage, double *basis, double *scratch, double *unit,
-    double *triangle, double *told, double *misses, double *off, double *gain, double *scatter)
+    double *triangle, double *basis_values, double *misses, double *off, double *gain, double *scatter)
 {
     double *left = scratch, *leverage = scratch + 2 * count, *missed = scratch + 3 * count, *ranked_off = scratch + 4 * count;
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
@@ -233,7 +233,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
             continue;
         terms_of_degree(places, count, unit, degree, scratch + 5 * count, basis + k * count);
         for (; k < TERMS_TO(degree); k++)
-            add_column(basis, count, terms, k, triangle, told, left, leverage);
+            add_column(basis, count, terms, k, triangle, basis_values, left, leverage);
 #pragma omp simd
         for (int64_t i = 0; i < count; i++) {
             const double rest = 1.0 - (leverage[i] < max_leverage ? leverage[i] : max_leverage);
@@ -260,7 +260,7 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
  * `fit_polynomials`, or -1 where a place is nearer than `nearest` in it. `rest` (count, 2) is scratch. */
 int64_t fit_map(
     const double *places, const double *pixels, int64_t count, int64_t terms, double max_leverage, double nearest, double *rest,
-    double *basis, double *scratch, double *homography, double *unit, double *triangle, double *told, double *misses, double *off,
+    double *basis, double *scratch, double *homography, double *unit, double *triangle, double *basis_values, double *misses, double *off,
     double *gain, double *scatter)
 {
     const double *h = homography;
@@ -272,12 +272,12 @@ int64_t fit_map(
             rest[2 * i + k] = pixels[2 * i + k] - (h[3 * k] * x + h[3 * k + 1] * y + h[3 * k + 2]) * per_depth;
     }
     return fit_polynomials(
-        places, rest, count, terms, max_leverage, basis, scratch, unit, triangle, told, misses, off, gain, scatter);
+        places, rest, count, terms, max_leverage, basis, scratch, unit, triangle, basis_values, misses, off, gain, scatter);
 }
 
 /* Set `out` to the values at a place whose terms are `row`, by the degree that is surest there, and to their gain. */
-static void surest_values(
-    const double *row, int64_t terms, const double *triangle, const double *told, const double *misses, double out[3])
+static void most_certain_values(
+    const double *row, int64_t terms, const double *triangle, const double *basis_values, const double *misses, double out[3])
 {
     double part[SURFACE_TERMS], square = 0.0, u = 0.0, v = 0.0, least = INFINITY;
     memcpy(part, row, (size_t)terms * sizeof(double));
@@ -288,8 +288,8 @@ static void surest_values(
             const double pivot = triangle[k * terms + k];
             part[k] = pivot > 0.0 ? part[k] / pivot : 0.0;
             square += part[k] * part[k];
-            u += part[k] * told[2 * k];
-            v += part[k] * told[2 * k + 1];
+            u += part[k] * basis_values[2 * k];
+            v += part[k] * basis_values[2 * k + 1];
         }
         const double gain = sqrt(square), off = misses[degree] * (gain > 1.0 ? gain : 1.0);
         if (degree == 0 || off < least) {
@@ -316,15 +316,15 @@ INLINE void line_shapes(double *row)
 }
 
 FOR_EACH_PROCESSOR void add_polynomial(
-    const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle, const double *told,
-    const double *misses, int64_t surest, double *out)
+    const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle, const double *basis_values,
+    const double *misses, int64_t most_certain, double *out)
 {
     const double size = unit[2];
     const int64_t end = TERMS_TO(degree);
     double factors[SURFACE_TERMS][2];
     for (int64_t k = end - 1; k >= 0; k--)
         for (int64_t axis = 0; axis < 2; axis++) {
-            double left = told[2 * k + axis];
+            double left = basis_values[2 * k + axis];
             for (int64_t j = k + 1; j < end; j++)
                 left -= triangle[k * terms + j] * factors[j][axis];
             const double pivot = triangle[k * terms + k];
@@ -348,10 +348,10 @@ FOR_EACH_PROCESSOR void add_polynomial(
                     sum[s][1] += part[s] * factors[k][1];
                 }
             }
-        if (surest) {
+        if (most_certain) {
             double row[SURFACE_TERMS], best[3] = {0.0};
             terms_at(x, y, terms, row);
-            surest_values(row, terms, triangle, told, misses, best);
+            most_certain_values(row, terms, triangle, basis_values, misses, best);
             sum[0][0] = best[0];
             sum[0][1] = best[1];
             out[GAIN] = best[2];

@@ -136,7 +136,7 @@ class Polynomials:
 
     unit: FloatArray
     triangle: FloatArray
-    told: FloatArray
+    basis_values: FloatArray
     misses: FloatArray
     plain: int
     off: FloatArray
@@ -166,7 +166,7 @@ class Polynomials:
         best: int,
         unit: FloatArray,
         triangle: FloatArray,
-        told: FloatArray,
+        basis_values: FloatArray,
         misses: FloatArray,
         off: FloatArray,
         gain: FloatArray,
@@ -176,7 +176,7 @@ class Polynomials:
         return cls(
             unit=unit,
             triangle=triangle,
-            told=told,
+            basis_values=basis_values,
             misses=misses,
             plain=plain,
             off=off,
@@ -184,15 +184,17 @@ class Polynomials:
             scatter=float(scatter[0]),
         )
 
-    def added_to(self, base: TagSurface | None, wanted: FloatArray, *, surest: bool) -> TagSurface:
+    def added_to(self, base: TagSurface | None, wanted: FloatArray, *, most_certain: bool) -> TagSurface:
         """Return the map `base` (without one, nothing) at `wanted` (M, 2) with the values there and their derivatives,
         by the plain degree.
 
-        With `surest`, the values are by the degree that is surest at each place, and have gains: beyond the points high
-        degrees run wild, and what counts is the usual miss times the gain.
+        With `most_certain`, the values are by the degree that is surest at each place, and have gains: beyond the
+        points high degrees run wild, and what counts is the usual miss times the gain.
         """
         out = np.zeros((len(wanted), SURFACE_COLUMNS)) if base is None else base.rows.copy()
-        kernels().add_polynomial(wanted, self.unit, self.plain, self.triangle, self.told, self.misses, surest, out)
+        kernels().add_polynomial(
+            wanted, self.unit, self.plain, self.triangle, self.basis_values, self.misses, most_certain, out
+        )
         return TagSurface(out)
 
 

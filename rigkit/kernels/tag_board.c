@@ -29,7 +29,7 @@ tag_room_t room_of(const tag_fit_t *fit)
     out.off = fit->off;
     out.gain = fit->off + count;
     out.triangle = taken(&map, SURFACE_TERMS * SURFACE_TERMS);
-    out.told = taken(&map, 2 * SURFACE_TERMS);
+    out.basis_values = taken(&map, 2 * SURFACE_TERMS);
     out.misses = taken(&map, SURFACE_DEGREE + 1);
     out.unit = taken(&map, 3);
     out.homography = taken(&map, 9);
@@ -142,13 +142,13 @@ void map_tag_board(const tag_fit_t *fit)
     } else
         best = fit_map(
             room.places, room.start, count, terms, rules->max_leverage, rules->nearest_depth, room.rest, room.basis, room.left,
-            room.homography, room.unit, room.triangle, room.told, room.misses, room.off, room.gain, numbers + MAP_SCATTER);
+            room.homography, room.unit, room.triangle, room.basis_values, room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     numbers[MAP_BY_PERSPECTIVE] = (double)(best >= 0);
     if (best < 0) {
         const int64_t fewest = values == room.rest ? 1 : count < 3 ? count : 3;
         terms = terms_within(wanted > fewest ? wanted : fewest);
         best = fit_polynomials(
-            room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle, room.told,
+            room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle, room.basis_values,
             room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     }
     /* What further terms add is noise. */
@@ -162,7 +162,7 @@ void map_tag_board(const tag_fit_t *fit)
     numbers[MAP_KNOWN] = 1.0;
 }
 
-void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t surest)
+void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
 {
     const double *numbers = fit->numbers;
     if (numbers[MAP_BY_CAMERA] != 0.0)
@@ -175,8 +175,8 @@ void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t surest)
     else
         memset(room->surface, 0, (size_t)(SURFACE_COLUMNS * room->count) * sizeof(double));
     add_polynomial(
-        room->places, room->count, room->unit, (int64_t)numbers[MAP_TERMS], (int64_t)numbers[MAP_PLAIN_DEGREE], room->triangle, room->told,
-        room->misses, surest, room->surface);
+        room->places, room->count, room->unit, (int64_t)numbers[MAP_TERMS], (int64_t)numbers[MAP_PLAIN_DEGREE], room->triangle, room->basis_values,
+        room->misses, most_certain, room->surface);
 }
 
 /* Tell the fit of the corner of a lone tag in the image on which side of its lines that lies, and how dark it is. */

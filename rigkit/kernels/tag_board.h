@@ -10,7 +10,7 @@ typedef struct {
     int64_t count;
     double *cell, *places, *start, *surface, *single, *contrast, *blur, *out;
     /* The map: what its polynomial is, and scratch. */
-    double *triangle, *told, *misses, *unit, *homography, *off, *gain, *basis, *left, *rest;
+    double *triangle, *basis_values, *misses, *unit, *homography, *off, *gain, *basis, *left, *rest;
     /* Scratch, `count` twice of the board's corners. */
     double *ranked;
 } tag_room_t;
@@ -23,8 +23,8 @@ int64_t take_known(const tag_fit_t *fit, tag_room_t *room);
 /* Keep of the marked corners those that `keep` says, with their places, surface and start. */
 void keep_marked(const tag_fit_t *fit, tag_room_t *room, const uint8_t *keep);
 
-/* Set the surface of the marked corners by the map; by the `surest` degree, with gains, for those beyond the known ones. */
-void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t surest);
+/* Set the surface of the marked corners by the map; by the `most_certain` degree, with gains, for those beyond the known ones. */
+void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain);
 
 /* Fit the marked corners from `start` and `blur`. */
 void fit_marked(const tag_fit_t *fit, tag_room_t *room, const edge_rules_t *rules);

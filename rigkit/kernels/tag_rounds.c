@@ -87,7 +87,7 @@ static void read_own(const tag_fit_t *fit, tag_room_t *room, const double *at, u
 
 enum { NOT_SEEN, SEEN_ODD, SEEN_CODED, SEEN_CLEAN };
 
-/* Return how the corner that was fitted where the board lies as `seen` says looks beside the usual `contrast` and `residual`. The
+/* Return how the corner that was fitted where the board lies as `seen` says looks beside the typical `contrast` and `residual`. The
  * code is in the windows of narrow borders, but says itself that the tag is there. */
 static uint8_t looks_of(
     const tag_fit_t *fit, const double *seen, const double *outcome, double contrast, double residual, double blur)
@@ -147,7 +147,7 @@ static int64_t add_round(const tag_fit_t *fit, int64_t by_this_map)
 {
     tag_room_t room = room_of(fit);
     const int64_t count = fit->board->count, known = known_corners(fit);
-    if (known == count || known < fit->rules->min_foretelling)
+    if (known == count || known < fit->rules->min_predicting)
         return 0;
     if (!by_this_map)
         map_tag_board(fit);
@@ -199,12 +199,12 @@ static int64_t drop_round(const tag_fit_t *fit)
     double *off = room.blur, *allowed = room.contrast;
     for (int64_t k = 0; k < room.count; k++)
         off[k] = (isnan(room.off[k]) ? 0.0 : room.off[k] < FAR ? room.off[k] : FAR) / room.gain[k];
-    const double own = median_of_numbers(off, room.count, 1, room.ranked), usual = own > rules->scatter_floor ? own : rules->scatter_floor;
-    const double usual_sigma = usual_of(fit, &room, CORNER_SIGMA);
+    const double own = median_of_numbers(off, room.count, 1, room.ranked), typical = own > rules->scatter_floor ? own : rules->scatter_floor;
+    const double typical_sigma = usual_of(fit, &room, CORNER_SIGMA);
     int seen = 0;
     for (int64_t k = 0; k < room.count; k++) {
         const double sigma = fit->corners[CORNER_COLUMNS * (int64_t)room.cell[k] + CORNER_SIGMA];
-        allowed[k] = rules->outlier * hypot(usual, sigma < 3.0 * usual_sigma ? sigma : 3.0 * usual_sigma);
+        allowed[k] = rules->outlier * hypot(typical, sigma < 3.0 * typical_sigma ? sigma : 3.0 * typical_sigma);
         seen |= room.gain[k] < rules->judging_gain && off[k] > allowed[k];
     }
     if (!seen)

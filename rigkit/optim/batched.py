@@ -68,7 +68,7 @@ def minimise_each(
             better &= active
         gain = np.where(better, here.cost - there.cost, 0.0)
         done = np.where(better, gain <= stop.gain * here.cost, level > damping.ceiling)
-        done |= predicted <= stop.promise * here.cost
+        done |= predicted <= stop.predicted_gain * here.cost
         if small is not None:
             done |= small(state, step)
         if better.all():

@@ -51,14 +51,14 @@ class Stop:
     steps : at most so many are tried.
     gain : a step that is taken and gains no more than this share of the cost is the last one,
     gain_ratio : if it gained more than this share of what the quadratic model promised.
-    promise : a step that promises no more than this share of the cost is not tried.
+    predicted_gain : a step that promises no more than this share of the cost is not tried.
     cost : a step that arrives below this cost is the last one: what is left is rounding.
     """
 
     steps: int
     gain: float = 0.0
     gain_ratio: float = 0.0
-    promise: float = 0.0
+    predicted_gain: float = 0.0
     cost: float = 0.0
 
 

@@ -119,7 +119,7 @@ def minimise(
             if level > damping.ceiling:
                 return Minimum(state, here, count, StopReason.SINGULAR)
             continue
-        if step.predicted <= stop.promise * here.cost:
+        if step.predicted <= stop.predicted_gain * here.cost:
             return Minimum(state, here, count, StopReason.STATIONARY)
         trial = moved(state, step)
         there = None if trial is None else linearise(trial)

@@ -69,9 +69,9 @@ def held_boards(camera: Camera, board: Board, reach: Reach) -> HeldBoards:
 
     Raises DegenerateError where the board fits nowhere into the image.
     """
-    u, v, size, tilt, way, upright = _even(CANDIDATES_DRAWN, 6).T
+    u, v, size, tilt, azimuth, upright = _even(CANDIDATES_DRAWN, 6).T
     width, height = camera.size_px
-    facing = _tilted(np.radians(TILT_DEG[0] + tilt * (TILT_DEG[1] - TILT_DEG[0])), 2.0 * np.pi * way)
+    facing = _tilted(np.radians(TILT_DEG[0] + tilt * (TILT_DEG[1] - TILT_DEG[0])), 2.0 * np.pi * azimuth)
     facing = facing @ exp_so3(np.where(upright < UPRIGHT_SHARE, 0.5 * np.pi, 0.0)[:, None] * np.array([0.0, 0.0, 1.0]))
     square_px = (
         (SIZE_SHARE[0] + size * (SIZE_SHARE[1] - SIZE_SHARE[0])) * height / np.hypot(*(np.array(board.size) + 1))
@@ -116,10 +116,11 @@ def _even(count: int, dimensions: int) -> FloatArray:
     return np.asarray((0.5 + np.arange(1, count + 1)[:, None] * powers) % 1.0)
 
 
-def _tilted(tilt_rad: FloatArray, way_rad: FloatArray) -> FloatArray:
-    """Return rotations (C, 3, 3) that tilt a facing board so that its side at `way_rad` comes towards the camera."""
+def _tilted(tilt_rad: FloatArray, azimuth_rad: FloatArray) -> FloatArray:
+    """Return rotations (C, 3, 3) that tilt a facing board so that its side at `azimuth_rad` comes towards the
+    camera."""
     # A turn about a moves d by a x d: with a = (-d_y, d_x, 0) that is along -z, towards the camera.
-    axis = np.stack([-np.sin(way_rad), np.cos(way_rad), np.zeros_like(way_rad)], axis=-1)
+    axis = np.stack([-np.sin(azimuth_rad), np.cos(azimuth_rad), np.zeros_like(azimuth_rad)], axis=-1)
     return np.asarray(exp_so3(tilt_rad[:, None] * axis))
 
 

@@ -47,9 +47,9 @@ class CornerError:
     def of(cls, calibration: Calibration) -> CornerError:
         """Return what the views of a calibration show: they disagree more than independent corners would."""
         corners = np.array([int(view.kept.sum()) for view in calibration.views])
-        usual = float(corners[corners > 0].mean())
+        typical = float(corners[corners > 0].mean())
         excess = calibration.overdispersion**2 - 1.0
-        rho = float(np.clip(excess / (usual - 1.0), 0.0, 1.0)) if usual > 1.0 else 0.0
+        rho = float(np.clip(excess / (typical - 1.0), 0.0, 1.0)) if typical > 1.0 else 0.0
         return cls(max(calibration.sigma_px, MIN_SIGMA_PX), rho)
 
     def variance(self, corners: FloatArray) -> FloatArray:
@@ -156,8 +156,8 @@ class Knowledge:
         first = p + WARP_UNKNOWNS * self.warped.index(board_id)
         own = np.r_[0:p, first : first + WARP_UNKNOWNS]
         products = _products(camera, held, self.error, warp_of_board(held.points_mm))
-        told = reduced_by_cluster(products, p + WARP_UNKNOWNS, np.arange(len(held)))[0]
-        out[:, own[:, None], own] = told
+        reduced = reduced_by_cluster(products, p + WARP_UNKNOWNS, np.arange(len(held)))[0]
+        out[:, own[:, None], own] = reduced
         return out
 
     def departing(self, modes: LensModes) -> Knowledge:

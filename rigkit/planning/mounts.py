@@ -36,14 +36,14 @@ class SharedViews:
 def mount_information(shared: SharedViews) -> FloatArray:
     """Return what each of C shared boards tells of b_from_a, (C, 6, 6): of a turn about the origin of b (rad), and of
     a shift (mm)."""
-    turn, swung = shared.carried()
+    turn, rotated = shared.carried()
     by_a, by_b = np.zeros((len(turn), 6, 6)), np.zeros((len(turn), 6, 6))
     # With b_from_a = B A^-1, errors (w, v) of either pose, x -> exp(w) R x + t + v, make w = w_b - R_ba w_a and
     # v = v_b - R_ba v_a - w x (R_ba t_a).
     by_b[:, :3, :3] = by_b[:, 3:, 3:] = np.eye(3)
-    by_b[:, 3:, :3] = skew(swung)
+    by_b[:, 3:, :3] = skew(rotated)
     by_a[:, :3, :3] = by_a[:, 3:, 3:] = -turn
-    by_a[:, 3:, :3] = -skew(swung) @ turn
+    by_a[:, 3:, :3] = -skew(rotated) @ turn
     covariance = by_a @ _inverse(pose_information(shared.a, shared.in_a, shared.error)) @ np.swapaxes(by_a, -1, -2)
     covariance += by_b @ _inverse(pose_information(shared.b, shared.in_b, shared.error)) @ np.swapaxes(by_b, -1, -2)
     return _inverse(covariance)

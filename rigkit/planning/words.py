@@ -71,8 +71,8 @@ def placement(camera: Camera, board: Board, cam_from_board: Rigid3) -> BoardInVi
     size = float(np.linalg.norm(np.ptp(paper, axis=0)))
     there, _ = camera.project(at + 0.05 * size * along)
     across, _ = camera.project(at + 0.05 * size * cam_from_board.rotation[:, int(board.rows > board.columns)])
-    way, edge = there - here, across - here
-    angle = float(np.degrees(np.arctan2(way[1], way[0])))
+    step, edge = there - here, across - here
+    angle = float(np.degrees(np.arctan2(step[1], step[0])))
     nearer = NEARER_SIDES[round(angle / 45.0) % 8] if tilt > FACING_DEG and np.isfinite(angle) else ""
     return BoardInView(
         place=_place(here / (np.array(camera.size_px) - 1.0)) if seen else "out of view",

@@ -26,7 +26,7 @@ GROSS = 8.0
 """A corner this many standard deviations off is no corner of the board: something stands in front of it."""
 OUTLIER_ROUNDS = 3
 DAMPING_OF_PLANES = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
-STOP_OF_PLANES = Stop(steps=60, promise=1e-14, gain=1e-14)
+STOP_OF_PLANES = Stop(steps=60, predicted_gain=1e-14, gain=1e-14)
 
 State = TypeVar("State")
 

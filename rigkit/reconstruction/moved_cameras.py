@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.moving_pupil import as_other_from_afar
+from rigkit.cameras.moving_pupil import as_other_with_fixed_pupil
 from rigkit.cameras.uncertain import PosedPair, UncertainCamera, UncertainPair
 from rigkit.core.arrays import BoolArray, Pixels, Points
 
@@ -47,9 +47,9 @@ def moved_pixels(
     pixels: tuple[Pixels, Pixels], points: tuple[Points, Points], known: Known, moved: tuple[Camera, Camera]
 ) -> tuple[Pixels, Pixels]:
     """Return the pixels (N, 2) of both images as moved cameras have what was seen of points (N, 3) mm in each camera's
-    frame: where a pupil moves, what that does is taken out anew (`as_other_from_afar`)."""
+    frame: where a pupil moves, what that does is taken out anew (`as_other_with_fixed_pupil`)."""
     one, two = (
-        at if camera is None else as_other_from_afar(at, p, camera.camera, other)
+        at if camera is None else as_other_with_fixed_pupil(at, p, camera.camera, other)
         for at, p, camera, other in zip(pixels, points, known, moved, strict=True)
     )
     return one, two

@@ -12,7 +12,7 @@ import numpy as np
 from rigkit.affine.affinities import DirectionNoise
 from rigkit.affine.directions import Support, direction_field
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import board_from_afar
+from rigkit.cameras.board_pose import board_with_fixed_pupil
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.pinhole import Pinhole
 from rigkit.core.arrays import FloatArray
@@ -41,7 +41,7 @@ class MatchedPair:
     ----------
     pair_id : name of the pair.
     camera1, camera2 : calibrated cameras of the images as captured, central: where the pupil of one moves, all corners
-        are `as_from_afar`.
+        are `as_with_fixed_pupil`.
     boards : boards seen in both images, in the order of `matches.board_index`.
     identity : which board and which corner is which.
     chain : "raw": `matches` are in captured pixels; "rectified": in perspective views along each camera's axis.
@@ -119,14 +119,14 @@ def match_pair(
     lenses = far_camera(camera1), far_camera(camera2)
     identity, notes = identified(detections1, detections2), list[str]()
     if lenses != (camera1, camera2):
-        one, said1 = _from_afar(identity.detections1, boards, camera1, "image 1")
-        two, said2 = _from_afar(identity.detections2, boards, camera2, "image 2")
-        identity, notes = identified(one, two), [*said1, *said2]
+        one, note1 = _with_fixed_pupil(identity.detections1, boards, camera1, "image 1")
+        two, note2 = _with_fixed_pupil(identity.detections2, boards, camera2, "image 2")
+        identity, notes = identified(one, two), [*note1, *note2]
     matched = _matched(pair_id, *lenses, boards, identity, chain, support, window)
     return replace(matched, notes=(*notes, *matched.notes))
 
 
-def _from_afar(
+def _with_fixed_pupil(
     detections: Sequence[BoardDetection], boards: Sequence[Board], camera: Camera, image: str
 ) -> tuple[Sequence[BoardDetection], list[str]]:
     """Return known boards as a camera whose pupil did not move would have seen them, and what to say of that."""
@@ -134,7 +134,8 @@ def _from_afar(
         return detections, []
     by_id = {board.board_id: board for board in boards}
     out = [
-        replace(d, pixels=board_from_afar(camera, d.pixels, by_id[str(d.board_id)].points(d.grid))) for d in detections
+        replace(d, pixels=board_with_fixed_pupil(camera, d.pixels, by_id[str(d.board_id)].points(d.grid)))
+        for d in detections
     ]
     largest = max(
         (float(np.abs(new.pixels - old.pixels).max()) for new, old in zip(out, detections, strict=True)), default=0.0

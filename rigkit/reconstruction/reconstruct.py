@@ -238,9 +238,9 @@ def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruc
         )
     baseline_mm, baseline_sigma_mm = planes.baseline_mm()
     lost = [b.board_id for b in reconstruction.boards if b.board_id not in planes.board_ids]
-    told = [f"left out, for their planes could not be fitted: {', '.join(lost)}"] if lost else []
+    new_notes = [f"left out, for their planes could not be fitted: {', '.join(lost)}"] if lost else []
     if planes.gross:
-        told.append(f"{planes.gross} corners lie far off the boards' planes and were left out")
+        new_notes.append(f"{planes.gross} corners lie far off the boards' planes and were left out")
     pixels1, pixels2 = reconstruction.pixels1[placed], reconstruction.pixels2[placed]
     m = Matches.from_cameras(reconstruction.camera1, reconstruction.camera2, pixels1, pixels2)
     E21 = essential_from_pose(planes.cam2_from_cam1)
@@ -257,7 +257,7 @@ def on_planes(reconstruction: Reconstruction, planes: BoardPlanes) -> Reconstruc
         cloud=_cloud_on_planes(reconstruction, planes, placed),
         baseline_mm=baseline_mm,
         baseline_sigma_mm=baseline_sigma_mm,
-        notes=(*reconstruction.notes, *told),
+        notes=(*reconstruction.notes, *new_notes),
         kept=None,
     )
 

@@ -161,7 +161,7 @@ def with_pupils(
         for camera, p, at in zip(
             cameras, (points, pose.apply(points)), (correspondences.pixels1, correspondences.pixels2), strict=True
         ):
-            moved = camera.as_from_afar(at, p) if isinstance(camera, NearCamera) else at
+            moved = camera.as_with_fixed_pupil(at, p) if isinstance(camera, NearCamera) else at
             pixels.append(np.where(np.isfinite(moved), moved, at))
         found = replace(correspondences, pixels1=pixels[0], pixels2=pixels[1])
         scene = scene_of(found)

@@ -13,7 +13,7 @@ import numpy as np
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
-from rigkit.core.findings import Finding, Severity, gravest_first, worst
+from rigkit.core.findings import Finding, Severity, most_severe_first, worst
 from rigkit.core.printing import counted
 from rigkit.core.progress import Progress, silent
 from rigkit.geometry.rotation import exp_so3
@@ -37,9 +37,11 @@ def html_of(result: Calibration | RigCalibration | Reconstruction) -> str:
     """Return a result as a notebook shows it: what it is, the verdict, and its 3D scene as a drawing."""
     if isinstance(result, Calibration):
         scene = boards_scene(result.views, result.boards)
-        return _shown(repr(result), gravest_first(result.verdicts)[:2], scene)
+        return _shown(repr(result), most_severe_first(result.verdicts)[:2], scene)
     if isinstance(result, RigCalibration):
-        return _shown(f"{result!r}\n  {rig_reach(result, ())}", gravest_first(result.verdicts)[:2], rig_scene(result))
+        return _shown(
+            f"{result!r}\n  {rig_reach(result, ())}", most_severe_first(result.verdicts)[:2], rig_scene(result)
+        )
     baseline = measured_words(result.baseline_mm, result.baseline_sigma_mm, 2)
     words = (
         f"Reconstruction of '{result.pair_id}', {result.pose_type}, {result.affine_method}: {len(result.cloud)} "
@@ -53,9 +55,9 @@ def _shown(words: str, findings: Sequence[Finding], scene: Mapping[str, Any]) ->
     colour = COLOUR_OF[worst(findings)] if findings else "#1f5fa8"
     lines = [line.strip() for line in words.splitlines()]
     lines = [*(line for line in lines if line not in {str(f) for f in findings}), *(str(f) for f in findings)]
-    told = "<br>".join(escape(line) for line in lines)
+    body = "<br>".join(escape(line) for line in lines)
     return (
-        f'<div style="border-left: 4px solid {colour}; padding-left: 10px; max-width: 60em">{told}<br>'
+        f'<div style="border-left: 4px solid {colour}; padding-left: 10px; max-width: 60em">{body}<br>'
         f"{scene_svg(scene)}</div>"
     )
 

@@ -143,8 +143,8 @@ def _angles(target: BoardRig, checks: Sequence[Check]) -> Table:
             corners = target.distance_mm(Feature(a, grid=(0, 0)), Feature(b, grid=(0, 0)))
         centres = target.distance_mm(Feature(a, centre=True), Feature(b, centre=True))
         measured = _measured(checks, f"angle {a}-{b}", f"angle {b}-{a}")
-        apart = (Cell(value, sigma=sigma) for value, sigma in (corners, centres))
-        rows.append(cells(f"{a} and {b}", Cell(value, sigma=sigma), *measured, *apart))
+        difference_cells = (Cell(value, sigma=sigma) for value, sigma in (corners, centres))
+        rows.append(cells(f"{a} and {b}", Cell(value, sigma=sigma), *measured, *difference_cells))
     distances = [c for c in checks if c.kind == "distance"]
     note = f"Solved from {target.image_count} images that show at least two of these boards."
     note += "".join(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigkit.core.arrays import without_nan
-from rigkit.core.claims import Comparison, Verdict, judge_claim
+from rigkit.core.claims import Comparison, Verdict, evaluate_claim
 from rigkit.core.errors import InputError
 from rigkit.study.study import STUDY_PLANES, Claim, Study
 
@@ -78,7 +78,7 @@ def tabulate(study: Study, chunks: Sequence[NDArray[np.float32]]) -> StudyTable:
     if errors.shape[3] != study.trials:
         raise InputError(f"study '{study.name}': {errors.shape[3]} of {study.trials} trials; run the missing chunks")
     cells = tuple(_cells(study, errors))
-    return StudyTable(study, cells, tuple(_judge(claim, cells) for claim in study.claims))
+    return StudyTable(study, cells, tuple(_evaluated(claim, cells) for claim in study.claims))
 
 
 def _cells(study: Study, errors: NDArray[np.float32]) -> Iterator[StudyCell]:
@@ -120,8 +120,8 @@ def _select(cells: Sequence[StudyCell], which: Mapping[str, Any]) -> list[StudyC
     return [cell for cell in cells if fits(cell)]
 
 
-def _judge(claim: Claim, cells: Sequence[StudyCell]) -> Verdict:
-    verdict = judge_claim(claim.text, _comparisons(claim, cells))
+def _evaluated(claim: Claim, cells: Sequence[StudyCell]) -> Verdict:
+    verdict = evaluate_claim(claim.text, _comparisons(claim, cells))
     if verdict is None:
         raise InputError(f"claim '{claim.text}': no two cells of this study can be compared; check its keys and values")
     return verdict

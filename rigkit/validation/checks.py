@@ -206,9 +206,9 @@ def _report(
     if truth.baseline is not None:
         checks.append(compare_baseline("baseline", truth.baseline, baseline, coverage, len(cloud)))
     of_boards, unchecked = _checks_of_boards(measured, truth, angles, fitted, coverage)
-    held, unheld = declaration_checks(reconstruction)
+    held, undeclared = declaration_checks(reconstruction)
     checks += [*of_boards, *held, *contradicted_boards(measured.boards, layout or {})]
-    unchecked += unheld
+    unchecked += undeclared
     against = normal_errors_against(reconstruction, fitted.judge)
     stated = {frozenset((angle.a, angle.b)): angle.value_deg for angle in truth.angles}
     return ValidationReport(

@@ -37,7 +37,7 @@ OTHER_CHAIN = "other chain"
 CROSS_COVERAGE = 4.0
 """A data set of eight pairs makes a hundred and fifty comparisons: at four sigmas one such data set in a hundred has a
 false alarm, at three every third, at two each."""
-TOLD = (
+REPORTED_FIELDS = (
     *("name", "rotation_difference_deg", "direction_difference_deg", "baseline_mm"),
     *("rms_px", "variance_factor", "used", "excluded"),
 )
@@ -119,7 +119,7 @@ class CrossCheckReport:
             "affine_method": self.affine_method,
             "passed": self.passed,
             "methods": [
-                {name: getattr(method, name) for name in TOLD}
+                {name: getattr(method, name) for name in REPORTED_FIELDS}
                 | {
                     "angles_deg": [
                         {"a": a, "b": b, "angle": angle, "sigma": sigma}
@@ -212,8 +212,8 @@ def _colmap_methods(reconstruction: Reconstruction, seed: int) -> list[Independe
     # What the adjustment leaves in place is as certain as its end, but for a length that it never had.
     own_sigma = np.array(_pose_sigmas(adjusted.cam2_from_cam1, covariance)[:2])
     own = adjusted.cam2_from_cam1
-    turned, swung = own.rotation @ two_view.rotation.T, angle_between(own.translation_mm, two_view.translation_mm)
-    moved = np.rad2deg([rotation_angle(turned), swung])
+    turned, rotated = own.rotation @ two_view.rotation.T, angle_between(own.translation_mm, two_view.translation_mm)
+    moved = np.rad2deg([rotation_angle(turned), rotated])
     settled = bool((moved <= CROSS_COVERAGE * own_sigma).all())
     # What the adjustment moves, the two-view estimate has not taken from the corners: an error of its own.
     step = two_view.step_from(own)
@@ -295,7 +295,7 @@ def _checks(
     """
     rows_of: list[tuple[str, str, str, tuple[float, float], tuple[float, float]]] = []
     ours = _angles(measured)
-    apart = _apart(measured, shifts) if shifts is not None and method.name == PNP else {}
+    sigmas = _difference_sigmas(measured, shifts) if shifts is not None and method.name == PNP else {}
     sigma = _pose_sigmas(method.cam2_from_cam1, method.covariance)
     if all(np.isfinite(value) for value in sigma):
         own = _pose_sigmas(reconstruction.cam2_from_cam1, _covariance(reconstruction))
@@ -313,13 +313,13 @@ def _checks(
     for name, kind, unit, (other, theirs), (value, mine) in rows_of:
         ours_sigma, their_sigma = (sigma if np.isfinite(sigma) else 0.0 for sigma in (mine, theirs))
         of_corners = sigma_of_difference(ours_sigma, their_sigma, method.used - POSE_FREEDOM)
-        combined = float(np.hypot(of_corners, apart.get(name, 0.0)))
+        combined = float(np.hypot(of_corners, sigmas.get(name, 0.0)))
         known = (other, theirs, method.name)
         checks.append(compare(name, kind, unit, known, (value, mine), coverage, method.used, combined_sigma=combined))
     return checks
 
 
-def _apart(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
+def _difference_sigmas(measured: Measured, shifts: CalibrationShifts) -> dict[str, float]:
     """Return how far the calibrations' uncertainty moves our quantities and those of planar PnP apart, one sigma."""
 
     every = (shifts.base, *shifts.moved)

@@ -23,7 +23,7 @@ from rigkit.validation.check import Check, compare
 
 DECLARED = ("pose type", "level", "board size", "layout")
 """Kinds of checks that are about a declaration, not about a measured quantity."""
-MAX_TOLD_SIGMAS = 38.0
+MAX_DECLARED_SIGMAS = 38.0
 """A chance below the smallest number there is is told as this many standard deviations."""
 
 
@@ -116,7 +116,7 @@ def _check(kind: str, name: str, found: TypeEvidence, decision: PoseTypeDecision
 
     assert decision.evidence is not None
     level_deg, ours = (float(np.rad2deg(v)) for v in (decision.evidence.level_sigma_rad, found.deviation_rad))
-    k = min(float(-ndtri(0.5 * max(found.p_value, 1e-320))), MAX_TOLD_SIGMAS)
+    k = min(float(-ndtri(0.5 * max(found.p_value, 1e-320))), MAX_DECLARED_SIGMAS)
     limit = float(-ndtri(0.5 * CONTRADICTION_P))
     combined = ours / k if k > 1.0 else max(ours, level_deg)
     return Check(

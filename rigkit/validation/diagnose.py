@@ -21,7 +21,7 @@ from rigkit.validation.checks import ValidationReport
 CLEARLY_BETTER = 4.0
 """Another calibration fits clearly better if it leaves this many times less. Two calibrations of one lens differ by far
 less, two lenses by far more."""
-MISFIT_PX = 0.5
+LARGE_RESIDUAL_PX = 0.5
 """Below this no calibration is called wrong: corners of a blurred or bent board leave as much."""
 SAME_RATIO = 0.005
 """Baselines that are off by one factor, to half a percent, share a cause."""
@@ -82,7 +82,7 @@ def diagnose_cameras(
     fits = []
     for found, own in zip(detections, declared, strict=True):
         fit = {own: camera_fit(cameras[own], found, boards)}
-        if fit[own] > MISFIT_PX:
+        if fit[own] > LARGE_RESIDUAL_PX:
             others = {n: c for n, c in cameras.items() if n != own and c.size_px == cameras[own].size_px}
             fit |= {name: camera_fit(camera, found, boards) for name, camera in others.items()}
         fits.append(fit)
@@ -100,7 +100,7 @@ def diagnose_cameras(
                 f"pair '{pair_id}': image {number} fits camera '{other}' ({fit[other]:.2f} px), not the declared "
                 f"'{name}' ({fit[name]:.2f} px): the calibration of another lens?"
             )
-        elif fit[name] > MISFIT_PX:
+        elif fit[name] > LARGE_RESIDUAL_PX:
             aspect, left = _best_stretch(cameras[name], detections[number - 1], boards)
             cause = "; was the lens changed or refocused since?"
             if left * CLEARLY_BETTER < fit[name]:
@@ -128,14 +128,14 @@ def _best_stretch(camera: Camera, detections: Sequence[BoardDetection], boards: 
 
 def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
     """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
-    said = []
+    message = []
     for one in fitting:
         ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
         of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}, {one.where} in image 1,"
-        said.append(
+        message.append(
             f"{of} would fit the others with squares of {one.factor * declared_mm:.1f} mm ({declared_mm:g} is declared)"
         )
-    return (f"{', or '.join(said)}; measure them again",) if said else ()
+    return (f"{', or '.join(message)}; measure them again",) if message else ()
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:
@@ -183,7 +183,7 @@ def _clearly_better(fit: Mapping[str, float], declared: str) -> str | None:
     if not known or np.isnan(fit[declared]):
         return None
     best = min(known, key=lambda name: known[name])
-    worse = fit[declared] > MISFIT_PX and fit[declared] > CLEARLY_BETTER * known[best]
+    worse = fit[declared] > LARGE_RESIDUAL_PX and fit[declared] > CLEARLY_BETTER * known[best]
     return best if worse and best != declared else None
 
 
@@ -321,8 +321,8 @@ def _diagnose_angles(report: ValidationReport) -> list[str]:
     names = [check.name.removeprefix("angle ") for check in failed]
     radians = [c for c in failed if abs(c.ours / np.degrees(c.measured) - 1.0) < UNIT_RATIO]
     if radians:
-        said = ", ".join(c.name.removeprefix("angle ") for c in radians)
-        return [f"pair '{report.pair_id}': {said}: written in radians? Angles are in degrees"]
+        message = ", ".join(c.name.removeprefix("angle ") for c in radians)
+        return [f"pair '{report.pair_id}': {message}: written in radians? Angles are in degrees"]
     supplement = [c for c in failed if abs(180.0 - c.ours - c.measured) <= c.limit_k * c.combined_sigma]
     if supplement:
         return [
@@ -352,10 +352,10 @@ def _lone_angle(report: ValidationReport, check: Check) -> str:
             "board is bent, or the calibration does not fit; see what the corners leave over"
         )
     others = [c for c in report.checks if c.kind == "angle" and c is not check]
-    witnesses = [] if angle.lattice_deg is None else [f"the boards' known squares say {angle.lattice_deg:.2f} deg too"]
-    witnesses += ["the other angles hold"] if others and all(c.passed for c in others) else []
+    support = [] if angle.lattice_deg is None else [f"the boards' known squares say {angle.lattice_deg:.2f} deg too"]
+    support += ["the other angles hold"] if others and all(c.passed for c in others) else []
     misread = (
-        f"{check.measured:g} was probably misread" if witnesses else f"the boards do not stand at {check.measured:g}"
+        f"{check.measured:g} was probably misread" if support else f"the boards do not stand at {check.measured:g}"
     )
-    why = f" ({', and '.join(witnesses)})" if witnesses else ""
+    why = f" ({', and '.join(support)})" if support else ""
     return f"{misread}: the images show {check.ours:.2f} deg{why}; measure it again"

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigkit.core.claims import Comparison, Verdict, judge_claim
+from rigkit.core.claims import Comparison, Verdict, evaluate_claim
 from rigkit.core.posetype import PoseType
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.validation.checks import ValidationReport
@@ -63,13 +63,13 @@ def claim_table(reports: Sequence[ValidationReport], method: str, printed: Paper
     """
     by_baseline = dict(_baseline_errors(printed))
     ours = (
-        judge_claim(CLAIMS[0], _better(_by_estimator(reports), SCALED, UNSCALED, "deg")),
-        judge_claim(CLAIMS[1], _better(_by_estimator(reports), (*UNSCALED[:2], *SCALED), (WORST,), "deg")),
+        evaluate_claim(CLAIMS[0], _better(_by_estimator(reports), SCALED, UNSCALED, "deg")),
+        evaluate_claim(CLAIMS[1], _better(_by_estimator(reports), (*UNSCALED[:2], *SCALED), (WORST,), "deg")),
         *_of_planes({Capture.of(r.pair_id, r.pose_type): _by_plane(r) for r in reports if r.affine_method == method}),
     )
     theirs = (
-        judge_claim(CLAIMS[0], _better(by_baseline, SCALED, UNSCALED, "mm")),
-        judge_claim(CLAIMS[1], _better(by_baseline, (*UNSCALED[:2], *SCALED), (WORST,), "mm")),
+        evaluate_claim(CLAIMS[0], _better(by_baseline, SCALED, UNSCALED, "mm")),
+        evaluate_claim(CLAIMS[1], _better(by_baseline, (*UNSCALED[:2], *SCALED), (WORST,), "mm")),
         *_of_planes(_printed_planes(printed)),
     )
     rows = [
@@ -107,9 +107,9 @@ def _of_planes(errors: Errors) -> tuple[Verdict | None, ...]:
         if capture.motion != PoseType.GENERAL and number != 1 and 1 in planes
     )
     return (
-        judge_claim(CLAIMS[2], first),
-        judge_claim(CLAIMS[3], _between(errors, lambda one, other: other == PoseType.FORWARD)),
-        judge_claim(CLAIMS[4], _between(errors, lambda one, other: one == PoseType.STANDARD)),
+        evaluate_claim(CLAIMS[2], first),
+        evaluate_claim(CLAIMS[3], _between(errors, lambda one, other: other == PoseType.FORWARD)),
+        evaluate_claim(CLAIMS[4], _between(errors, lambda one, other: one == PoseType.STANDARD)),
     )
 
 

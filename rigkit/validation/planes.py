@@ -29,7 +29,7 @@ MIN_WIDTH = 1e-3
 GROSS = 8.0
 """A point this many standard deviations off, noise and bending together, is no corner of the board: chance never does
 that."""
-VAGUE = 8.0
+MAX_SIGMA_RATIO = 8.0
 """A point this many times as uncertain as the middle one of its board has a sixty-fourth of its say. Nothing is lost
 without it, and beside an epipole errors are so large that they are no longer linear: nobody knows its true variance."""
 ROUNDING = 1e-9
@@ -282,7 +282,7 @@ def _judged(points: Points, covariance: FloatArray, common: FloatArray) -> tuple
     off = np.abs(seen.residuals)
     scatter = SIGMA_OF_MEDIAN * float(np.median(off / np.sqrt(seen.variance)))
     expected = np.sqrt(scatter**2 * seen.variance + np.sum(seen.bending(weights) ** 2, axis=1))
-    return np.asarray(off <= GROSS * expected + floor), np.asarray(expected <= VAGUE * np.median(expected))
+    return np.asarray(off <= GROSS * expected + floor), np.asarray(expected <= MAX_SIGMA_RATIO * np.median(expected))
 
 
 def _plane(points: Points, weights: FloatArray, noise_mm2: FloatArray | None, used: BoolArray) -> Plane:

@@ -21,8 +21,8 @@ from rigkit.core.processes import process_count, worker_pool
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
+from rigkit.detection.duplicate_marks import duplicate_boards
 from rigkit.detection.lattices import MIN_BOARD_CORNERS
-from rigkit.detection.twins import alike_boards
 from rigkit.io.boards.board_words import board_of_words
 from rigkit.io.corners.corners_file import write_corners
 from rigkit.io.disk.writing import ensure_writable, write_atomic
@@ -222,7 +222,7 @@ def _detect(job: _DetectJob) -> tuple[Outcome, str | None]:
     try:
         image = _read(job)
         found = _boards_in(image, job)
-        seen = alike_boards(image, job.boards) if found else doubtful_grid(image)
+        seen = duplicate_boards(image, job.boards) if found else doubtful_grid(image)
     except InputError as error:
         return error, None
     except MemoryError as error:

@@ -12,7 +12,7 @@ from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.calibration.certainty.uncertainty import pose_covariance_of_lens
 from rigkit.calibration.hand_eye import HandEye, hand_eye
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import board_from_afar
+from rigkit.cameras.board_pose import board_with_fixed_pupil
 from rigkit.cameras.moving_pupil import NearCamera, far_camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.boards import Board
@@ -109,7 +109,7 @@ def calibrate_hand_eye(
     missing = [path.name for path in paths if path.name not in robot]
     if missing:
         raise InputError(f"'{poses}': no pose of image '{missing[0]}' ({len(missing)} in all); add the rows")
-    board, camera = _one_way_up(board_of_words(str(options.board))), import_near_camera(options.camera)
+    board, camera = _with_unique_orientation(board_of_words(str(options.board))), import_near_camera(options.camera)
     views, stands, unreadable = [], [], []
     for done, path in enumerate(paths, start=1):
         try:
@@ -123,7 +123,7 @@ def calibrate_hand_eye(
             progress("board", done, len(paths))
         if view is not None:
             base_from_hand = robot[path.name].inverse() if options.inverse else robot[path.name]
-            views.append(_from_afar(camera, view))
+            views.append(_with_fixed_pupil(camera, view))
             stands.append(base_from_hand if options.board_on_hand else base_from_hand.inverse())
     if not views:
         if unreadable:
@@ -154,7 +154,7 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
             )
         why = explained([Path(image)], [known]) or "check focus and the board's file"
         raise CheckFailed(f"'{image}' does not show board '{known.board_id}'; {why}")
-    view = _from_afar(near, view)
+    view = _with_fixed_pupil(near, view)
     rays, valid = lens.unproject(view.pixels)
     unit = np.linalg.norm(lens.ray_jacobian(view.pixels[valid]), axis=(1, 2)) / np.sqrt(2.0)
     points = view.points()[valid]
@@ -177,11 +177,11 @@ def camera_on_board(image: str | Path, camera: str | Path, board: str | Path) ->
     return PlacedCamera(placed, Path(image), rms, ambiguous, of_lens is not None)
 
 
-def _from_afar(camera: Camera, view: BoardView) -> BoardView:
+def _with_fixed_pupil(camera: Camera, view: BoardView) -> BoardView:
     """Return a view as the central camera has it, without what the pupil's motion does to it."""
     if not isinstance(camera, NearCamera):
         return view
-    return replace(view, pixels=board_from_afar(camera, view.pixels, view.points()))
+    return replace(view, pixels=board_with_fixed_pupil(camera, view.pixels, view.points()))
 
 
 def _known(camera: str | Path) -> UncertainCamera | None:
@@ -192,10 +192,10 @@ def _known(camera: str | Path) -> UncertainCamera | None:
         return None
 
 
-def _one_way_up(board: Board) -> Board:
+def _with_unique_orientation(board: Board) -> Board:
     if board.looks_same_turned:
         raise InputError(
-            f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.one_way_up}, or one "
+            f"board '{board.board_id}' looks the same turned by 180 degrees: take {board.pattern.unambiguous}, or one "
             "with markers"
         )
     return board

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.circles import Circles
-from rigkit.detection.circles.evidence import CORNERED, DISPLACED, MAX_STRANGE, MISSHAPEN, UNEXPLAINED, GridEvidence
+from rigkit.detection.circles.evidence import (
+    CORNERED,
+    DISPLACED,
+    MAX_IMPLAUSIBILITY,
+    MISSHAPEN,
+    UNEXPLAINED,
+    GridEvidence,
+)
 from rigkit.detection.circles.find import seen_grids
 
 BOARDS = (
@@ -38,4 +45,4 @@ def print_circle_margins(looks: Iterable[tuple[str, bool, NDArray[np.uint8]]]) -
         for name, evidence in sorted(seen[shows], key=lambda item: item[1].strange, reverse=shows)[:SHOWN]:
             parts = (value / scale for value, scale in zip(astuple(evidence), SCALES, strict=True))
             print(f"| {evidence.strange:.2f} |", " | ".join(f"{part:.2f}" for part in parts), f"| {name} |")
-    print(f"the limit is {MAX_STRANGE}")
+    print(f"the limit is {MAX_IMPLAUSIBILITY}")

@@ -114,7 +114,7 @@ def _on_wall(board: Board, axes: FloatArray, rng: np.random.Generator) -> Placed
     return PlacedBoard(board, Rigid3(axes @ turn, shift))
 
 
-def judge_pair(
+def evaluate_pair(
     scene: StereoScene, pairs: Sequence[tuple[BoardDetection, BoardDetection]], ambiguous: bool
 ) -> PairVerdict:
     """Say whether equal indices of `pairs` (boards of image 1 and 2) are the same physical corners."""

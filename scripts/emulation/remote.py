@@ -225,8 +225,8 @@ def host() -> Host:
     if not _HOSTS:
         *command, shared = shlex.split(os.environ[COMMAND])
         own = Path(f"{shared}-{os.getpid()}")
-        as_told = f"Z:{own}".replace("/", "\\") if "wine" in command[0] else str(own)
-        _HOSTS.append(Host([*command, as_told], own))
+        host_path = f"Z:{own}".replace("/", "\\") if "wine" in command[0] else str(own)
+        _HOSTS.append(Host([*command, host_path], own))
     return _HOSTS[0]
 
 

@@ -28,14 +28,14 @@ def fault_of_message(message: str, file: str | None, words: Sequence[str]) -> st
     an option; and what to do. None where it lacks nothing."""
     if file is not None and file not in message:
         return f"message does not name the file: {message[:300]}"
-    if file is None and not _tells_of(message, words):
+    if file is None and not _mentions(message, words):
         return f"message names nothing of the command: {message[:300]}"
     if not REMEDY.search(message):
         return f"message does not say what to do: {message[:300]}"
     return None
 
 
-def _tells_of(message: str, words: Sequence[str]) -> bool:
+def _mentions(message: str, words: Sequence[str]) -> bool:
     """Return whether the message names a word of the command (shown with escapes, or cut), or an option."""
     if re.search(r"--[a-z]|(?<!\w)-[a-z]\b", message):
         return True

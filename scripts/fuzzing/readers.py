@@ -10,7 +10,7 @@ from pathlib import Path
 from rigkit.cli.main import main
 from rigkit.coach.coach import Coach
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.sources import watched_frames
+from rigkit.coach.sources import frames_of_folders
 from rigkit.core.boards import Board
 from rigkit.core.errors import RigkitError
 from rigkit.interop.ocamcalib import read_py_ocamcalib
@@ -102,7 +102,7 @@ def coach_folder(path: Path) -> None:
         # Of long ago: nobody waits for it to be whole.
         os.utime(Path("watched") / name, (0.0, 0.0))
     coach = _coach()
-    coach_frames(coach, watched_frames([Path("watched")], until_idle_s=0.1), photos=True)
+    coach_frames(coach, frames_of_folders([Path("watched")], until_idle_s=0.1), photos=True)
     assert coach.guide.frames, "the picture after the damaged one was not looked at"
 
 

@@ -71,8 +71,8 @@ def lens_in_sigmas(found: Calibration, truth: Camera) -> list[float]:
     """Return the errors of the projection where boards were, after the rotation that no camera knows, (u and v)."""
     pixels = grid_pixels(SIZE, GRID).reshape(-1, 2)
     rays, known = truth.unproject(pixels)
-    told = covered_by_boards(found, pixels) & known & found.camera.unproject(pixels)[1]
-    pixels, rays = pixels[told], rays[told]
+    declared = covered_by_boards(found, pixels) & known & found.camera.unproject(pixels)[1]
+    pixels, rays = pixels[declared], rays[declared]
     turn = best_rotation(rays, pixels, np.ones(len(pixels)), found.camera)
     error = found.camera.project(rays @ turn.T)[0] - pixels
     variance = np.diagonal(projection_uncertainty(found, pixels).covariance, axis1=1, axis2=2)
@@ -121,12 +121,12 @@ def boards_session(name: str, images: int, common_px: float, whole: bool, rng: n
 
 def hand_session(name: str, images: int, common_px: float, whole: bool, rng: np.random.Generator) -> Errors:
     exact, rotations, translations = random_views(lens(name), images, rng, reach_deg=REACH_DEG[name], noise_px=0.0)
-    told = []
+    declared = []
     for rotation, translation in zip(rotations, translations, strict=True):
         true = CAM_FROM_HAND.inverse() @ Rigid3(rotation, translation) @ BASE_FROM_BOARD.inverse()
         turn = exp_so3(ROBOT_RAD * rng.normal(size=3))
-        told.append(Rigid3(turn @ true.rotation, true.translation_mm + ROBOT_MM * rng.normal(size=3)))
-    found = hand_eye(lens(name), [disturbed(view, common_px, whole, rng) for view in exact], told)
+        declared.append(Rigid3(turn @ true.rotation, true.translation_mm + ROBOT_MM * rng.normal(size=3)))
+    found = hand_eye(lens(name), [disturbed(view, common_px, whole, rng) for view in exact], declared)
     turns, moves = found.sigmas()
     out: Errors = {"hand-eye, turns": [], "hand-eye, places": []}
     pairs = ((found.cam_from_mount, CAM_FROM_HAND), (found.stand_from_board, BASE_FROM_BOARD))

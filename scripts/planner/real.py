@@ -86,7 +86,7 @@ class Images:
             np.inf if part is None else compare_cameras(self.full.camera, part.camera, grid=GRID, mask=self.mask).rms_px
         )
 
-    def told(self, knowledge: Knowledge) -> FloatArray:
+    def gains(self, knowledge: Knowledge) -> FloatArray:
         """Return what each image tells, as far as the lens is known."""
         return np.array([_of_image(view, knowledge) for view in self.views])
 
@@ -123,9 +123,9 @@ def choose_images(images: Images, start: list[int], count: int, way: Way) -> lis
             taken.append(left[0])
             continue
         known = _known(calibration, way)
-        told = images.told(known)
+        gains = images.gains(known)
         goal = projection_goal(calibration.camera, pixels=covered)
-        taken.append(left[choose_views(known.information + told[taken].sum(axis=0), told[left], goal, 1)[0][0]])
+        taken.append(left[choose_views(known.information + gains[taken].sum(axis=0), gains[left], goal, 1)[0][0]])
     return taken
 
 
@@ -157,39 +157,39 @@ def real(name: str, data: Path, cache: Path, draws: int, rows: dict[str, list[Ro
     """Choose among the images of a capture; print and keep how near the choices come to the calibration from all."""
     images = Images.of(name, data, cache)
     known = Knowledge.unseen(images.full)
-    told, goal = images.told(known), projection_goal(images.full.camera, pixels=images.covered)
+    gains, goal = images.gains(known), projection_goal(images.full.camera, pixels=images.covered)
     total = len(images.views)
     counts = [count for count in COUNTS if count < total]
     for count in counts if total > FEW_IMAGES else (total // 2, *counts):
         rng = np.random.default_rng(count)
-        anyhow = [rng.choice(total, count, replace=False).tolist() for _ in range(draws)]
-        free = np.array([images.error(chosen) for chosen in anyhow])
+        unplanned = [rng.choice(total, count, replace=False).tolist() for _ in range(draws)]
+        free = np.array([images.error(chosen) for chosen in unplanned])
         starts = [rng.choice(total, 2, replace=False).tolist() for _ in range(max(draws // 4, 4))]
         print(
             f"{name}, {images.full.camera.model}, board {images.full.boards[0].kind}, {count} of {total}: random "
             f"{np.median(free):.3f} px, the best of {draws} of them {free.min() / np.median(free):.2f} of that"
         )
         ways = {way.name: [choose_images(images, start, count, way) for start in starts] for way in WAYS}
-        ways[BEST] = [exchanged(known, told, goal, anyhow[0])]
+        ways[BEST] = [exchanged(known, gains, goal, unplanned[0])]
         for name_of_way, chosen in ways.items():
             own = np.array([images.error(c) for c in chosen])
             row = Row(
                 float(np.median(own) / np.median(free)),
                 100.0 * float(np.mean((free > own[:, None]) + 0.5 * (free == own[:, None]))),
-                *_if_true(known, told, goal, chosen, anyhow),
+                *_if_true(known, gains, goal, chosen, unplanned),
             )
             rows.setdefault(name_of_way, []).append(row)
             print(f"    {name_of_way:18s} {len({tuple(sorted(c)) for c in chosen}):2d} choices: {row}", flush=True)
 
 
-def exchanged(known: Knowledge, told: FloatArray, goal: Goal, chosen: list[int]) -> list[int]:
+def exchanged(known: Knowledge, gains: FloatArray, goal: Goal, chosen: list[int]) -> list[int]:
     """Return the choice of as many images with the smallest error, from `chosen` on, one image exchanged at a time."""
 
     def errors(choices: list[list[int]]) -> FloatArray:
-        return np.asarray(goal.error(covariance_of(known.information + told[np.array(choices)].sum(axis=1))))
+        return np.asarray(goal.error(covariance_of(known.information + gains[np.array(choices)].sum(axis=1))))
 
     while True:
-        left = [i for i in range(len(told)) if i not in chosen]
+        left = [i for i in range(len(gains)) if i not in chosen]
         others = [[*(i for i in chosen if i != out), new] for out in chosen for new in left]
         error, best = errors([chosen])[0], errors(others)
         if best.min() >= error * (1.0 - 1e-9):
@@ -198,14 +198,14 @@ def exchanged(known: Knowledge, told: FloatArray, goal: Goal, chosen: list[int])
 
 
 def _if_true(
-    known: Knowledge, told: FloatArray, goal: Goal, chosen: list[list[int]], anyhow: list[list[int]]
+    known: Knowledge, gains: FloatArray, goal: Goal, chosen: list[list[int]], unplanned: list[list[int]]
 ) -> tuple[FloatArray, FloatArray]:
     """Return ratios and parts (%) in sessions (2, S) whose images err as the covariance says, against the calibration
     from all images and against the lens. The sessions of a capture are the same for every row of it."""
     rng = np.random.default_rng(0)
     p = len(goal.weight)
-    scale = 1.0 / np.sqrt(np.diag(known.information + told.sum(axis=0)))
-    before, own = (m * scale[:, None] * scale for m in (known.information, told))
+    scale = 1.0 / np.sqrt(np.diag(known.information + gains.sum(axis=0)))
+    before, own = (m * scale[:, None] * scale for m in (known.information, gains))
     seen = _root(goal.weight * scale[:p, None] * scale[:p]).T
     scores = np.einsum("nij,njs->nis", _root(own), rng.standard_normal((*own.shape[:2], SESSIONS)))
     first = _root(before) @ rng.standard_normal((len(scale), SESSIONS))
@@ -214,9 +214,9 @@ def _if_true(
         moved = covariance_of(before + own[images].sum(axis=0)) @ (first + scores[images].sum(axis=0))
         return np.asarray(seen @ moved[:p])
 
-    whole = step(list(range(len(told))))
+    whole = step(list(range(len(gains))))
     against = np.stack([whole, np.zeros_like(whole)])
-    free, best = (np.array([np.linalg.norm(step(c) - against, axis=1) for c in own]) for own in (anyhow, chosen))
+    free, best = (np.array([np.linalg.norm(step(c) - against, axis=1) for c in own]) for own in (unplanned, chosen))
     ratio = np.median(best, axis=0) / np.median(free, axis=0)
     return ratio, 100.0 * np.mean([(free > errors).mean(axis=0) for errors in best], axis=0)
 

@@ -15,7 +15,7 @@ from rigkit.core.errors import RigkitError
 from rigkit.planning.goal import projection_goal
 from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, ALARM_PX, SentinelCheck
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import monitored_camera
 from sentinel.tally import CHANGED_PX, FRESH, KINDS, checked, tell, unchanged
 
 
@@ -55,8 +55,8 @@ def real(name: str, data: Path, cache: Path, draws: int) -> None:
 
 def touched(full: Calibration, what: str, rng: np.random.Generator) -> Camera:
     """Return a calibrated camera of any model after a change that leaves 0.15 px rms after the best rotation."""
-    watched = watched_camera(full, "camera")
-    (hypothesis,) = (c for c in hypotheses_of(watched) if c.kind == what)
+    monitored = monitored_camera(full, "camera")
+    (hypothesis,) = (c for c in hypotheses_of(monitored) if c.kind == what)
     amount = rng.standard_normal((hypothesis.directions.shape[1],))
     if what == "distortion":
         amount[1:] = 0.0

@@ -21,8 +21,8 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import covariance_of, plan_views
 from rigkit.validation.sentinel.baseline import judge_since
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, scene_matches
-from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, scene_matches
+from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.judge import SentinelCheck
 from sentinel.tally import SCENE_TURNED_DEG, tell, turned
 
@@ -40,7 +40,7 @@ class ScenePair:
 
     name: str
     group: str
-    rig: Watched
+    rig: Monitored
     matches: PairMatches
 
 
@@ -66,29 +66,29 @@ def _pair(entry: dict[str, object], data: Path) -> ScenePair:
     true = Rigid3(np.array(entry["cam2_from_cam1_R"]), BASELINE_MM * direction)
     images = [read_image(data / "scenes" / str(entry[key])) for key in ("image1", "image2")]
     size = sum(camera.parameters.size for camera in cameras) + 6
-    rig = Watched(
+    rig = Monitored(
         names=("left", "right"),
         cameras=cameras,
         cam_from_rig=(Rigid3.identity(), true),
         covariance=np.eye(size),
         sigma_px=BOARD_SIGMA_PX,
     )
-    rig = replace(rig, covariance=_as_boards_tell(rig))
+    rig = replace(rig, covariance=_covariance_from_boards(rig))
     return ScenePair(str(entry["name"]), str(entry["set"]), rig, scene_matches(rig, (0, 1), *images))
 
 
-def _camera(told: object) -> Camera:
-    assert isinstance(told, list)
-    kind, size, numbers = told
+def _camera(declared: object) -> Camera:
+    assert isinstance(declared, list)
+    kind, size, numbers = declared
     return camera_model(kind)(tuple(size), np.array(numbers))
 
 
-def _same(a: Watched, b: Watched) -> bool:
+def _same(a: Monitored, b: Monitored) -> bool:
     """Say whether two rigs are one: cameras and mounts."""
     return bool(np.allclose(a.cam_from_rig[1].matrix(), b.cam_from_rig[1].matrix()))
 
 
-def _as_boards_tell(rig: Watched) -> FloatArray:
+def _covariance_from_boards(rig: Monitored) -> FloatArray:
     """Return the covariance (T, T) of a rig that is calibrated with boards, planned for one camera after the other."""
     views: list[FreshView] = []
     for c, camera in enumerate(rig.cameras):
@@ -112,8 +112,8 @@ def _as_boards_tell(rig: Watched) -> FloatArray:
 def _check(pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: dict[str, list[SentinelCheck]]) -> None:
     check = _judged(pair.rig, before, pair.matches)
     found["nothing"].append(check)
-    said = f"{check.rms_px:.3f} px ({check.expected_px:.3f}), chance {check.chance:.2g}, {check.change}"
-    print(f"   {pair.group} {pair.name}: {said}", flush=True)
+    message = f"{check.rms_px:.3f} px ({check.expected_px:.3f}), chance {check.chance:.2g}, {check.change}"
+    print(f"   {pair.group} {pair.name}: {message}", flush=True)
     camera = pair.rig.cameras[1]
     for seed in range(seeds):
         turn = turned(Rigid3.identity(), SCENE_TURNED_DEG, np.random.default_rng([seed, 23])).rotation
@@ -122,7 +122,9 @@ def _check(pair: ScenePair, before: Sequence[PairMatches], seeds: int, found: di
         found["rotation"].append(_judged(pair.rig, before, moved))
 
 
-def _judged(rig: Watched, before: Sequence[PairMatches], now: PairMatches) -> SentinelCheck:
+def _judged(rig: Monitored, before: Sequence[PairMatches], now: PairMatches) -> SentinelCheck:
     if not before:
         return check_matches(rig, [now])
-    return judge_since(rig, lambda known: matches_say(known, before), lambda known: matches_say(known, [now]))
+    return judge_since(
+        rig, lambda known: evidence_of_matches(known, before), lambda known: evidence_of_matches(known, [now])
+    )

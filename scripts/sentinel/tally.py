@@ -14,7 +14,7 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3, unit
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import monitored_camera
 
 CHANGED_PX, SCENE_TURNED_DEG = 0.15, 0.05
 FRESH = 3
@@ -41,8 +41,8 @@ def tell(title: str, checks: Sequence[SentinelCheck], what: str, how: str = "") 
 
 
 def checked(known: Calibration, views: Sequence[BoardView]) -> SentinelCheck:
-    watched = watched_camera(known, "camera", **COUNTED)
-    return check_views(watched, [FreshView(v.image, 0, v) for v in views])
+    monitored = monitored_camera(known, "camera", **COUNTED)
+    return check_views(monitored, [FreshView(v.image, 0, v) for v in views])
 
 
 def unchanged(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, evaluate_pair
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 9, 19])
@@ -37,14 +37,14 @@ def test_verdicts() -> None:
     _, scene = equal_boards_pair(2)
     one, two = scene.detections()
     pairs = list(zip(one, two, strict=True))
-    assert judge_pair(scene, pairs, False) == PairVerdict.RIGHT
+    assert evaluate_pair(scene, pairs, False) == PairVerdict.RIGHT
     # Both turned alike, and under other names, is as right.
     alike = [(a.turned(2).named("x"), b.turned(2).named("x")) for a, b in pairs]
-    assert judge_pair(scene, alike, False) == PairVerdict.RIGHT
+    assert evaluate_pair(scene, alike, False) == PairVerdict.RIGHT
     turned = [*pairs[:2], (one[2], two[2].turned(2))]
-    assert judge_pair(scene, turned, False) == PairVerdict.WRONG
-    assert judge_pair(scene, turned, True) == PairVerdict.AMBIGUOUS
+    assert evaluate_pair(scene, turned, False) == PairVerdict.WRONG
+    assert evaluate_pair(scene, turned, True) == PairVerdict.AMBIGUOUS
     swapped = [(one[0], two[1]), (one[1], two[0]), pairs[2]]
-    assert judge_pair(scene, swapped, False) == PairVerdict.WRONG
-    assert judge_pair(scene, pairs[:2], False) == PairVerdict.INCOMPLETE
+    assert evaluate_pair(scene, swapped, False) == PairVerdict.WRONG
+    assert evaluate_pair(scene, pairs[:2], False) == PairVerdict.INCOMPLETE
     assert all(board.looks_same_turned for board in EQUAL_BOARDS)

@@ -290,9 +290,13 @@ def test_boards_that_keep_their_places_are_noticed(alike: bool, rng: np.random.G
         # As the program has them where no name can be told: every view shows a board of its own.
         views = [replace(v, board=replace(v.board, board_id=f"part {k}")) for k, v in enumerate(views)]
     result = calibrate(views, REG["reg"][0].size_px, model="brown", board="flat")
-    (said,) = suggest_ties(views, result)
-    assert "kept their places to each other in 5 images" in str(said)
-    assert ("3 boards of 8x6 corners" in str(said)) if alike else ('boards = ["floor", "left", "right"]' in str(said))
+    (printed,) = suggest_ties(views, result)
+    assert "kept their places to each other in 5 images" in str(printed)
+    assert (
+        ("3 boards of 8x6 corners" in str(printed))
+        if alike
+        else ('boards = ["floor", "left", "right"]' in str(printed))
+    )
 
 
 def test_boards_that_move_are_not_taken_for_mounted(rng: np.random.Generator) -> None:

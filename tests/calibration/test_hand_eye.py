@@ -47,12 +47,14 @@ def capture(
 ) -> tuple[list[BoardView], list[Rigid3]]:
     """Return views, and mount_from_stand as a robot that errs a little tells it."""
     views, rotations, translations = random_views(lens("reg"), count, rng, reach_deg=25.0, noise_px=0.1)
-    told = []
+    reported = []
     for rotation, translation in zip(rotations, translations, strict=True):
         true = X.inverse() @ Rigid3(rotation, translation) @ Z.inverse()
         turn = exp_so3(robot_noise * rng.normal(0.0, ROBOT_TURN_RAD, 3))
-        told.append(Rigid3(turn @ true.rotation, true.translation_mm + robot_noise * rng.normal(0.0, ROBOT_MOVE_MM, 3)))
-    return views, told
+        reported.append(
+            Rigid3(turn @ true.rotation, true.translation_mm + robot_noise * rng.normal(0.0, ROBOT_MOVE_MM, 3))
+        )
+    return views, reported
 
 
 def test_errors_are_within_their_sigmas(rng: np.random.Generator) -> None:
@@ -78,29 +80,29 @@ def test_two_sigmas_of_few_images_hold_nearly_all_errors(count: int, rng: np.ran
 
 
 def test_an_exact_robot_gives_an_exact_answer(rng: np.random.Generator) -> None:
-    views, told = capture(rng, robot_noise=0.0)
-    error = np.abs(errors(hand_eye(lens("reg"), views, told)))
+    views, reported = capture(rng, robot_noise=0.0)
+    error = np.abs(errors(hand_eye(lens("reg"), views, reported)))
     assert error[[0, 1, 2, 6, 7, 8]].max() < 1e-4 and error[[3, 4, 5, 9, 10, 11]].max() < 0.1
 
 
 def test_images_of_other_poses_are_left_out_and_named(rng: np.random.Generator) -> None:
-    views, told = capture(rng)
-    told[3], told[7] = told[7], told[3]
-    result = hand_eye(lens("reg"), views, told)
+    views, reported = capture(rng)
+    reported[3], reported[7] = reported[7], reported[3]
+    result = hand_eye(lens("reg"), views, reported)
     assert set(result.left_out) == {views[3].image, views[7].image}
     assert np.abs(errors(result)[3:6]).max() < 2.0
 
 
 def test_what_cannot_be_solved_is_said(rng: np.random.Generator) -> None:
-    views, told = capture(rng)
+    views, reported = capture(rng)
     with pytest.raises(InputError, match="same order"):
-        hand_eye(lens("reg"), views, told[1:] + told[:1])
+        hand_eye(lens("reg"), views, reported[1:] + reported[:1])
     with pytest.raises(InputError, match="the other way round"):
-        hand_eye(lens("reg"), views, [pose.inverse() for pose in told])
+        hand_eye(lens("reg"), views, [pose.inverse() for pose in reported])
     with pytest.raises(InputError, match="14 poses"):
-        hand_eye(lens("reg"), views, told[:14])
+        hand_eye(lens("reg"), views, reported[:14])
     with pytest.raises(DegenerateError, match="at least 3"):
-        hand_eye(lens("reg"), views[:2], told[:2])
+        hand_eye(lens("reg"), views[:2], reported[:2])
     about_z = [Rigid3(exp_so3(np.array([0.0, 0.0, 0.1 * k])), [0.0, 0.0, 600.0]) for k in range(8)]
     flat = []
     for k, pose in enumerate(about_z):
@@ -117,7 +119,7 @@ def test_a_second_axis_counts_by_how_certain_it_makes_the_place(rng: np.random.G
     camera = lens("reg")
     middle = random_views(camera, 1, rng, reach_deg=10.0, noise_px=0.1)[0][0].board.points().mean(axis=0)
     for _ in range(8):
-        views, told = [], []
+        views, reported = [], []
         for k in range(15):
             turn = exp_so3(np.radians([*rng.normal(0.0, 2.5, 2), 0.0])) @ exp_so3(np.array([0.0, 0.0, 0.2 * k]))
             place = np.array([*rng.uniform(-60.0, 60.0, 2), rng.uniform(600.0, 800.0)])
@@ -125,8 +127,8 @@ def test_a_second_axis_counts_by_how_certain_it_makes_the_place(rng: np.random.G
             board = random_views(camera, 1, rng, reach_deg=10.0, noise_px=0.1)[0][0].board
             views.append(noisy_view(camera, pose, f"{k}.png", rng, 0.1, board=board))
             true = X.inverse() @ pose @ Z.inverse()
-            told.append(Rigid3(exp_so3(rng.normal(0.0, ROBOT_TURN_RAD, 3)) @ true.rotation, true.translation_mm))
-        result = hand_eye(camera, views, told)
+            reported.append(Rigid3(exp_so3(rng.normal(0.0, ROBOT_TURN_RAD, 3)) @ true.rotation, true.translation_mm))
+        result = hand_eye(camera, views, reported)
         ratios.append(errors(result) / np.sqrt(np.diag(result.covariance)))
         sigmas.append(np.linalg.norm(result.sigmas()[1][0]))
     assert MAHALANOBIS[0] < float(np.sqrt(np.mean(np.square(ratios)))) < MAHALANOBIS[1]
@@ -138,9 +140,9 @@ def test_a_board_that_looks_the_same_turned_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.png").touch()
     poses = tmp_path / "poses.csv"
     poses.write_text("image,x_mm,y_mm,z_mm,qx,qy,qz,qw\na.png,0,0,0,0,0,0,1\n")
-    told = HandEyeOptions(camera=Path("camera.json"), board=Path("circles:9x6x30"))
+    reported = HandEyeOptions(camera=Path("camera.json"), board=Path("circles:9x6x30"))
     with pytest.raises(InputError, match="looks the same turned"):
-        calibrate_hand_eye(poses, [tmp_path], told)
+        calibrate_hand_eye(poses, [tmp_path], reported)
 
 
 def test_from_rendered_images_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

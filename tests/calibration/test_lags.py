@@ -73,7 +73,7 @@ def test_a_lag_is_solved_for(tmp_path: Path) -> None:
         assert abs(found.frames - lag) < 3.0 * found.sigma < abs(lag)
         assert abs(off) < min(3.0 * sigma, LEFT * without_mm)
         when = "after" if lag > 0.0 else "before"
-        assert any(f"of the time between two frames {when} 'left'" in said.message for said in rig.verdicts)
+        assert any(f"of the time between two frames {when} 'left'" in printed.message for printed in rig.verdicts)
     (tmp_path / "rig.json").write_text(rig_text(rig))
     first, second = json.loads((tmp_path / "rig.json").read_text())["cameras"]
     assert "lag" not in first

@@ -35,8 +35,8 @@ def test_shuffled_images_have_the_same_lens(name: str, seed: int) -> None:
         assert other.heldout_rms_px == pytest.approx(found[0].heldout_rms_px, rel=SAME)
         rays, _ = found[0].camera.unproject(np.concatenate([view.pixels for view in views]))
         assert np.abs(other.camera.project(rays)[0] - found[0].camera.project(rays)[0]).max() < SAME
-        usual = FarProjection.of(found[0], from_boards=True).usual_px
-        assert FarProjection.of(other, from_boards=True).usual_px == pytest.approx(usual, rel=1e-3)
+        typical = FarProjection.of(found[0], from_boards=True).usual_px
+        assert FarProjection.of(other, from_boards=True).usual_px == pytest.approx(typical, rel=1e-3)
 
 
 def boards_at(centres: FloatArray, rng: np.random.Generator) -> list[FloatArray]:
@@ -98,8 +98,8 @@ def test_two_cameras_are_found_or_not_in_any_order() -> None:
         own = np.array([places[k], beside @ places[k] - [60.0, 0.0, 0.0]]) + rng.normal(size=(2, 3)) * UNSURE_MM
         for name, turn, place in zip("ab", (rotations[k], beside @ rotations[k]), own, strict=True):
             both.append(replace(view, image=name + view.image, cam_from_board=Rigid3(turn, place)))
-    said = set()
+    printed = set()
     for _ in range(20):
         session = replace(found, views=tuple(both[k] for k in rng.permutation(len(both))))
-        said.add(bool(two_cameras(session, np.arange(len(both)))))
-    assert len(said) == 1
+        printed.add(bool(two_cameras(session, np.arange(len(both)))))
+    assert len(printed) == 1

@@ -34,8 +34,8 @@ def test_a_changed_lens_moves_the_pose_as_said(name: str) -> None:
         turned = log_so3(found.rotation @ POSE.rotation.T)
         moved = np.concatenate([turned, found.translation_mm - POSE.translation_mm])
         covariance = np.outer(step, step)
-        said = pose_covariance_of_lens(camera, covariance, in_cam, POSE.translation_mm, sigma_px)
+        printed = pose_covariance_of_lens(camera, covariance, in_cam, POSE.translation_mm, sigma_px)
         if np.abs(moved[3:]).max() > 1e-6:
             np.testing.assert_allclose(
-                np.sqrt(np.diag(said)), np.abs(moved), rtol=RELATIVE, atol=RELATIVE * np.abs(moved).max()
+                np.sqrt(np.diag(printed)), np.abs(moved), rtol=RELATIVE, atol=RELATIVE * np.abs(moved).max()
             )

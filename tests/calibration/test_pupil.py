@@ -30,7 +30,7 @@ from rigkit.core.findings import Severity
 NEAR, FAR = Board("near", 9, 6, 12.0, 12.0), Board("far", 9, 6, 120.0, 120.0)
 """They fill the image at 90 to 210 mm, and at ten times that."""
 MM_PER_RAD2, NOISE_PX = 1.5, 0.03
-TOLD = "the lens does not look from one point"
+MESSAGE = "the lens does not look from one point"
 
 
 def from_the_pupil(points_mm: Points, mm_per_rad2: float) -> Points:
@@ -83,10 +83,10 @@ def off_far_away(found: Calibration) -> float:
 def test_a_pupil_that_moves_is_found_and_what_it_does_far_away(shape: str) -> None:
     """Half of it, and no more than there is: corners that fit least are left out, and boards of free shape follow."""
     found = session(NEAR, MM_PER_RAD2, 0, shape)
-    assert found.verdicts[0].message.startswith("training RMS") and TOLD in found.verdicts[0].message
+    assert found.verdicts[0].message.startswith("training RMS") and MESSAGE in found.verdicts[0].message
     # The images all say the same: that something differs between them would be another cause.
-    said = judge(found, in_force=("model", "board_shape"))
-    assert not any("something differs between images" in one.message for one in said)
+    printed = judge(found, in_force=("model", "board_shape"))
+    assert not any("something differs between images" in one.message for one in printed)
     pupil, true = pupil_of(found), off_far_away(found)
     assert 0.4 * MM_PER_RAD2 < pupil.mm_per_rad2 < 1.1 * MM_PER_RAD2
     assert true > 1.0
@@ -97,7 +97,7 @@ def test_a_lens_that_looks_from_one_point_is_not_accused() -> None:
     for seed in range(4):
         found = session(NEAR, 0.0, seed, pupil="auto")
         assert found.pupil is None
-        assert TOLD not in str(found.verdicts)
+        assert MESSAGE not in str(found.verdicts)
         pupil = pupil_of(found)
         assert pupil.chance > BY_CHANCE
         assert abs(pupil.mm_per_rad2) < 0.1
@@ -109,20 +109,20 @@ def test_a_lens_unlike_its_model_is_no_pupil_that_moves(model: str, rng: np.rand
     views = random_views(lens("reg"), 20, rng, reach_deg=REACH_DEG["reg"], noise_px=0.05)[0]
     found = calibrate(views, SIZE, model=model, board="flat", folds=0)
     assert found.rms_px > 0.1
-    assert TOLD not in str(found.verdicts)
+    assert MESSAGE not in str(found.verdicts)
 
 
 def test_a_pupil_that_moves_is_not_taken_for_what_changes_from_image_to_image() -> None:
     """A pupil of 4 mm per rad^2 leaves residuals that each image's own shear follows as well as that of a motion."""
     found = session(NEAR, 4.0, 4)
     assert "row by row" in str(changing(found, neighbour_correlation(found)))
-    assert TOLD in found.verdicts[0].message and "row by row" not in str(found.verdicts)
+    assert MESSAGE in found.verdicts[0].message and "row by row" not in str(found.verdicts)
 
 
 def test_boards_far_away_do_not_show_a_pupil_that_moves() -> None:
     found = session(FAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
-    assert TOLD not in str(found.verdicts)
+    assert MESSAGE not in str(found.verdicts)
     assert off_far_away(found) < 0.2
 
 
@@ -131,7 +131,7 @@ def test_a_narrow_lens_leaves_its_pupil_open() -> None:
     views = random_views(lens("reg"), 12, rng, reach_deg=REACH_DEG["reg"], noise_px=0.05)[0]
     found = calibrate(views, SIZE, model="brown", board="flat", folds=0)
     pupil = pupil_of(found)
-    assert pupil.sigma_mm_per_rad2 > 0.1 and TOLD not in str(found.verdicts)
+    assert pupil.sigma_mm_per_rad2 > 0.1 and MESSAGE not in str(found.verdicts)
 
 
 @pytest.mark.parametrize("folds", [0, 5])
@@ -149,8 +149,8 @@ def test_a_pupil_that_moves_is_solved_for(folds: int) -> None:
     assert off_far_away(found) < 2.0 * far.usual_px < 0.2
     assert off_far_away(session(NEAR, MM_PER_RAD2, 0)) > 1.0
     assert found.rms_px < 1.1 * NOISE_PX * np.sqrt(2.0)
-    (said,) = (one for one in found.verdicts if TOLD in one.message)
-    assert said.severity is Severity.GOOD and f"{found.pupil.shift_mm(_rim(found))[0]:.2f} +- " in said.message
+    (printed,) = (one for one in found.verdicts if MESSAGE in one.message)
+    assert printed.severity is Severity.GOOD and f"{found.pupil.shift_mm(_rim(found))[0]:.2f} +- " in printed.message
     assert any(one.name == MOVING and one.chosen for one in found.candidates)
 
 
@@ -173,12 +173,12 @@ def test_the_pupil_is_neither_asked_for_nor_left_in_vain() -> None:
 
 
 def test_a_pupil_that_may_be_chance_is_not_kept_and_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rigkit.calibration.calibrate.surely_moves", lambda _: False)
+    monkeypatch.setattr("rigkit.calibration.calibrate.pupil_moves_significantly", lambda _: False)
     found = session(NEAR, MM_PER_RAD2, 0, pupil="auto")
     assert found.pupil is None
-    said = {c.name: c for c in found.candidates}
-    assert said[CENTRAL].chosen and said[CENTRAL].reason == "images do not surely agree that the pupil moves"
-    assert not said[MOVING].chosen and said[MOVING].reason == "by how much it moves may be chance"
+    printed = {c.name: c for c in found.candidates}
+    assert printed[CENTRAL].chosen and printed[CENTRAL].reason == "images do not surely agree that the pupil moves"
+    assert not printed[MOVING].chosen and printed[MOVING].reason == "by how much it moves may be chance"
     assert session(NEAR, MM_PER_RAD2, 0, pupil="moving").pupil is not None
 
 
@@ -224,7 +224,7 @@ def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
     rng, true = np.random.default_rng(1), NearCamera.of(lens("fish"), (3.0, -0.3))
     views, nearer = (
         random_views(true, count, rng, reach_deg=80.0, board=Board(name, 9, 6, mm, mm), noise_px=NOISE_PX)[0]
-        for name, count, mm in (("usual", 16, 16.0), ("nearer", 3, 4.0))
+        for name, count, mm in (("typical", 16, 16.0), ("nearer", 3, 4.0))
     )
     views += [replace(view, image=f"nearer {view.image}") for view in nearer]
     central, moving = (
@@ -238,13 +238,13 @@ def test_views_that_the_central_lens_leaves_out_are_taken_back() -> None:
 def test_it_does_not_matter_of_how_many_corners_rows_are_held(monkeypatch: pytest.MonkeyPatch) -> None:
     found = session(NEAR, MM_PER_RAD2, 0)
 
-    def told() -> FloatArray:
+    def reported() -> FloatArray:
         pupil, evidence = MovingPupil.of(found), view_evidence(found)
         assert pupil is not None
         assert evidence is not None
         return np.array([pupil.mm_per_rad2, pupil.sigma_mm_per_rad2, evidence.total, *evidence.along.ravel()])
 
-    whole = told()
+    whole = reported()
     # Two of the views, of 54 corners each, at once.
     monkeypatch.setattr("rigkit.calibration.judging.view_evidence.CORNERS_AT_ONCE", 120)
-    np.testing.assert_array_equal(told(), whole)
+    np.testing.assert_array_equal(reported(), whole)

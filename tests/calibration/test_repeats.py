@@ -15,7 +15,7 @@ from rigkit.core.arrays import FloatArray
 def test_close_pairs_are_those_of_all_with_all(
     count: int, room: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(kernel, "USUAL_PARTNERS", room)
+    monkeypatch.setattr(kernel, "TYPICAL_PARTNERS", room)
     points: FloatArray = rng.integers(0, 40, (count, 3)).astype(np.float64) * 0.25
     apart = np.abs(points[:, None] - points).max(axis=2)
     expected = np.argwhere(np.triu(apart <= 0.5, 1))

@@ -63,9 +63,9 @@ def solved(views: Views, boards: tuple[Board, ...] = (), board: str = "flat", fo
 def test_what_all_corners_of_a_camera_are_said_to_be_off_by_says_nothing(rng: np.random.Generator) -> None:
     """A camera's noise is what it leaves: sigmas that are five times too large for all its corners change nothing."""
     views = board_views(rng, 12)
-    said = {name: [(f, replace(v, sigma_px=(5.0 if name == "wide" else 1.0) * v.sigma_px)) for f, v in own]
+    printed = {name: [(f, replace(v, sigma_px=(5.0 if name == "wide" else 1.0) * v.sigma_px)) for f, v in own]
             for name, own in views.items()}  # fmt: skip
-    one, other = solved(views), solved(said)
+    one, other = solved(views), solved(printed)
     assert other.sigma_px == pytest.approx(one.sigma_px, rel=1e-6)
     assert np.allclose(other.cameras[1].cam_from_rig.matrix(), one.cameras[1].cam_from_rig.matrix(), atol=1e-4)
 

@@ -123,7 +123,7 @@ def test_the_rig_follows_a_departure_as_a_new_fit_does(rng: np.random.Generator)
     assert np.abs(expected[-12:]).max() > 0.02
 
 
-def mounts_apart(a: Path, b: Path) -> float:
+def mount_differences(a: Path, b: Path) -> float:
     """Return the chance of the difference of two rigs' mounts."""
     found = diff(a, b)
     assert isinstance(found, RigPair) and found.mounts.chance is not None
@@ -144,14 +144,14 @@ def test_a_rig_file_says_what_lenses_may_do_beyond_their_models(rng: np.random.G
     # What lenses may do moves mounts: a difference of theirs is less of a surprise.
     other = tmp_path / "other.json"
     other.write_text(rig_text(calibrated(rig_views(rng, 8))))
-    found = mounts_apart(path, other)
+    found = mount_differences(path, other)
     # A file of before files said so, and damaged ones.
     for old in (path, other):
         data = json.loads(old.read_text())
         for camera in data["cameras"]:
             camera.pop("departures")
         (tmp_path / f"old-{old.name}").write_text(json.dumps(data))
-    assert found > mounts_apart(tmp_path / "old-rig.json", tmp_path / "old-other.json")
+    assert found > mount_differences(tmp_path / "old-rig.json", tmp_path / "old-other.json")
     data = json.loads(path.read_text())
     for camera in data["cameras"]:
         camera.pop("departures")

@@ -76,9 +76,9 @@ def test_nothing_in_common_is_said(frames: int, rng: np.random.Generator) -> Non
     seen = [frame for frame, _ in views["wide"]]
     shuffled = dict(zip(seen, np.roll(seen, max(1, frames // 5)).tolist(), strict=True))
     views["wide"] = [(shuffled[frame], view) for frame, view in views["wide"]]
-    with pytest.raises(DegenerateError, match="taken at one moment, and none is among those of another") as told:
+    with pytest.raises(DegenerateError, match="taken at one moment, and none is among those of another") as reported:
         calibrate_rig(views, sizes(), model=MODELS, folds=0)
-    assert "e+0" not in str(told.value)
+    assert "e+0" not in str(reported.value)
 
 
 def moved_once(views: Views, by_mm: float, rng: np.random.Generator) -> tuple[Views, str]:

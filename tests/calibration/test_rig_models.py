@@ -50,12 +50,12 @@ def test_a_rival_widens_the_baseline_by_its_own_difference(
 
 
 @pytest.mark.parametrize(
-    ("alone", "together", "said"), [((0.1, 0.2), 0.3, True), ((0.1, 0.2), 0.16, False), ((0.1, None), 0.3, False)]
+    ("alone", "together", "printed"), [((0.1, 0.2), 0.3, True), ((0.1, 0.2), 0.16, False), ((0.1, None), 0.3, False)]
 )
 def test_frames_that_took_no_part_against_the_cameras_alone(
-    alone: tuple[float | None, ...], together: float, said: bool
+    alone: tuple[float | None, ...], together: float, printed: bool
 ) -> None:
     """What a camera alone comes to is not known where its images were too few to hold some out."""
     single = [SimpleNamespace(heldout_rms_px=value) for value in alone]
     rig = SimpleNamespace(single=single, cameras=single, heldout_rms_px=together)
-    assert bool(_worse(cast(RigCalibration, rig))) == said
+    assert bool(_worse(cast(RigCalibration, rig))) == printed

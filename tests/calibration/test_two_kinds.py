@@ -22,7 +22,7 @@ def seen(camera: Camera, count: int, rng: np.random.Generator, first: int = 0) -
     return [replace(view, image=f"{first + k:03d}.png") for k, view in enumerate(views)]
 
 
-def told(views: list[BoardView], rng: np.random.Generator, model: str = "brown") -> tuple[str, list[str]]:
+def reported(views: list[BoardView], rng: np.random.Generator, model: str = "brown") -> tuple[str, list[str]]:
     """Return the first verdict and all, of images in any order."""
     verdicts = calibrate([views[k] for k in rng.permutation(len(views))], SIZE, model=model, board="flat").verdicts
     assert verdicts[0].severity is not Severity.GOOD
@@ -59,7 +59,7 @@ def mirrored(view: BoardView) -> BoardView:
 def test_some_images_without_their_distortion(rng: np.random.Generator) -> None:
     camera = lens("reg")
     views = [without_distortion(v, camera) if k % 2 == 0 else v for k, v in enumerate(seen(camera, 18, rng))]
-    first, _ = told(views, rng)
+    first, _ = reported(views, rng)
     assert f"{KINDS}, as if two lenses had taken them, or one at two settings: " in first
     assert first.count(": 9 like '") == 1 and " and 9 like '" in first
     assert "undistorted" in first and "as if some were" not in first
@@ -71,7 +71,7 @@ def test_some_pictures_mirrored(flip: str, rng: np.random.Generator) -> None:
     views = [mirrored(v) if k % 2 else v for k, v in enumerate(seen(off_the_middle(), 20, rng))]
     if flip == "top to bottom":
         views = [turned(v) if k % 2 else v for k, v in enumerate(views)]
-    first, every = told(views, rng)
+    first, every = reported(views, rng)
     assert f"10 of 20 images are mirrored {flip}" in first
     assert not any("stabilisation" in verdict or "rolling shutter" in verdict for verdict in every)
 
@@ -110,7 +110,7 @@ def test_a_stabilised_picture_is_not_turned(spread: str, rng: np.random.Generato
         amounts = 20.0 * (rng.normal(size=16) if spread == "normal" else rng.uniform(-1.7, 1.7, size=16))
         views = seen(camera, 16, rng)
         moved = [replace(v, pixels=v.pixels + np.array([far, -far])) for v, far in zip(views, amounts, strict=True)]
-        _, every = told([on_image(v, camera) for v in moved], rng)
+        _, every = reported([on_image(v, camera) for v in moved], rng)
         assert not any("half a turn" in verdict for verdict in every)
 
 
@@ -122,7 +122,7 @@ def test_a_focus_that_wanders_is_of_no_two_kinds(spread: str, rng: np.random.Gen
             longer = 1.0 + 0.01 * (rng.normal() if spread == "normal" else rng.uniform(-1.7, 1.7))
             camera = lens("reg")
             views += seen(camera.with_parameters(camera.parameters * [longer, longer, *[1.0] * 7]), 1, rng, first=k)
-        first, _ = told(views, rng)
+        first, _ = reported(views, rng)
         assert KINDS not in first and "the focal length differs from image to image" in first
 
 
@@ -130,7 +130,7 @@ def test_boards_left_and_right_before_a_lens_unlike_its_model(rng: np.random.Gen
     """What tells the images apart is where the boards were, and that explains it as well."""
     views = seen(lens("reg"), 80, rng)
     order = np.argsort([view.pixels[:, 0].mean() for view in views])
-    _, every = told([views[k] for k in (*order[:12], *order[-12:])], rng, model="pinhole")
+    _, every = reported([views[k] for k in (*order[:12], *order[-12:])], rng, model="pinhole")
     assert not any(KINDS in verdict for verdict in every)
 
 
@@ -139,7 +139,7 @@ def test_a_third_of_the_images_contradicts_the_others(rng: np.random.Generator) 
     camera = lens("reg")
     views = seen(camera, 18, rng)
     some = [without_distortion(v, camera) if k % 3 == 0 else v for k, v in enumerate(views)]
-    first, every = told(some, rng)
+    first, every = reported(some, rng)
     assert "but 6 of 18 images contradict the others and are left out" in first and "undistorted" in first
     assert not any("is left out:" in verdict for verdict in every)
     two = [without_distortion(v, camera) if k in (4, 9) else v for k, v in enumerate(views)]
@@ -163,6 +163,6 @@ def test_copies_of_images_are_no_kind_of_their_own() -> None:
         rng = np.random.default_rng(seed)
         views = [*seen(camera, 6, rng), *seen(zoomed, 2, rng, first=6)]
         copies = [replace(view, image=f"{ending} {view.image}") for ending in ("jpg", "JPG", "png") for view in views]
-        _, every = told(copies, rng)
+        _, every = reported(copies, rng)
         assert not any(KINDS in verdict for verdict in every)
         assert any("show the board where another one does" in verdict for verdict in every)

@@ -13,7 +13,7 @@ from helpers.calibration_scenes import BOARD, SIZE, lens, random_views
 from rigkit.calibration.calibrate import calibrate
 from rigkit.calibration.judging import verdicts
 from rigkit.calibration.judging.changing import CHANGES
-from rigkit.calibration.judging.verdicts import judge_session
+from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.fit import fit_model, identifiable
 from rigkit.calibration.solving.linearise import normal_equations
@@ -21,7 +21,7 @@ from rigkit.calibration.solving.normal_equations import NormalEquations
 from rigkit.calibration.solving.solver import with_priors
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
-from rigkit.calibration.views.usable import GRIDS_BESIDE
+from rigkit.calibration.views.usable import OTHER_GRIDS
 from rigkit.cameras.eucm import EUCM
 from rigkit.core.boards import Board
 from rigkit.core.errors import DegenerateError
@@ -30,7 +30,7 @@ from rigkit.io.manifests.session import Session
 from rigkit.workflows.calibration.calibrate_rig import judged
 
 
-def said(result: Calibration, words: str) -> bool:
+def printed(result: Calibration, words: str) -> bool:
     return any(words in str(verdict) for verdict in result.verdicts)
 
 
@@ -39,25 +39,25 @@ def test_sound_views_are_called_good(rng: np.random.Generator) -> None:
     result = calibrate(views, SIZE, model="brown")
     assert str(result.verdicts[0]).startswith("good: held-out RMS")
     assert worst(result.verdicts) is not Severity.BAD
-    assert not said(result, "neighbouring") and not said(result, "unlike") and not said(result, "retake")
+    assert not printed(result, "neighbouring") and not printed(result, "unlike") and not printed(result, "retake")
 
 
 def test_too_few_tilts_and_empty_corners(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=12.0, tilt_deg=(0.0, 3.0))
     result = calibrate(views, SIZE, model="brown", board="flat")
-    assert said(result, "tilted by more than") and result.verdicts[0].severity is Severity.BAD
-    assert said(result, "where the boards were, most in the")
-    assert said(result, "no corners in the whole left, whole right")
+    assert printed(result, "tilted by more than") and result.verdicts[0].severity is Severity.BAD
+    assert printed(result, "where the boards were, most in the")
+    assert printed(result, "no corners in the whole left, whole right")
 
 
-@pytest.mark.parametrize(("tilt_deg", "told"), [((0.0, 3.0), False), ((10.0, 45.0), True)])
+@pytest.mark.parametrize(("tilt_deg", "reported"), [((0.0, 3.0), False), ((10.0, 45.0), True)])
 def test_boards_all_alike_tell_no_motion(
-    tilt_deg: tuple[float, float], told: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+    tilt_deg: tuple[float, float], reported: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They leave a lens open whose misfit looks like a motion, or a zoom, of each image."""
     monkeypatch.setattr(verdicts, "changing", lambda *_: [CHANGES["rows"]])
     views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=20.0, tilt_deg=tilt_deg)
-    assert said(calibrate(views, SIZE, model="brown", board="flat"), "rolling shutter") == told
+    assert printed(calibrate(views, SIZE, model="brown", board="flat"), "rolling shutter") == reported
 
 
 def test_boards_that_face_a_fisheye_from_all_sides_are_tilted_enough(rng: np.random.Generator) -> None:
@@ -71,7 +71,7 @@ def test_moved_lens(rng: np.random.Generator) -> None:
     views, _, _ = random_views(first, 10, rng, reach_deg=33.0)
     later, _, _ = random_views(second, 10, rng, reach_deg=33.0)
     views += [replace(v, image=f"later{v.image}") for v in later]
-    assert said(calibrate(views, SIZE, model="brown", board="flat"), "from 'later000.png' on")
+    assert printed(calibrate(views, SIZE, model="brown", board="flat"), "from 'later000.png' on")
 
 
 def test_a_bent_board_shown_in_order_is_no_moved_lens(rng: np.random.Generator) -> None:
@@ -81,27 +81,27 @@ def test_a_bent_board_shown_in_order_is_no_moved_lens(rng: np.random.Generator) 
     for order in (rotation[:, 0, 2], np.array([view.pixels[:, 0].mean() for view in views])):
         shown = [replace(views[i], image=f"{k:02d}.png") for k, i in enumerate(np.argsort(order))]
         result = calibrate(shown, SIZE, model="brown", board="flat")
-        assert said(result, "neighbouring corners agree") and not said(result, "focus, zoom or mount moved")
+        assert printed(result, "neighbouring corners agree") and not printed(result, "focus, zoom or mount moved")
 
 
 def test_wrong_aspect_and_bent_board(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, points_mm=Board("b", 9, 6, 30.2, 30.0).points())
-    assert said(calibrate(views, SIZE, model="brown", board="warp"), "longer in x than stated")
+    assert printed(calibrate(views, SIZE, model="brown", board="warp"), "longer in x than stated")
     bent = BOARD.points()
     bent[:, 2] = 2.0 * (1.0 - ((bent[:, 0] - 120.0) / 120.0) ** 2)
     views, _, _ = random_views(lens("reg"), 20, rng, reach_deg=33.0, points_mm=bent)
     flat = calibrate(views, SIZE, model="brown", board="flat")
-    assert said(flat, "neighbouring corners agree")
+    assert printed(flat, "neighbouring corners agree")
     shaped = calibrate(views, SIZE, model="brown")
-    assert shaped.boards[0].kind != "flat" and said(shaped, "departs from a plane")
-    assert not said(shaped, "neighbouring corners agree")
+    assert shaped.boards[0].kind != "flat" and printed(shaped, "departs from a plane")
+    assert not printed(shaped, "neighbouring corners agree")
 
 
 def test_few_images_and_one_bad_view(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 6, rng, reach_deg=33.0)
     shaken = replace(views[2], pixels=views[2].pixels + 0.8 * rng.normal(size=(54, 2)))
     result = calibrate([*views[:2], shaken, *views[3:]], SIZE, model="brown", board="flat")
-    assert said(result, "6 images") and said(result, "'002.png' has a median residual")
+    assert printed(result, "6 images") and printed(result, "'002.png' has a median residual")
 
 
 def test_a_board_that_moved_during_the_exposure(rng: np.random.Generator) -> None:
@@ -109,7 +109,7 @@ def test_a_board_that_moved_during_the_exposure(rng: np.random.Generator) -> Non
     jump = np.where(np.arange(54) > 26, 2.0, 0.0)[:, None]
     views[7] = replace(views[7], pixels=np.clip(views[7].pixels + jump, 0.0, np.array(SIZE) - 1.0))
     result = calibrate(views, SIZE, model="brown", board="flat")
-    assert said(result, "image '007.png' has") and said(result, "retake it")
+    assert printed(result, "image '007.png' has") and printed(result, "retake it")
     assert [v.image for v in result.verdicts if v.image] == ["007.png"]
 
 
@@ -123,33 +123,35 @@ def test_more_scatter_at_the_rim_is_not_a_bad_view(rng: np.random.Generator) -> 
         noise = 0.3 * share[:, None] * rng.normal(size=view.pixels.shape)
         rough.append(replace(view, pixels=np.clip(view.pixels + noise, 0.0, np.array(SIZE) - 1.0)))
     result = calibrate(rough, SIZE, model="kannala_brandt", board="flat")
-    assert not said(result, "retake it")
+    assert not printed(result, "retake it")
 
 
 def test_a_lens_that_no_model_tried_fits(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("fish"), 20, rng, reach_deg=92.5)
     brown = calibrate(views, SIZE, model="brown")
-    assert said(brown, 'try model = "auto"')
+    assert printed(brown, 'try model = "auto"')
     # A camera's file of a rig has its own verdicts.
     asked: dict[str, Any] = {"path": Path("s.toml"), "images": (), "boards": (), "degree": None, "board_shape": "auto"}
     of_a_rig = [judged(brown, Session(model=model, **asked)) for model in ("brown", "auto")]
-    assert [said(one, 'try model = "auto"') for one in of_a_rig] == [True, False]
-    assert said(of_a_rig[1], "neither the lens models nor the boards' shapes follow all of it")
+    assert [printed(one, 'try model = "auto"') for one in of_a_rig] == [True, False]
+    assert printed(of_a_rig[1], "neither the lens models nor the boards' shapes follow all of it")
 
 
 def test_images_left_out_are_named(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 12, rng, reach_deg=33.0)
     wrong = replace(views[3], pixels=np.clip(views[3].pixels + 30.0 * rng.normal(size=(54, 2)), 0.0, [1623.0, 1239.0]))
     result = calibrate([*views[:3], wrong, *views[4:]], SIZE, model="brown", board="flat")
-    assert said(result, "image '003.png' is left out: only")
-    session = judge_session(result, [("a.png", "800x600 px, most images with boards have 1624x1240")])
+    assert printed(result, "image '003.png' is left out: only")
+    session = diagnose_session(result, [("a.png", "800x600 px, most images with boards have 1624x1240")])
     assert session[0] == result.verdicts[0] and "'a.png' is left out: 800x600 px" in session[1].message
-    many = judge_session(result, [(f"{i}.png", "no board found") for i in range(5)])
+    many = diagnose_session(result, [(f"{i}.png", "no board found") for i in range(5)])
     assert "5 images are left out, '0.png' the first: no board found" in many[1].message
     # Of an image that is used only something is left out; what lies beside the board is no cause to look.
-    assert judge_session(result, [("000.png", GRIDS_BESIDE)]) == result.verdicts
-    assert "of image '000.png' something is left out: bent" in judge_session(result, [("000.png", "bent")])[1].message
-    assert result.images_left_out == 1 and replace(result, dropped=(("000.png", GRIDS_BESIDE),)).images_left_out == 0
+    assert diagnose_session(result, [("000.png", OTHER_GRIDS)]) == result.verdicts
+    assert (
+        "of image '000.png' something is left out: bent" in diagnose_session(result, [("000.png", "bent")])[1].message
+    )
+    assert result.images_left_out == 1 and replace(result, dropped=(("000.png", OTHER_GRIDS),)).images_left_out == 0
 
 
 def test_hundredths_of_a_pixel_are_no_reason_to_retake(rng: np.random.Generator) -> None:
@@ -158,7 +160,7 @@ def test_hundredths_of_a_pixel_are_no_reason_to_retake(rng: np.random.Generator)
         rough = views[i].pixels + some[:, None] * rng.choice([-1.0, 1.0], size=(54, 2))
         views[i] = replace(views[i], pixels=np.clip(rough, 0.0, np.array(SIZE) - 1.0))
     result = calibrate(views, SIZE, model="brown", board="flat")
-    assert len(result.outliers) > 10 and not said(result, "retake") and not said(result, "outliers")
+    assert len(result.outliers) > 10 and not printed(result, "retake") and not printed(result, "outliers")
 
 
 def test_repeated_images_count_as_one(rng: np.random.Generator) -> None:
@@ -166,7 +168,7 @@ def test_repeated_images_count_as_one(rng: np.random.Generator) -> None:
     noisy = [replace(v, image=f"again {v.image}", pixels=v.pixels + 0.02 * rng.normal(size=(54, 2))) for v in views]
     once = calibrate(views, SIZE, model="brown", board="flat")
     twice = calibrate([*views, *noisy], SIZE, model="brown", board="flat")
-    assert said(twice, "show the board where another one does") and not said(once, "where another one does")
+    assert printed(twice, "show the board where another one does") and not printed(once, "where another one does")
     # The same images again say nothing new: independent corners would promise a factor of 0.7.
     assert np.median(twice.parameter_sigmas / once.parameter_sigmas) > 0.85
 
@@ -203,7 +205,7 @@ def test_two_images_are_not_good(rng: np.random.Generator) -> None:
     views, _, _ = random_views(lens("reg"), 3, rng, reach_deg=33.0)
     result = calibrate(views, SIZE, model="brown", board="flat")
     assert result.verdicts[0].severity is not Severity.GOOD
-    assert judge_session(result, [])[0].severity is not Severity.GOOD
+    assert diagnose_session(result, [])[0].severity is not Severity.GOOD
 
 
 def test_the_part_of_the_image_is_named(rng: np.random.Generator) -> None:

@@ -110,8 +110,8 @@ def test_what_boards_the_same_way_up_leave_open(rng: np.random.Generator) -> Non
     tilts[::2, 2] += np.pi / 2.0
     for own, provided in ((views, True), (seen(lens("reg"), *poses(rng, 20, tilts), rng), False)):
         longer = [replace(v, board=replace(v.board, square_x_mm=0.99 * v.board.square_x_mm)) for v in own]
-        said = str(calibrate(longer, SIZE, model="brown", board="warp").verdicts)
-        assert "longer in x than stated" in said and ("if pixels are square" in said) == provided
+        printed = str(calibrate(longer, SIZE, model="brown", board="warp").verdicts)
+        assert "longer in x than stated" in printed and ("if pixels are square" in printed) == provided
 
 
 def test_boards_at_one_distance(rng: np.random.Generator) -> None:
@@ -158,8 +158,8 @@ def test_no_remedy_that_is_in_force(rng: np.random.Generator) -> None:
         wave = np.stack([np.sin(4.0 * x + k), np.cos(3.0 * y - k)], axis=-1)
         views.append(replace(view, pixels=np.clip(view.pixels + 0.5 * wave, 0.0, np.array(SIZE) - 1.0)))
     assert len(bent) == len(views[0].grid)
-    said = str(calibrate(views, SIZE, model="auto", board="auto").verdicts)
-    assert "neighbouring corners agree" in said and '"auto"' not in said
+    printed = str(calibrate(views, SIZE, model="auto", board="auto").verdicts)
+    assert "neighbouring corners agree" in printed and '"auto"' not in printed
     assert 'board_shape = "auto"' in str(calibrate(views, SIZE, model="auto", board="flat").verdicts)
     assert 'model = "auto"' in str(calibrate(views, SIZE, model="brown", board="auto").verdicts)
 
@@ -347,9 +347,9 @@ def test_a_zoom_is_not_taken_for_a_motion(again: str, rng: np.random.Generator) 
             view = random_views(own, 1, rng, reach_deg=33.0, noise_px=0.03, points_mm=bent)[0][0]
             views.append(replace(view, image=f"{k:03d}.png"))
         found = calibrate(views, SIZE, model="brown", folds=0)
-        told = str(found.verdicts)
-        assert "rolling shutter" not in told and "is bent otherwise" not in told and "shifted" not in told
-        named += "the focal length differs from image to image" in told or "(focal lengths " in told
+        reported = str(found.verdicts)
+        assert "rolling shutter" not in reported and "is bent otherwise" not in reported and "shifted" not in reported
+        named += "the focal length differs from image to image" in reported or "(focal lengths " in reported
     assert named >= 3
 
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.cameras import sample_cameras
 
 from rigkit.cameras.base import Camera
-from rigkit.cameras.board_pose import board_from_afar, cam_from_seen_board
+from rigkit.cameras.board_pose import board_with_fixed_pupil, cam_from_seen_board
 from rigkit.cameras.moving_pupil import NearCamera, far_camera, pupil_shift_of_rays_mm
 from rigkit.core.arrays import FloatArray
 from rigkit.core.boards import Board
@@ -86,5 +86,5 @@ def test_a_board_is_where_it_is_and_not_where_a_central_camera_has_it() -> None:
     np.testing.assert_allclose(found.rotation, pose.rotation, atol=1e-7)
     central = cam_from_seen_board(near.lens, pixels, board.points())
     assert np.linalg.norm(central.translation_mm - pose.translation_mm) > 1.0
-    afar = board_from_afar(near, pixels, board.points())
-    np.testing.assert_allclose(afar, near.lens.project(pose.apply(board.points()))[0], atol=1e-5)
+    fixed_pupil = board_with_fixed_pupil(near, pixels, board.points())
+    np.testing.assert_allclose(fixed_pupil, near.lens.project(pose.apply(board.points()))[0], atol=1e-5)

@@ -24,7 +24,7 @@ def test_lenses(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "at", "value", "said"),
+    ("model", "at", "value", "printed"),
     [
         ("pinhole", 0, 1e-3, "focal length"),
         ("pinhole", 0, 1e9, "focal length"),
@@ -37,7 +37,7 @@ def test_lenses(model: str) -> None:
         ("double_sphere", 1, 1e-9, "focal length"),
     ],
 )
-def test_no_lens(model: str, at: int, value: float, said: str) -> None:
+def test_no_lens(model: str, at: int, value: float, printed: str) -> None:
     parameters = np.array(LENSES[model])
     parameters[at] = value
-    assert said in str(fault_of_lens(camera_model(model)((640, 480), parameters)))
+    assert printed in str(fault_of_lens(camera_model(model)((640, 480), parameters)))

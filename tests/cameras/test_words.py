@@ -13,6 +13,6 @@ def test_a_camera_says_its_numbers_by_name(label: str) -> None:
     camera = CAMERAS[label]
     head, _, values = repr(camera).removesuffix(")").partition(": ")
     assert head == f"{type(camera).__name__}({camera.size_px[0]}x{camera.size_px[1]} px"
-    said = dict(value.split("=") for value in values.split(", "))
-    assert tuple(said) == camera.parameter_names()
-    assert [float(value) for value in said.values()] == pytest.approx(camera.parameters.tolist(), rel=1e-5)
+    printed = dict(value.split("=") for value in values.split(", "))
+    assert tuple(printed) == camera.parameter_names()
+    assert [float(value) for value in printed.values()] == pytest.approx(camera.parameters.tolist(), rel=1e-5)

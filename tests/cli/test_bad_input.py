@@ -240,11 +240,11 @@ def test_two_boards_are_reconstructed_and_the_third_is_said_to_be_missing(
     cv2.imwrite(str(tmp_path / "two.png"), cv2.fillConvexPoly(image.copy(), hull, 90))
     folder = write(image2="two.png")
     code = main(["reconstruct", str(folder), "-o", str(folder / "out"), "-j", "1"])
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert code == 0
     assert len(list((folder / "out").rglob("*.png"))) == 3
-    assert "96 points, 2 boards" in said.out
-    assert "seen in image 1 only" in said.err
+    assert "96 points, 2 boards" in printed.out
+    assert "seen in image 1 only" in printed.err
 
 
 def test_negative_seed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -326,7 +326,7 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "reported"),
     [
         ("coach new --board 9x6x25 --port 99999999", "port 99999999"),
         ("coach new --board 9x6x25 --lens 400", "400 degrees"),
@@ -348,7 +348,7 @@ def test_numbers_that_overflow_are_told_in_one_line(tmp_path: Path) -> None:
     ],
 )
 def test_options_of_one_verb(
-    words: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: str, reported: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     places = {
         "LENS": CALIBRATION,
@@ -358,7 +358,7 @@ def test_options_of_one_verb(
     }
     monkeypatch.chdir(tmp_path)
     code = main([str(places.get(word, word)) for word in words.split()])
-    check(code, capsys.readouterr().err.strip(), 2, told)
+    check(code, capsys.readouterr().err.strip(), 2, reported)
     assert not list(tmp_path.glob("*.*"))
 
 
@@ -366,5 +366,5 @@ def test_an_unknown_option_shows_the_usage_of_its_verb(capsys: pytest.CaptureFix
     with pytest.raises(SystemExit) as stop:
         main(["diff", "a.json", "b.json", "--nonsense"])
     assert stop.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in said
+    printed = capsys.readouterr().err
+    assert printed.startswith("usage: rigkit diff") and "unrecognized arguments: --nonsense" in printed

@@ -58,17 +58,17 @@ def test_a_board_keeps_its_name(board: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "printed"),
     [
         (["--ruler-x-mm", "249"], "both rulers"),
         (["--ruler-x-mm", "24.9", "--ruler-y-mm", "16.9"], "cannot measure"),
         (["--ruler-x-mm", "249", "--ruler-y-mm", "159"], "check the readings"),
     ],
 )
-def test_misread_rulers(board: Path, options: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_misread_rulers(board: Path, options: list[str], printed: str, capsys: pytest.CaptureFixture[str]) -> None:
     before = board.read_bytes()
     assert main(["board", str(board), *options]) == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
     assert board.read_bytes() == before
 
 

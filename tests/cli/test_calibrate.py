@@ -48,10 +48,10 @@ def session(tmp_path: Path) -> Path:
 
 def test_from_images_to_file_and_again_without_images(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(session), "--json", "--report"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     assert (session.parent / "calibration.html").read_text().count("data:image/jpeg") == 5
     result = load_calibration(session.parent / "calibration.json")
-    assert told["model"] == "kannala_brandt" and told["rms_px"] == result.rms_px < GOOD_RMS_PX
+    assert reported["model"] == "kannala_brandt" and reported["rms_px"] == result.rms_px < GOOD_RMS_PX
     assert len(result.views) == 5 and result.dropped == ()
     assert result.heldout_rms_px is not None
 
@@ -65,9 +65,9 @@ def test_from_images_to_file_and_again_without_images(session: Path, capsys: pyt
         path.unlink()
     assert main(["calibrate", str(session), "--force", "-r", str(session.parent / "page.html")]) == 0
     assert "gone; the corners kept" in (session.parent / "page.html").read_text()
-    said = capsys.readouterr()
-    assert "held-out RMS" in said.out
-    assert "no image matches 'images'; the corners of 5 images kept in corners.json are used" in said.err
+    printed = capsys.readouterr()
+    assert "held-out RMS" in printed.out
+    assert "no image matches 'images'; the corners of 5 images kept in corners.json are used" in printed.err
     again = load_calibration(session.parent / "calibration.json")
     assert np.array_equal(again.camera.parameters, result.camera.parameters)
 
@@ -144,8 +144,8 @@ def test_bad_input(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
     board.write_text(BOARD.replace("rows = 6", "rows = 7"))
     assert main(["calibrate", str(session)]) == 2
-    said = capsys.readouterr().err
-    assert "9 x 7" in said and "9 x 6" in said and "board file" in said
+    printed = capsys.readouterr().err
+    assert "9 x 7" in printed and "9 x 6" in printed and "board file" in printed
 
     board.write_text(BOARD)
     whole = (session.parent / "02.jpg").read_bytes()
@@ -262,7 +262,7 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("model", "degree", "said"),
+    ("model", "degree", "printed"),
     [
         ("scaramuzza", 99, "scaramuzza has no degree 99; choose 3, 4, 5, 6, 7, 8, 9, 10"),
         ("brown", 6, "brown has no degree 6; choose 4, 5, 8"),
@@ -272,16 +272,16 @@ def test_image_of_another_size_is_dropped_with_the_reason(session: Path) -> None
     ],
 )
 def test_degrees_that_no_model_has(
-    session: Path, capsys: pytest.CaptureFixture[str], model: str, degree: int, said: str
+    session: Path, capsys: pytest.CaptureFixture[str], model: str, degree: int, printed: str
 ) -> None:
     session.write_text(SESSION.replace("kannala_brandt", model) + f"degree = {degree}\n")
     assert main(["calibrate", str(session)]) == 2
     error = capsys.readouterr().err
-    assert said in error and str(session) in error
+    assert printed in error and str(session) in error
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "printed"),
     [
         ("columns = 9000", "'columns' is 9000, more than 1000"),
         ("square_mm = 0.03", "write mm"),
@@ -289,12 +289,12 @@ def test_degrees_that_no_model_has(
         ("rows = 1", "at least 2x2 inner corners"),
     ],
 )
-def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str], line: str, said: str) -> None:
+def test_boards_that_nobody_has(session: Path, capsys: pytest.CaptureFixture[str], line: str, printed: str) -> None:
     board = session.parent / "board.toml"
     key = line.split()[0]
     board.write_text("\n".join(line if row.startswith(key) else row for row in board.read_text().splitlines()))
     assert main(["calibrate", str(session)]) == 2
-    assert said in capsys.readouterr().err
+    assert printed in capsys.readouterr().err
 
 
 def test_images_of_two_sizes(session: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -297,9 +297,9 @@ def test_lenses_that_are_known_stay_and_a_camera_is_added_to_a_rig(pictures: Pat
     assert worst_px(rig["right"][0]) < SAME_LENS_PX
     # The lenses of a rig's file come with how unsure they are.
     session = replace(load_rig_session(folder / "session.toml"), lenses={"right": added})
-    told, saved_rig = known_cameras(session), load_saved_rig(added)
-    assert told is not None and told.covariance is not None and saved_rig.covariance is not None
-    np.testing.assert_array_equal(told.covariance, saved_rig.covariance[9:18, 9:18])
+    reported, saved_rig = known_cameras(session), load_saved_rig(added)
+    assert reported is not None and reported.covariance is not None and saved_rig.covariance is not None
+    np.testing.assert_array_equal(reported.covariance, saved_rig.covariance[9:18, 9:18])
 
 
 def test_what_is_known_of_cameras_stands_in_their_session(
@@ -318,8 +318,8 @@ def test_what_is_known_of_cameras_stands_in_their_session(
     session = load_rig_session(wanted.path)
     assert session.known_rig == known and list(session.cameras) == ["left", "right"]
     # Of the rig's file nobody knows how sure it is, nor of another tool's lens.
-    told = known_cameras(replace(session, lenses={"right": lens}))
-    assert told is not None and list(told.cameras) == ["left", "right"] and told.covariance is None
+    reported = known_cameras(replace(session, lenses={"right": lens}))
+    assert reported is not None and list(reported.cameras) == ["left", "right"] and reported.covariance is None
     # A camera of the rig that has no images is not lost without a word.
     with_known_first(session)
     assert "without images here, top will not be in the new rig" in caplog.text
@@ -346,16 +346,16 @@ def test_the_square_is_enough_where_images_show_the_board(pictures: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("told", "words"),
+    ("reported", "words"),
     [
         (["--square-mm", "nan"], "a positive number of mm"),
         (["--square-mm", "30", "--board", "9x6x30"], "leave --square-mm out"),
     ],
 )
 def test_a_square_that_says_nothing_is_refused(
-    told: list[str], words: str, pictures: Path, capsys: pytest.CaptureFixture[str]
+    reported: list[str], words: str, pictures: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["calibrate", str(pictures), *told]) == 2
+    assert main(["calibrate", str(pictures), *reported]) == 2
     assert words in capsys.readouterr().err
 
 

@@ -66,14 +66,14 @@ def test_pupils_of_a_rig_move_where_that_is_asked_for(session: Path) -> None:
 
 def test_rig_from_kept_corners(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(session), "--json", "--report"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    reported = json.loads(capsys.readouterr().out)
     true = float(np.linalg.norm(mounts()["wide"][1].translation_mm))
-    baseline = told["baselines"][0]
+    baseline = reported["baselines"][0]
     assert abs(baseline["value_mm"] - true) < SIGMAS * baseline["sigma_mm"]
     # The squares are known to one per cent: no length is known better.
     assert 0.01 * true < baseline["sigma_mm"] < 0.011 * true
     rig = load_rig(session.parent / "rig.json")
-    assert np.allclose(rig["wide"][1].matrix()[:3], told["cameras"][1]["cam_from_rig"])
+    assert np.allclose(rig["wide"][1].matrix()[:3], reported["cameras"][1]["cam_from_rig"])
     page = (session.parent / "rig.html").read_text()
     assert "Cameras of the rig" in page and 'id="wide"' in page and "drawing" in page
 
@@ -97,8 +97,8 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     assert main(["diff", str(folder / "rig-wide.json"), str(folder / "again-wide.json"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["same"] is True
     assert main(["diff", str(folder / "rig.json"), str(folder / "again.json"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["chance"] > 0.01 and set(told["cameras"]) == set(NAMES)
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["chance"] > 0.01 and set(reported["cameras"]) == set(NAMES)
 
     saved = json.loads((folder / "again.json").read_text())
     for k in range(3):
@@ -106,25 +106,25 @@ def test_diff_has_a_verdict_on_rigs_and_their_cameras(
     (folder / "again.json").write_text(json.dumps(saved))
     page = folder / "diff.html"
     assert main(["diff", str(folder / "rig.json"), str(folder / "again.json"), "-r", str(page)]) == 1
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     text = page.read_text()
     # Of each camera a drawing for light pages and one for dark ones.
     assert "NOT the same rig" in text and text.count("data:image/png") == 2 * len(NAMES)
-    assert "NOT the same rig" in said and said.count("no contradiction") == len(NAMES)
+    assert "NOT the same rig" in printed and printed.count("no contradiction") == len(NAMES)
     assert main(["diff", str(folder / "rig.json"), str(folder / "rig-reg.json")]) == 2
 
 
 def test_a_camera_of_a_rig_is_surer_than_alone(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its file is a whole calibration: what `validate` needs to count its share."""
     assert main(["calibrate", str(session), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    for camera in told["cameras"]:
+    reported = json.loads(capsys.readouterr().out)
+    for camera in reported["cameras"]:
         saved = load_calibration(session.parent / f"rig-{camera['name']}.json")
         assert saved.parameter_sigmas.tolist() == list(camera["sigmas"].values())
         assert saved.heldout_rms_px == camera["heldout_rms_px"]
         assert saved.verdicts[0].severity != "bad"
-    assert told["heldout_rms_px"] == pytest.approx(np.sqrt(2.0) * 0.2, rel=0.05)
-    assert 0.0 < told["transfers"][0]["median_px"] < 0.5
+    assert reported["heldout_rms_px"] == pytest.approx(np.sqrt(2.0) * 0.2, rel=0.05)
+    assert 0.0 < reported["transfers"][0]["median_px"] < 0.5
 
 
 def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,13 +144,13 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     views = target_views(rng, one, ALIKE, room, 6, noise_px=0.1, distance_mm=1000.0, shuffled=True)
     keep_corners(path, views, named=False)
     assert main(["calibrate", str(path), "--json", "--report"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["checks"][0]["passed"] and told["checks"][0]["our_sigma"] < 0.05
-    assert load_calibration(tmp_path / "calibration.json").heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["checks"][0]["passed"] and reported["checks"][0]["our_sigma"] < 0.05
+    assert load_calibration(tmp_path / "calibration.json").heldout_rms_px == reported["cameras"][0]["heldout_rms_px"]
     (target,) = load_board_rigs(tmp_path / "calibration-boards.json")
     assert sorted(target.names) == [b.board_id for b in ALIKE] and target.image_count == 6
     between, sigma = target.angle_deg("plane1", "plane2")
-    assert between == pytest.approx(told["checks"][0]["ours"])
+    assert between == pytest.approx(reported["checks"][0]["ours"])
     # The deviations in the file are those of its degrees of freedom.
     kept = json.loads((tmp_path / "calibration-boards.json").read_text())["rigs"][0]
     assert sigma in [pytest.approx(entry["sigma_deg"]) for entry in kept["angles"]]
@@ -164,12 +164,12 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
     (tmp_path / "moved.json").write_text(json.dumps(moved))
     assert main(["diff", str(saved), str(saved)]) == 0 and "the same mount" in capsys.readouterr().out
     assert main(["diff", str(saved), str(tmp_path / "moved.json"), "--json"]) == 1
-    told_apart = json.loads(capsys.readouterr().out)["targets"][target.names[0]]["boards"]
-    assert told_apart[0]["shift_mm"] == pytest.approx(2.0) and told_apart[1]["shift_mm"] == 0.0
+    boards_found = json.loads(capsys.readouterr().out)["targets"][target.names[0]]["boards"]
+    assert boards_found[0]["shift_mm"] == pytest.approx(2.0) and boards_found[1]["shift_mm"] == 0.0
     assert main(["diff", str(saved), str(tmp_path / "calibration.json")]) == 2
 
     again = calibrate_camera(path)
-    assert again.heldout_rms_px == told["cameras"][0]["heldout_rms_px"]
+    assert again.heldout_rms_px == reported["cameras"][0]["heldout_rms_px"]
 
     # Without the mount, two cameras cannot know which board is which.
     path.write_text(
@@ -183,5 +183,5 @@ def test_boards_on_one_mount(tmp_path: Path, rng: np.random.Generator, capsys: p
 def test_a_camera_without_views_is_named(session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (session.parent / "corners-wide.json").unlink()
     assert main(["calibrate", str(session)]) == 2
-    said = capsys.readouterr().err
-    assert "no image matches 'images' of camera 'wide'" in said and "Traceback" not in said
+    printed = capsys.readouterr().err
+    assert "no image matches 'images' of camera 'wide'" in printed and "Traceback" not in printed

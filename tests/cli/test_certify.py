@@ -61,12 +61,12 @@ def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: py
     data = json.loads(rig.read_text())
     asked = ["certify", str(rig), "--length", "300", "--distance", "1200", "--limit", "1000"]
     for severity, code in (("look", 0), ("bad", 1)):
-        said = {
+        printed = {
             "severity": severity,
             "message": "held-out RMS 0.1 px, but the focal length differs",
             "remedy": "fix it",
         }
-        rig.write_text(json.dumps(data | {"verdicts": [said]}))
+        rig.write_text(json.dumps(data | {"verdicts": [printed]}))
         assert main(asked) == code
         words = capsys.readouterr().out.splitlines()
         called = "  The calibration was called bad: held-out RMS 0.1 px, but the focal length differs; fix it."
@@ -74,8 +74,8 @@ def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: py
         page = rig.with_suffix(".html")
         drawn = ["--report", str(page)] if severity == "bad" else []
         assert main([*asked, *drawn, "--json"]) == code
-        told = json.loads(capsys.readouterr().out)["page"]
-        assert ("not to be trusted" in json.dumps(told)) == (severity == "bad")
+        reported = json.loads(capsys.readouterr().out)["page"]
+        assert ("not to be trusted" in json.dumps(reported)) == (severity == "bad")
     assert "not to be trusted" in page.read_text()
 
 
@@ -83,14 +83,14 @@ def test_what_rests_on_a_bad_calibration_is_no_certificate(rig: Path, capsys: py
 def test_the_result_for_programs(quantity: str, rig: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["certify", str(rig), f"--{quantity}", "50", "--distance", "900", "--json"]
     assert main(command) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["quantity"] == quantity
-    assert told["cameras"] == ["left", "right"]
-    assert told["passed"] is None
-    bounds = [value for row in told["bound"] for value in row if value is not None]
-    assert max(bounds) == told["worst"]
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["quantity"] == quantity
+    assert reported["cameras"] == ["left", "right"]
+    assert reported["passed"] is None
+    bounds = [value for row in reported["bound"] for value in row if value is not None]
+    assert max(bounds) == reported["worst"]
     assert main([*command, "--sigma-px", "0.5"]) == 0
-    assert json.loads(capsys.readouterr().out)["median"] > told["median"]
+    assert json.loads(capsys.readouterr().out)["median"] > reported["median"]
 
 
 @pytest.mark.parametrize(

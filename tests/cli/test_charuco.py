@@ -79,11 +79,11 @@ def test_one_picture_of_the_whole_print_tells_what_it_is(
     cv2.imwrite(str(picture), image)
     capsys.readouterr()
     assert main(["board", "identify", str(picture)]) == 0
-    told = capsys.readouterr()
-    assert f"--board charuco:{size}xMM,dictionary=DICT_5X5_" in told.out
+    reported = capsys.readouterr()
+    assert f"--board charuco:{size}xMM,dictionary=DICT_5X5_" in reported.out
     # The two patterns are the same board where it has an even number of rows of corners.
-    assert ("legacy_pattern=true" in told.out) == (bool(extra) and int(size.split("x")[1]) % 2 == 1)
-    assert "differ in one column" not in told.err
+    assert ("legacy_pattern=true" in reported.out) == (bool(extra) and int(size.split("x")[1]) % 2 == 1)
+    assert "differ in one column" not in reported.err
 
 
 def test_the_measured_print_keeps_its_markers(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from rigkit.report.pages.check_page import _could_have_found
 from rigkit.synthetic.photometry import Photometry
 from rigkit.synthetic.render import Optics, render
 from rigkit.synthetic.scene import PlacedBoard
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.judge import SentinelCheck
 from rigkit.validation.sentinel.power import Power
 from rigkit.workflows.checks.check import CheckOptions, _frames, _require_right_order, check_pictures
@@ -207,10 +207,10 @@ def test_pictures_that_were_flipped_are_no_moved_principal_point(
         cv2.imwrite(str(tmp_path / path.name), cv2.flip(np.asarray(read_image(path)), flip))
     fixed = tmp_path / "fixed.json"
     assert main(["check", str(home / "cam.json"), str(tmp_path), "--fix", str(fixed)]) == 1
-    said = capsys.readouterr()
-    assert f"they seem {words}; put back, they fit" in said.out
-    assert "Else it would be this: the principal point of the camera moved" in said.out
-    assert "not written: the pictures were flipped" in said.err and not fixed.exists()
+    printed = capsys.readouterr()
+    assert f"they seem {words}; put back, they fit" in printed.out
+    assert "Else it would be this: the principal point of the camera moved" in printed.out
+    assert "not written: the pictures were flipped" in printed.err and not fixed.exists()
 
 
 def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -223,12 +223,12 @@ def test_what_holds_and_what_does_not(home: Path, tmp_path: Path, capsys: pytest
     assert "fixed.json not written: nothing changed" in said_and_noted.err and not fixed.exists()
     command = ["check", calibration, str(home / "moved"), "--json", "-r", str(page), "--fix", str(fixed), *also]
     assert main([*command, "--length", "200", "--distance", "600"]) == 1
-    said = json.loads(capsys.readouterr().out)
-    assert said["cause"] == "focus" and said["units"] == ["%"] and said["cost_unit"] == "mm"
-    assert said["amounts"] == pytest.approx([FOCUS_PERCENT], abs=0.1)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["cause"] == "focus" and printed["units"] == ["%"] and printed["cost_unit"] == "mm"
+    assert printed["amounts"] == pytest.approx([FOCUS_PERCENT], abs=0.1)
     # A length seen through a focus that is 0.5 % off is 0.5 % off.
-    assert said["cost"] == pytest.approx(0.01 * FOCUS_PERCENT * 200.0, rel=0.4)
-    assert f"an error of {said['cost']:.2g} mm rms in the length" in said["statement"]
+    assert printed["cost"] == pytest.approx(0.01 * FOCUS_PERCENT * 200.0, rel=0.4)
+    assert f"an error of {printed['cost']:.2g} mm rms in the length" in printed["statement"]
     assert "does not hold" in page.read_text()
     assert load_camera(fixed).parameters[0] == pytest.approx(CAMERA.parameters[0] * 1.005, rel=1e-3)
     assert main(["check", str(fixed), str(home / "moved")]) == 0
@@ -280,15 +280,15 @@ def test_another_program_says_not_how_sure_it_is(
 def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A file whose focal length is off by a hundredth; pictures of before, some more, and some after a knock."""
     wrong, register, fixed = tmp_path / "wrong.json", tmp_path / "cam.jsonl", tmp_path / "fixed.json"
-    told = json.loads((home / "cam.json").read_text())
-    told["camera"]["parameters"] |= {name: 1.01 * told["camera"]["parameters"][name] for name in ("fx", "fy")}
-    wrong.write_text(json.dumps(told))
+    reported = json.loads((home / "cam.json").read_text())
+    reported["camera"]["parameters"] |= {name: 1.01 * reported["camera"]["parameters"][name] for name in ("fx", "fy")}
+    wrong.write_text(json.dumps(reported))
     again = _pictures(tmp_path / "again", CAMERA, np.random.default_rng(8))
     since = ["--before", str(home / "same"), "--register", str(register)]
     assert main(["check", str(wrong), str(again), *since[2:]]) == 1
     assert main(["check", str(wrong), str(again), *since]) == 0
-    said = capsys.readouterr().out
-    assert "Nothing moved since" in said and "Since 3 frames of before" in said
+    printed = capsys.readouterr().out
+    assert "Nothing moved since" in printed and "Since 3 frames of before" in printed
     assert main(["check", str(wrong), str(home / "moved"), *since, "--fix", str(fixed), "--json"]) == 1
     done = json.loads(capsys.readouterr().out)
     assert done["cause"] == "focus" and done["baseline"]["frames"] == 3
@@ -304,7 +304,7 @@ def test_what_was_wrong_before_is_no_change(home: Path, tmp_path: Path, capsys: 
 
 
 def test_folders_of_a_rig_are_its_cameras_by_their_names_or_in_its_order(tmp_path: Path) -> None:
-    rig = cast(Watched, SimpleNamespace(cameras=(CAMERA, CAMERA), names=("left", "right")))
+    rig = cast(Monitored, SimpleNamespace(cameras=(CAMERA, CAMERA), names=("left", "right")))
     folders = [tmp_path / name for name in ("right", "left", "day")]
     for folder in folders:
         folder.mkdir()

@@ -194,8 +194,8 @@ def fresh_right(lab: Lab) -> str:
 
 @pytest.fixture(scope="module")
 def calibration(lab: Lab, left: str) -> str:
-    told = ["--board", lab.target, "--model", "pinhole", "-o", lab.path("calibration.json")]
-    assert main(["calibrate", left, *told]) == 0
+    reported = ["--board", lab.target, "--model", "pinhole", "-o", lab.path("calibration.json")]
+    assert main(["calibrate", left, *reported]) == 0
     return lab.path("calibration.json")
 
 
@@ -219,10 +219,10 @@ def test_it_is_printed(lab: Lab) -> None:
 
 def test_images_tell_it(lab: Lab, fresh: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["board", "identify", fresh]) == 0
-    said = capsys.readouterr().out
-    assert f"seen in {FRESH} of {FRESH} images" in said
+    printed = capsys.readouterr().out
+    assert f"seen in {FRESH} of {FRESH} images" in printed
     kind, _, size = lab.words.split(",")[0].rpartition(":")
-    assert f"--board {f'{kind}:' if kind else ''}{size.rpartition('x')[0]}xMM" in said
+    assert f"--board {f'{kind}:' if kind else ''}{size.rpartition('x')[0]}xMM" in printed
 
 
 def test_one_camera(lab: Lab, calibration: str) -> None:
@@ -267,14 +267,14 @@ def test_pose_and_hand(lab: Lab, left: str, calibration: str, capsys: pytest.Cap
     known = ["--camera", calibration, "--board", lab.target]
     lines = [robot_line(f"{n:02d}.png", one.world_from_board) for n, one in enumerate(lab.placed[:VIEWS])]
     Path(lab.path("poses.csv")).write_text("\n".join(["image,x_mm,y_mm,z_mm,qx,qy,qz,qw", *lines]) + "\n")
-    told = ["handeye", lab.path("poses.csv"), left, *known, "-o", lab.path("hand.json"), "--force"]
+    reported = ["handeye", lab.path("poses.csv"), left, *known, "-o", lab.path("hand.json"), "--force"]
     if lab.board.looks_same_turned:
         # Nobody can say which end of such a board is which, and it is said what to take.
-        assert main(told) == 2
+        assert main(reported) == 2
         assert "looks the same turned" in capsys.readouterr().err
         return
     assert main(["pose", *known, lab.path("left/00.png")]) == 0
-    assert main(told) == 0
+    assert main(reported) == 0
     result = json.loads(Path(lab.path("hand.json")).read_text())
     moved = np.array(result["cam_from_hand"])[:3, 3] - CAM_FROM_HAND.translation_mm
     assert np.linalg.norm(moved) < HAND_MM

@@ -148,8 +148,8 @@ def test_a_rig_goes_out_as_a_camchain_and_comes_back(tmp_path: Path, capsys: pyt
     rig = saved_rig(tmp_path / "rig.json", (LEFT, WIDE), (POSES[0], POSES[2]))
     chain = tmp_path / "chain.yaml"
     assert main(["export", str(rig), "--to", "kalibr", "-o", str(chain)]) == 0
-    said = capsys.readouterr()
-    assert "at most 0 px" in said.out and "cam0 is 'left'" in said.err and "cam1 is 'right'" in said.err
+    printed = capsys.readouterr()
+    assert "at most 0 px" in printed.out and "cam0 is 'left'" in printed.err and "cam1 is 'right'" in printed.err
     (one, _), (two, cam1_from_cam0) = import_rig(chain).values()
     # Kalibr has no k3, which is zero here.
     np.testing.assert_allclose(one.parameters, LEFT.parameters[:8], atol=1e-12)
@@ -274,14 +274,14 @@ def test_a_camera_of_py_ocamcalib_needs_the_size_of_its_images(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     theirs, ours = tmp_path / "fisheye.json", tmp_path / "ours.json"
-    said = {
+    printed = {
         "date": "today",
         "taylor_coefficient": [300.0, 0.0, -1.1e-3, 1.2e-6, -2.5e-9],
         "distortion_center": [640.5, 480.25],
         "stretch_matrix": [[1.001, 0.002], [-0.001, 1.0]],
         "extrinsics_t": [],
     }
-    theirs.write_text(json.dumps(said))
+    theirs.write_text(json.dumps(printed))
     assert main(["export", str(theirs), "-o", str(ours)]) == 2
     assert "--size" in capsys.readouterr().err
     assert main(["export", str(theirs), "--size", "1280x", "-o", str(ours)]) == 2

@@ -101,9 +101,9 @@ def test_what_images_cannot_tell_must_be_said(
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     shutil.copytree(IMAGES / "fisheye-general", tmp_path / "first")
     assert main(["init", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert all(option in said for option in ("--square-mm", "--calibration", "--pose-type"))
-    assert len(said.splitlines()) == 1
+    printed = capsys.readouterr().err
+    assert all(option in printed for option in ("--square-mm", "--calibration", "--pose-type"))
+    assert len(printed.splitlines()) == 1
     assert not (tmp_path / "dataset.toml").exists()
 
 
@@ -140,8 +140,8 @@ def test_several_cameras_and_pose_types(
         shutil.copy(CALIBRATION, tmp_path / f"{name}.json")
     monkeypatch.chdir(tmp_path)
     command = ["init", "lab", *3 * ["--board", "8x6x50"], "--force"]
-    told = ["--pose-type", "*-standard=standard", "--pose-type", "general"]
-    assert main([*command, "--calibration", "wide.json", "--calibration", "tele.json", *told]) == 0
+    declared = ["--pose-type", "*-standard=standard", "--pose-type", "general"]
+    assert main([*command, "--calibration", "wide.json", "--calibration", "tele.json", *declared]) == 0
     dataset = load_dataset(root)
     assert [(p.pose_type, p.camera1.camera_id, p.camera2.camera_id) for p in dataset.pairs] == [
         ("general", "camera1", "camera2"),
@@ -151,13 +151,13 @@ def test_several_cameras_and_pose_types(
     boards = [(board.board_id, board.size, board.square_x_mm) for board in dataset.boards]
     assert boards == [(f"plane{n}", (8, 6), 50.0) for n in (1, 2, 3)]
     three = [f"--calibration={name}" for name in ("w=wide.json", "t=tele.json", "x=wide.json")]
-    assert main([*command, *three, *told]) == 2
+    assert main([*command, *three, *declared]) == 2
     assert "which cameras took pair 'fisheye-general'; add --cameras" in capsys.readouterr().err
-    assert main([*command, *three, *told, "--cameras", "*-general=w,t", "--cameras", "*=t,t"]) == 0
+    assert main([*command, *three, *declared, "--cameras", "*-general=w,t", "--cameras", "*=t,t"]) == 0
     cameras = [(p.camera1.camera_id, p.camera2.camera_id) for p in load_dataset(root).pairs]
     assert cameras == [("w", "t"), ("t", "t")]
     for wrong in (["--cameras", "*=w,y"], ["--cameras", "w,t"], ["--pose-type", "sideways"]):
-        assert main([*command, *three, *told, *wrong]) == 2
+        assert main([*command, *three, *declared, *wrong]) == 2
 
 
 def test_a_rig_stands_for_its_cameras(
@@ -173,8 +173,8 @@ def test_a_rig_stands_for_its_cameras(
     monkeypatch.chdir(tmp_path)
     command = ["init", "lab", "--square-mm", "50", "--pose-type", "general", "--calibration", "rig.json"]
     assert main(command) == 2
-    said = capsys.readouterr().err
-    assert "'rig-right.json' is not beside it; give each camera's own file" in said and said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "'rig-right.json' is not beside it; give each camera's own file" in printed and printed.count("\n") == 1
     shutil.copy(CALIBRATION, tmp_path / "rig-right.json")
     assert main(command) == 0
     pair = load_dataset(tmp_path / "lab").pairs[0]
@@ -199,9 +199,9 @@ def test_a_session_of_two_cameras_is_written_and_loads(tmp_path: Path, capsys: p
     assert main([*command, "--square-mm", "50", "--force"]) == 2
 
 
-@pytest.mark.parametrize("told", ["90", "first=90+-x", "190+-1", "90+-0"])
-def test_angles_that_are_none(told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("declared", ["90", "first=90+-x", "190+-1", "90+-0"])
+def test_angles_that_are_none(declared: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "first").mkdir()
     shutil.copy(IMAGES / "fisheye-general" / "view1.jpg", tmp_path / "first")
-    assert main(["init", str(tmp_path), "--square-mm", "50", "--angle-deg", told]) == 2
-    assert f"--angle-deg '{told}': write" in capsys.readouterr().err
+    assert main(["init", str(tmp_path), "--square-mm", "50", "--angle-deg", declared]) == 2
+    assert f"--angle-deg '{declared}': write" in capsys.readouterr().err

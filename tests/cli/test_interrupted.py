@@ -212,9 +212,9 @@ def test_the_version_says_what_is_installed(capsys: pytest.CaptureFixture[str]) 
     assert "Python 3." in third
 
 
-@pytest.mark.parametrize("said", [ImportError("initialization failed"), InputError("a library cannot be loaded")])
+@pytest.mark.parametrize("printed", [ImportError("initialization failed"), InputError("a library cannot be loaded")])
 def test_a_library_interrupted_while_it_is_loaded(
-    said: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    printed: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It says that it could not be loaded, of which the interruption is the cause."""
 
@@ -222,7 +222,7 @@ def test_a_library_interrupted_while_it_is_loaded(
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt as stop:
-            raise said from stop
+            raise printed from stop
 
     monkeypatch.setattr(diff, "run", work)
     assert main(["diff", "a.json", "b.json"]) == 128 + signal.SIGINT

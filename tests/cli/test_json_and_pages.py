@@ -34,26 +34,26 @@ def run(arguments: list[str], page: Path, capsys: pytest.CaptureFixture[str], co
     """Return the page that a command writes, and what it prints for programs."""
     capsys.readouterr()
     assert main([*arguments, "-r", str(page), "--json"]) == code
-    told = json.loads(capsys.readouterr().out)
-    assert faults(told["page"]) == []
-    return page.read_text(encoding="utf-8"), told
+    answer = json.loads(capsys.readouterr().out)
+    assert faults(answer["page"]) == []
+    return page.read_text(encoding="utf-8"), answer
 
 
 def test_one_camera(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     session, out = str(calibrated / "session.toml"), str(tmp_path / "c.json")
-    html, told = run(["calibrate", session, "-o", out], tmp_path / "c.html", capsys)
-    assert_all_is_in(html, told["page"], REPEATS)
-    keys = {table["key"] for table in told["page"]["tables"]}
+    html, answer = run(["calibrate", session, "-o", out], tmp_path / "c.html", capsys)
+    assert_all_is_in(html, answer["page"], REPEATS)
+    keys = {table["key"] for table in answer["page"]["tables"]}
     assert {"parameters", "candidates", "boards", "images", "plan"} <= keys
-    assert f"{told['heldout_rms_px']:.3f} px" in html and f"{told['rms_px']:.3f} px" in html
-    assert set(told["sigmas"]) == set(told["parameters"])
+    assert f"{answer['heldout_rms_px']:.3f} px" in html and f"{answer['rms_px']:.3f} px" in html
+    assert set(answer["sigmas"]) == set(answer["parameters"])
 
 
 def test_a_rig(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["calibrate", str(pictures), "--board", "9x6x30", "--model", "brown", "-o", str(tmp_path / "rig.json")]
-    html, told = run(command, tmp_path / "rig.html", capsys)
-    assert_all_is_in(html, told["page"], REPEATS)
-    assert set(told["page"]["parts"]) == {"left", "right"}
+    html, answer = run(command, tmp_path / "rig.html", capsys)
+    assert_all_is_in(html, answer["page"], REPEATS)
+    assert set(answer["page"]["parts"]) == {"left", "right"}
 
 
 def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -66,8 +66,8 @@ def test_diff_certify_check_and_plan(calibrated: Path, tmp_path: Path, capsys: p
         "plan": ["plan", known],
     }
     for name, command in commands.items():
-        html, told = run(command, tmp_path / f"{name}.html", capsys)
-        assert_all_is_in(html, told["page"], ("Blue dots",))
+        html, answer = run(command, tmp_path / f"{name}.html", capsys)
+        assert_all_is_in(html, answer["page"], ("Blue dots",))
 
 
 def test_a_validation_that_fails() -> None:

@@ -95,9 +95,9 @@ def test_a_session_that_fails_does_not_end_the_rest(
         )
     sessions = [str(tmp_path / name / "s.toml") for name in ("a", "b")]
     assert main(["calibrate", *sessions]) == 2
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert (tmp_path / "b" / "s-calibration.json").is_file()
-    assert "1 of 2 sessions are well" in said.err and "a/s.toml" in said.err
+    assert "1 of 2 sessions are well" in printed.err and "a/s.toml" in printed.err
     assert main(["calibrate", *sessions, "-o", str(tmp_path / "x.json")]) == 2
     assert "beside each" in capsys.readouterr().err
 
@@ -116,11 +116,11 @@ def test_a_bad_calibration_of_a_data_set_is_warned_of(captures: Path, caplog: py
     folder = Path(shutil.copytree(captures / "one", captures / "called-bad"))
     manifest = folder / "dataset.toml"
     text = manifest.read_text(encoding="utf-8")
-    said = {"severity": "bad", "message": "two cameras are mixed", "remedy": "calibrate each"}
+    printed = {"severity": "bad", "message": "two cameras are mixed", "remedy": "calibrate each"}
     for name in ("mvca020_r61", "mvca020_fe185"):
         source = REPOSITORY / "calib" / "cameras" / name / "calibration.json"
         own = folder / f"{name}.json"
-        own.write_text(json.dumps(json.loads(source.read_text()) | {"verdicts": [said]}))
+        own.write_text(json.dumps(json.loads(source.read_text()) | {"verdicts": [printed]}))
         text = text.replace(str(source), str(own))
     manifest.write_text(text, encoding="utf-8")
     load_cameras(load_dataset(manifest))

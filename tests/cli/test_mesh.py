@@ -25,10 +25,10 @@ def test_the_surface_goes_through_the_points(tmp_path: Path, capsys: pytest.Capt
     cloud = make_reconstruction().cloud
     write_ply(tmp_path / "cloud.ply", cloud)
     assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "6", "--cut", "0.15", "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    mesh = open3d.io.read_triangle_mesh(said["mesh"])
-    assert len(mesh.triangles) == said["triangles"] > 100
-    assert len(mesh.vertices) == said["vertices"]
+    printed = json.loads(capsys.readouterr().out)
+    mesh = open3d.io.read_triangle_mesh(printed["mesh"])
+    assert len(mesh.triangles) == printed["triangles"] > 100
+    assert len(mesh.vertices) == printed["vertices"]
     assert mesh.has_vertex_normals() and mesh.has_vertex_colors()
     # Normals that pointed to the wrong side would turn the surface inside out and far away from the points.
     surface = np.asarray(mesh.sample_points_uniformly(50_000).points)
@@ -79,17 +79,17 @@ def test_an_extent_that_no_octree_bears_is_refused(
     cloud = make_reconstruction().cloud
     write_ply(tmp_path / "cloud.ply", replace(cloud, points_mm=cloud.points_mm * factor))
     assert main(["mesh", str(tmp_path / "cloud.ply"), "--depth", "3"]) == 3
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert words in said and "cloud.ply" in said
+    printed = capsys.readouterr().err.splitlines()[-1]
+    assert words in printed and "cloud.ply" in printed
 
 
 @pytest.mark.parametrize("factor", [1e-20, 1e20])
 def test_the_surface_does_not_depend_on_the_unit(factor: float) -> None:
     cloud = make_reconstruction().cloud
-    usual = poisson_mesh(cloud, depth=5, cut=0.1)
+    typical = poisson_mesh(cloud, depth=5, cut=0.1)
     scaled = poisson_mesh(replace(cloud, points_mm=cloud.points_mm * factor), depth=5, cut=0.1)
-    assert len(scaled.triangles) == pytest.approx(len(usual.triangles), rel=0.05)
-    extent, other = np.ptp(usual.points, axis=0), np.ptp(scaled.points, axis=0) / factor
+    assert len(scaled.triangles) == pytest.approx(len(typical.triangles), rel=0.05)
+    extent, other = np.ptp(typical.points, axis=0), np.ptp(scaled.points, axis=0) / factor
     np.testing.assert_allclose(other, extent, rtol=0.05)
 
 

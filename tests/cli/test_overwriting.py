@@ -142,8 +142,8 @@ def test_names_of_images_that_no_table_expects(name: bytes, folder: Path, capsys
     (folder / "many").mkdir()
     shutil.copy(LAB / "images" / "regular-general" / "view1.jpg", folder / "many" / os.fsdecode(name))
     assert main(["detect", "many", "-j", "1", "-o", "new.csv", "--overlay", "shown"]) == 0
-    said = capsys.readouterr()
-    assert "\x1b" not in said.out + said.err and len(said.out.splitlines()) == 2
+    printed = capsys.readouterr()
+    assert "\x1b" not in printed.out + printed.err and len(printed.out.splitlines()) == 2
     (read,) = read_corners(folder / "new.csv")
     assert (folder / "new.csv").read_bytes().decode() and read.endswith(".png")
     shutil.copy(LAB / "images" / "regular-general" / "view2.jpg", folder / "many" / ("2" + os.fsdecode(name)))

@@ -119,8 +119,8 @@ def test_pictures_to_check_a_rig_with(tmp_path: Path, capsys: pytest.CaptureFixt
     path.write_text(json.dumps(rig | {"boards": [board]}))
     page = tmp_path / "check.html"
     assert main(["plan", str(path), "--check", "-n", "2", "-r", str(page), "--json"]) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert all(set(view["seen_by"]) == set(poses) for view in said["views"])
+    printed = json.loads(capsys.readouterr().out)
+    assert all(set(view["seen_by"]) == set(poses) for view in printed["views"])
     text = page.read_text()
     assert "before camera" in text and "rotation of right" in text and text.count("<svg") == 2
     assert "Blue dots" not in text
@@ -138,9 +138,9 @@ def test_a_calibration_that_was_called_bad_is_warned_of(
     """What the next pictures bring is reckoned from its sigmas."""
     data = json.loads(calibrated.read_text())
     for severity in ("look", "bad"):
-        said = {"severity": severity, "message": "two cameras are mixed", "remedy": "calibrate each"}
+        printed = {"severity": severity, "message": "two cameras are mixed", "remedy": "calibrate each"}
         source = tmp_path / f"{severity}.json"
-        source.write_text(json.dumps(data | {"verdicts": [said]}))
+        source.write_text(json.dumps(data | {"verdicts": [printed]}))
         assert main(["plan", str(source), "-n", "1"]) == 0
         called = f"'{source}': the calibration was called bad: two cameras are mixed"
         assert (called in capsys.readouterr().err) == (severity == "bad")

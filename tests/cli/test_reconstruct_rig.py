@@ -111,5 +111,5 @@ def test_images_of_a_rig_that_are_exchanged_are_told(
     folder, images, _ = files
     monkeypatch.setattr("rigkit.affine.features.ENOUGH_PLAIN", 50)
     assert run(folder, "--images", images[1], images[0], "--sparse") == 3
-    said = capsys.readouterr().err
-    assert f"images '{images[1]}' and '{images[0]}' are exchanged" in said and "--names" in said
+    printed = capsys.readouterr().err
+    assert f"images '{images[1]}' and '{images[0]}' are exchanged" in printed and "--names" in printed

@@ -51,9 +51,9 @@ def test_a_file_of_correspondences(files: tuple[Path, Rigid3], capsys: pytest.Ca
     assert run(folder, "--correspondences", str(folder / "found.csv")) == 2
     assert "--force" in capsys.readouterr().err
     assert run(folder, "--correspondences", str(folder / "found.csv"), "--force", "--no-pictures") == 0
-    said = capsys.readouterr()
-    assert "(baselines)" in said.out
-    assert "lengths are in baselines" in said.err
+    printed = capsys.readouterr()
+    assert "(baselines)" in printed.out
+    assert "lengths are in baselines" in printed.err
     assert b"units baselines" in (folder / "out" / "scene.ply").read_bytes()[:300]
 
 
@@ -114,8 +114,8 @@ def test_two_images(tmp_path: Path, rng: np.random.Generator, capsys: pytest.Cap
 def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]) -> None:
     _, names = pictures_of_a_corner(tmp_path, rng)
     np.savetxt(tmp_path / "pose.txt", CAM2_FROM_CAM1.matrix())
-    said = ("--images", *names, "--json", "--no-pictures", "--pose")
-    assert run(tmp_path, *said, str(tmp_path / "pose.txt")) == 0
+    printed = ("--images", *names, "--json", "--no-pictures", "--pose")
+    assert run(tmp_path, *printed, str(tmp_path / "pose.txt")) == 0
     result = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(result["cam2_from_cam1"], CAM2_FROM_CAM1.matrix(), atol=1e-9)
     assert result["unit"] == "mm"
@@ -125,10 +125,10 @@ def test_a_measured_pose_is_kept(tmp_path: Path, rng: np.random.Generator, capsy
     assert 800.0 < np.median(np.linalg.norm(cloud.points_mm, axis=1)) < 1500.0
     wrong = Rigid3(exp_so3(np.array([0.0, 0.0, 0.3])) @ TURN, CAM2_FROM_CAM1.translation_mm)
     (tmp_path / "wrong.json").write_text(json.dumps({"cam2_from_cam1": wrong.matrix().tolist()}))
-    assert run(tmp_path, *said, str(tmp_path / "wrong.json"), "--force") == 3
+    assert run(tmp_path, *printed, str(tmp_path / "wrong.json"), "--force") == 3
     assert "agree" in capsys.readouterr().err
     (tmp_path / "short.txt").write_text("1 2 3")
-    assert run(tmp_path, *said, str(tmp_path / "short.txt"), "--force") == 2
+    assert run(tmp_path, *printed, str(tmp_path / "short.txt"), "--force") == 2
     assert "3 numbers" in capsys.readouterr().err
 
 

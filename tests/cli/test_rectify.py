@@ -199,16 +199,16 @@ def test_a_kind_of_image_that_nobody_writes_is_known_before_the_work(
 
 
 @pytest.mark.parametrize(
-    ("size", "name", "said"),
+    ("size", "name", "shown_text"),
     [("60000x60000", "out.png", "more than 200 million"), ("66000x10", "out.jpg", "takes no image of 66000 x 10 px")],
 )
 def test_an_image_that_is_too_large_is_refused(
-    size: str, name: str, said: str, files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    size: str, name: str, shown_text: str, files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / name), "--size", size]
     assert main([*arguments, "--interpolation", "nearest"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert said in line and name in line and "--size" in line
+    assert shown_text in line and name in line and "--size" in line
     assert not (tmp_path / name).exists()
 
 
@@ -225,14 +225,14 @@ def test_one_bad_image_does_not_end_a_folder(
     cv2.imwrite(str(folder / "e.png"), np.zeros((60, 80), np.uint8))
     command = ["rectify", str(folder), "--camera", files[1], "-o", str(out), "--interpolation", "linear"]
     assert main(command) == 2
-    said = capsys.readouterr()
-    assert sorted(p.stem for p in out.iterdir()) == ["a", "d", "f"] and f"{out}, 3 images:" in said.out
-    assert [name for name in "abcdef" if f"'{folder / name}.png'" in said.err] == sorted(bad)
+    shown_text = capsys.readouterr()
+    assert sorted(p.stem for p in out.iterdir()) == ["a", "d", "f"] and f"{out}, 3 images:" in shown_text.out
+    assert [name for name in "abcdef" if f"'{folder / name}.png'" in shown_text.err] == sorted(bad)
     for name in "abdf":
         (folder / f"{name}.png").unlink()
     assert main(command) == 2
-    told = capsys.readouterr().err
-    assert "c.png" in told and "e.png" in told
+    reported = capsys.readouterr().err
+    assert "c.png" in reported and "e.png" in reported
 
 
 def test_one_bad_image_of_a_pair_leaves_out_both(
@@ -252,8 +252,8 @@ def test_one_bad_image_of_a_pair_leaves_out_both(
     rig.write_text(json.dumps({"schema": "rigkit.rig/1", "cameras": entries}))
     both = [str(tmp_path / name) for name in poses]
     assert main(["rectify", *both, "--rig", str(rig), "-o", str(out), "--interpolation", "linear", "--json"]) == 2
-    said = capsys.readouterr()
-    assert len(json.loads(said.out)["images"]) == 4 and "right/1.png" in said.err
+    shown_text = capsys.readouterr()
+    assert len(json.loads(shown_text.out)["images"]) == 4 and "right/1.png" in shown_text.err
     assert sorted(p.stem for p in out.rglob("*.png")) == ["0", "0", "2", "2"]
 
 
@@ -264,19 +264,19 @@ def test_a_crop_is_seen_whole_and_its_geometry_follows(tmp_path: Path, capsys: p
     cv2.imwrite(str(tmp_path / "image.png"), np.full((120, 160), 200, dtype=np.uint8))
     command = ["rectify", str(tmp_path / "image.png"), "--camera", str(tmp_path / "camera.json"), "--json"]
     command += ["--interpolation", "linear", "--hfov-deg", "120", "--yaw-deg", "50", "--roll-deg", "20"]
-    told = {}
+    reported = {}
     for name, more in (("whole", []), ("crop", ["--crop", "--maps", str(tmp_path / "maps.npz")])):
         assert main([*command, *more, "-o", str(tmp_path / f"{name}.png")]) == 0
-        told[name] = json.loads(capsys.readouterr().out)
-    assert told["whole"]["covered"] < 1.0 == told["crop"]["covered"]
+        reported[name] = json.loads(capsys.readouterr().out)
+    assert reported["whole"]["covered"] < 1.0 == reported["crop"]["covered"]
     image, part = (cv2.imread(str(tmp_path / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in ("whole", "crop"))
     assert image is not None and part is not None
     assert image.min() == 0 and part.min() > 100
-    assert told["crop"]["size_px"] == [part.shape[1], part.shape[0]]
-    left, top = (round(told["whole"]["parameters"][k] - told["crop"]["parameters"][k]) for k in ("cx", "cy"))
+    assert reported["crop"]["size_px"] == [part.shape[1], part.shape[0]]
+    left, top = (round(reported["whole"]["parameters"][k] - reported["crop"]["parameters"][k]) for k in ("cx", "cy"))
     np.testing.assert_array_equal(part, image[top : top + part.shape[0], left : left + part.shape[1]])
     maps = np.load(tmp_path / "maps.npz")
-    assert maps["map_x"].shape == part.shape and maps["K"][0, 2] == pytest.approx(told["crop"]["parameters"]["cx"])
+    assert maps["map_x"].shape == part.shape and maps["K"][0, 2] == pytest.approx(reported["crop"]["parameters"]["cx"])
     # No side has room for another row or column.
     seen = np.pad(image > 100, 1)
     rows, columns = slice(top + 1, top + 1 + part.shape[0]), slice(left + 1, left + 1 + part.shape[1])
@@ -320,8 +320,12 @@ def test_two_videos_frame_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture
     _video(tmp_path / "right.avi", [60, 80])
     both = [str(tmp_path / "left.avi"), str(tmp_path / "right.avi")]
     assert main(["rectify", *both, "--rig", str(rig), "-o", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr()
-    assert "baseline 100.000 mm" in said.out and "3 frames" in said.err and "2: those of one number" in said.err
+    shown_text = capsys.readouterr()
+    assert (
+        "baseline 100.000 mm" in shown_text.out
+        and "3 frames" in shown_text.err
+        and "2: those of one number" in shown_text.err
+    )
     for name in poses:
         assert sorted(p.name for p in (tmp_path / "out" / name).iterdir()) == ["000000.png", "000001.png"]
     (tmp_path / "folder").mkdir()
@@ -335,5 +339,8 @@ def test_a_view_that_is_no_number_is_no_fault_of_the_camera(
 ) -> None:
     arguments = ["rectify", files[0], "--camera", files[1], "-o", str(tmp_path / "out.png"), "--yaw-deg", angle]
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert f"rectify: yaw {angle}, pitch 0, roll 0: three finite numbers are needed" in said and files[1] not in said
+    shown_text = capsys.readouterr().err
+    assert (
+        f"rectify: yaw {angle}, pitch 0, roll 0: three finite numbers are needed" in shown_text
+        and files[1] not in shown_text
+    )

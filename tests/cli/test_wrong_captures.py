@@ -195,8 +195,8 @@ def test_one_board_with_squares_so_wrong_that_it_fits_nowhere_is_named(
     declare_squares(folder, capture, "43.0")
     code, text, _ = validate(folder, capsys, "--no-crosscheck")
     assert code == 1
-    said = "board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
-    assert f"probable cause: pair 'same': {said}" in text
+    printed = "board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    assert f"probable cause: pair 'same': {printed}" in text
 
 
 def test_reconstruct_names_the_board_that_fits_nowhere_too(
@@ -204,8 +204,8 @@ def test_reconstruct_names_the_board_that_fits_nowhere_too(
 ) -> None:
     declare_squares(folder, capture, "43.0")
     assert main(["reconstruct", str(folder), "-j", "1", "--no-pictures", "-o", str(folder / "clouds")]) == 0
-    said = "same: board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
-    assert said in capsys.readouterr().err
+    printed = "same: board 'plane2' would fit the others with squares of 50.0 mm (43 is declared); measure them again"
+    assert printed in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("what", ["images", "cameras"])

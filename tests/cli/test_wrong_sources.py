@@ -50,5 +50,5 @@ def test_a_camera_of_a_rig_that_sees_no_board(
         for k in range(3):
             cv2.imwrite(f"{camera}/{k}.png", np.full((60, 80), 90, np.uint8))
     assert main(["calibrate", "left", "right", "--board", "5x4x20"]) == 2
-    assert "of camera 'left'" in (said := capsys.readouterr().err)
-    assert "look whether that camera saw the boards, else leave it out; or check columns and rows" in said
+    assert "of camera 'left'" in (printed := capsys.readouterr().err)
+    assert "look whether that camera saw the boards, else leave it out; or check columns and rows" in printed

@@ -20,10 +20,10 @@ from rigkit.calibration.certainty.displaced import uncertain_camera
 from rigkit.cameras.brown import Brown
 from rigkit.cameras.compare import compare_cameras
 from rigkit.coach.coach import Coach, Take
-from rigkit.coach.guide import WORTH_OF_PHOTO, WORTH_TAKING, CaptureGuide, GuideOptions
-from rigkit.coach.look import Glance, glance_at
+from rigkit.coach.guide import MIN_GAIN, MIN_GAIN_OF_PHOTO, CaptureGuide, GuideOptions
+from rigkit.coach.look import FrameObservation, observe_frame
 from rigkit.coach.server import LOCAL, MAX_UPLOAD_BYTES
-from rigkit.coach.sources import Frame, device_frames, watched_frames
+from rigkit.coach.sources import Frame, device_frames, frames_of_folders
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
@@ -71,15 +71,15 @@ def options(folder: Path, **more: object) -> CoachOptions:
 
 def test_a_frame_is_taken_when_it_is_still_sharp_and_helps(pictures: list[np.ndarray], poses: list[Rigid3]) -> None:
     guide = CaptureGuide(GuideOptions(boards=(BOARD,), hfov_deg=52.0))
-    first = glance_at(pictures[0], [BOARD], "a")
+    first = observe_frame(pictures[0], [BOARD], "a")
     assert first.view is not None and not guide.advise(first).take, "nobody knows yet whether it is still"
-    again = glance_at(pictures[0], [BOARD], "b", first)
+    again = observe_frame(pictures[0], [BOARD], "b", first)
     assert again.still and again.sharp and guide.advise(again).take
     guide.add(again.view, again.size_px)  # type: ignore[arg-type]
     assert guide.advise(again).worth == 0.0, "the same once more counts as one"
-    blurred = glance_at(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c").as_photo()
+    blurred = observe_frame(picture(poses[1], np.random.default_rng(2), blur_px=4.0), [BOARD], "c").as_photo()
     assert blurred.view is None or (not blurred.sharp and not guide.advise(blurred).take)
-    empty = glance_at(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
+    empty = observe_frame(np.full((480, 640, 3), 90, np.uint8), [BOARD], "d")
     advice = guide.advise(empty)
     assert not advice.take and advice.words.startswith("Hold the board: ")
     assert np.isfinite(advice.target_px).all()
@@ -90,11 +90,11 @@ def test_a_photo_that_is_there_needs_to_bring_less_than_a_frame_that_may_be_wait
     guide = CaptureGuide(GuideOptions(boards=(coarse,), hfov_deg=52.0))
     away = Rigid3(poses[0].rotation, 3.0 * poses[0].translation_mm)
     pixels, _ = CAMERA.project(away.apply(coarse.points()))
-    far = Glance(
+    far = FrameObservation(
         size_px=SIZE, view=BoardView("far", coarse, coarse.grid(), pixels, np.full(len(pixels), 0.1)), contrast=100.0
     )
     photo = far.as_photo()
-    assert WORTH_OF_PHOTO < guide.advise(photo).worth < WORTH_TAKING
+    assert MIN_GAIN_OF_PHOTO < guide.advise(photo).worth < MIN_GAIN
     assert not guide.advise(photo).take and guide.advise(photo, photo=True).take
 
 
@@ -113,29 +113,29 @@ def test_frames_are_offered_until_there_are_enough() -> None:
 
 
 def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[np.ndarray], tmp_path: Path) -> None:
-    watched = tmp_path / "incoming"
-    watched.mkdir()
+    monitored = tmp_path / "incoming"
+    monitored.mkdir()
     for k, image in enumerate(pictures):
-        cv2.imwrite(str(watched / f"{k:02d}.png"), image)
-    (watched / "notes.png").write_text("no picture")
-    told: list[str] = []
-    coach = open_coach(options(tmp_path / "session"), told.append)
+        cv2.imwrite(str(monitored / f"{k:02d}.png"), image)
+    (monitored / "notes.png").write_text("no picture")
+    reported: list[str] = []
+    coach = open_coach(options(tmp_path / "session"), reported.append)
     # The first picture once more, and the first place once more: whoever took it is told that it brought nothing.
-    cv2.imwrite(str(watched / "001.png"), pictures[0])
-    cv2.imwrite(str(watched / "002.png"), pictures[0] ^ 1)
-    said, known = [], []
+    cv2.imwrite(str(monitored / "001.png"), pictures[0])
+    cv2.imwrite(str(monitored / "002.png"), pictures[0] ^ 1)
+    printed, known = [], []
 
     def show(images: object) -> None:
-        said.append(coach.state().get("words"))
-        known.append(len(told))
+        printed.append(coach.state().get("words"))
+        known.append(len(reported))
 
-    coach_frames(coach, watched_frames([watched], until_idle_s=0.5), photos=True, show=show)
+    coach_frames(coach, frames_of_folders([monitored], until_idle_s=0.5), photos=True, show=show)
     # The picture before the page is the one whose corners are drawn on it.
     assert known[0] == 1
-    assert any(str(words).startswith("Not taken, as it is frame-0001.png already. ") for words in said)
+    assert any(str(words).startswith("Not taken, as it is frame-0001.png already. ") for words in printed)
     assert any(
         str(words).startswith("Not taken, as it brings little that is new: 0 % of what the place asked for would. ")
-        for words in said
+        for words in printed
     )
     assert len(coach.guide.frames) >= 7
     kept = sorted((tmp_path / "session/images").glob("*.png"))
@@ -143,12 +143,12 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     first = np.asarray(cv2.imread(str(kept[0])))
     assert any(np.array_equal(first, image) for image in pictures), "kept without loss"
     (lens,) = coach.guide.lenses
-    said_px = lens.advise(Glance(size_px=SIZE, view=None)).left[0].error
+    said_px = lens.advise(FrameObservation(size_px=SIZE, view=None)).left[0].error
     assert said_px is not None and re.match(r"Done: \w+, error [0-9.]+ px \(", coach.finish())
-    assert "00.png: taken as frame-0001.png" in told and any(
-        line.startswith("002.png: not taken, as it brings little that is new: 0 % of") for line in told
+    assert "00.png: taken as frame-0001.png" in reported and any(
+        line.startswith("002.png: not taken, as it brings little that is new: 0 % of") for line in reported
     )
-    assert len([line for line in told if ": taken as " in line]) == len(kept) and told[-1] == coach.finished
+    assert len([line for line in reported if ": taken as " in line]) == len(kept) and reported[-1] == coach.finished
     found = load_calibration(tmp_path / "session/calibration.json")
     error = compare_cameras(CAMERA, found.camera).rms_px
     known = uncertain_camera(found)
@@ -169,11 +169,11 @@ def test_a_recording_is_gone_through_whole_and_what_it_lacks_is_said(
     writer.release()
     coach = open_coach(options(tmp_path / "session", video=(film,)))
     shown: list[object] = []
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     lacks = coach_recording(
-        coach, [film], show=shown.append, progress=lambda what, done, total: told.append((done, total))
+        coach, [film], show=shown.append, progress=lambda what, done, total: reported.append((done, total))
     )
-    assert (told[0], told[-1]) == ((1, 11), (11, 11))
+    assert (reported[0], reported[-1]) == ((1, 11), (11, 11))
     kept = [np.asarray(cv2.imread(str(path))) for path in sorted((tmp_path / "session/images").glob("*.png"))]
     assert 4 <= len(kept) == len(shown) == len(coach.guide.frames)
     # Grey as the recording is decoded: of every pose the sharp picture.
@@ -187,7 +187,7 @@ def _with_a_part(image: np.ndarray, columns: range) -> np.ndarray:
     for column in columns:
         covered = image.copy()
         covered[:, column:] = 120
-        view = glance_at(covered, [BOARD], "tried").view
+        view = observe_frame(covered, [BOARD], "tried").view
         if view is not None and view.board.board_id != BOARD.board_id:
             return covered
     pytest.fail("no part is seen")
@@ -228,7 +228,7 @@ def test_a_picture_that_was_copied_slowly_is_read_once_it_is_whole(
     place = tmp_path / "1.png"
     place.write_bytes(whole[:-20])
     os.utime(place, (0.0, 0.0))
-    frames = watched_frames([tmp_path], until_idle_s=0.8)
+    frames = frames_of_folders([tmp_path], until_idle_s=0.8)
 
     def copy_on() -> None:
         """The copy rested for so long that it looked whole."""
@@ -243,7 +243,7 @@ def test_a_picture_that_was_copied_slowly_is_read_once_it_is_whole(
 
 def test_what_gives_no_frames_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a folder"):
-        watched_frames([tmp_path / "none"])
+        frames_of_folders([tmp_path / "none"])
     with pytest.raises(InputError, match="camera 97 gives no picture"):
         device_frames([97])
     with pytest.raises(InputError, match="does not exist"):
@@ -307,8 +307,8 @@ def test_the_server_answers_its_own_page_alone(served: tuple[Coach, int], pictur
     png = cv2.imencode(".png", pictures[0])[1].tobytes()
     status, page = ask(port, "GET", "/secret/")
     assert status == 200 and b"getUserMedia" in page and b"http" not in page.replace(b"http-equiv", b"")
-    status, said = ask(port, "POST", "/secret/look", png)
-    assert status == 200 and len(json.loads(said)["cameras"][0]["corners"]) == 54
+    status, printed = ask(port, "POST", "/secret/look", png)
+    assert status == 200 and len(json.loads(printed)["cameras"][0]["corners"]) == 54
     assert coach.keeper.frames == []
     assert ask(port, "POST", "/secret/take", png)[0] == 200
     assert len(coach.keeper.frames) == 1

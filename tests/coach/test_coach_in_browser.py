@@ -17,7 +17,7 @@ from helpers.driven import DrivenPage
 from helpers.sentinel_scenes import best_held
 
 from rigkit.cameras.compare import compare_cameras
-from rigkit.coach.look import glance_at
+from rigkit.coach.look import observe_frame
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.calibration_file import load_calibration
@@ -159,7 +159,7 @@ def test_two_cameras_take_frames_together(tmp_path: Path) -> None:
     kept = [read_image(folder / f"images/camera{c}/frame-0001.png") for c in (0, 1)]
     # Both see one pose: the board is where the mount puts it, and not in one picture twice.
     assert all(image.shape[:2] == SIZE[::-1] for image in kept) and not np.array_equal(kept[0], kept[1])
-    found = [glance_at(image, [BOARD], "kept").view for image in kept]
+    found = [observe_frame(image, [BOARD], "kept").view for image in kept]
     assert all(view is not None and len(view.grid) == BOARD.corner_count for view in found)
 
 
@@ -196,8 +196,8 @@ def test_a_capture_from_beginning_to_end(tmp_path: Path) -> None:
     with _guided(video, folder, tmp_path / "second") as page:
         page.wait("coach.looks > 0", PATIENCE_S)
         assert page.evaluate("coach.state.frames") >= kept
-        said = page.wait("coach.state.enough && coach.state.words", PATIENCE_S)
-        assert said.startswith("Enough: ") and "two more pictures would bring" in said
+        printed = page.wait("coach.state.enough && coach.state.words", PATIENCE_S)
+        assert printed.startswith("Enough: ") and "two more pictures would bring" in printed
         assert page.evaluate("coach.state.share") <= 1
         page.wait("coach.state.finished", PATIENCE_S)
         assert _words(page).startswith("Done: ") and "calibration.json written" in _words(page)

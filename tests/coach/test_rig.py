@@ -19,9 +19,9 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.coach.coach import Coach, Take
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.look import Glance, glance_at
+from rigkit.coach.look import FrameObservation, observe_frame
 from rigkit.coach.rig import SHARED_FRAMES, RigGuide
-from rigkit.coach.sources import watched_frames
+from rigkit.coach.sources import frames_of_folders
 from rigkit.core.errors import InputError
 from rigkit.geometry.board_pose import board_pose
 from rigkit.geometry.principal_axes import principal_axes
@@ -78,16 +78,16 @@ def test_the_error_of_a_mount_is_what_repeated_frames_show(rng: np.random.Genera
     assert np.allclose(mean_motion([MOUNT] * 3).matrix(), MOUNT.matrix())
 
 
-def glance(pose: Rigid3, rng: np.random.Generator, name: str) -> Glance:
+def frame_observation(pose: Rigid3, rng: np.random.Generator, name: str) -> FrameObservation:
     """What a camera sees of a board held still, without a picture."""
     view = noisy_view(CAMERA, pose, name, rng, NOISE_PX, board=BOARD)
     if len(view.grid) < 30:
-        return Glance(size_px=SIZE, view=None)
-    return Glance(size_px=SIZE, view=view, edge_px=2.0, moved_px=0.0, contrast=150.0)
+        return FrameObservation(size_px=SIZE, view=None)
+    return FrameObservation(size_px=SIZE, view=view, edge_px=2.0, moved_px=0.0, contrast=150.0)
 
 
-def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[Glance]:
-    return [glance(pose, rng, name), glance(MOUNT @ pose, rng, name)]
+def both(pose: Rigid3, rng: np.random.Generator, name: str) -> list[FrameObservation]:
+    return [frame_observation(pose, rng, name), frame_observation(MOUNT @ pose, rng, name)]
 
 
 def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,13 +98,13 @@ def test_a_rig_is_enough_when_lenses_and_mounts_are(rng: np.random.Generator, mo
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5),
     )
     guide = RigGuide(("left", "right"), GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=0.3, reach=REACH))
-    empty = [Glance(size_px=SIZE, view=None)] * 2
+    empty = [FrameObservation(size_px=SIZE, view=None)] * 2
     first = guide.advise(empty)
     assert first.words.startswith("left: Hold the board") and first.targets[1] is None and first.mount_px is None
     # Every camera by itself: both lenses are known well, and of the mount nothing.
     alone = held_boards(CAMERA, BOARD, REACH)
     for k in range(0, 220, 10):
-        own = glance(alone.pose(k), rng, f"{k}")
+        own = frame_observation(alone.pose(k), rng, f"{k}")
         guide.add([own, empty[0]] if k % 20 else [empty[0], own])
     lenses_known = guide.advise(empty)
     assert all(lens.enough for lens in lenses_known.lenses)
@@ -150,7 +150,7 @@ def test_frames_of_several_cameras_are_kept_together(pairs: Sequence[list[np.nda
     # Taken by one camera only: it waits for the other's.
     (incoming[0] / "img7.png").write_bytes((incoming[0] / "img0.png").read_bytes())
     coach = open_coach(rig_options(tmp_path / "session", watch=tuple(incoming)))
-    for images, source in watched_frames(incoming, until_idle_s=0.5):
+    for images, source in frames_of_folders(incoming, until_idle_s=0.5):
         coach.look(images, take=Take.YES, source=source)
     taken = len(coach.guide.frames)
     assert taken == len(pairs)
@@ -177,8 +177,8 @@ def test_two_images_come_in_one_upload(
     port = serve(coach, ("127.0.0.1", "192.168.7.7"))
     data = [cv2.imencode(".png", image)[1].tobytes() for image in pairs[0]]
     path = f"/secret/look?sizes={len(data[0])},{len(data[1])}"
-    status, said = ask(port, "POST", path, data[0] + data[1])
-    assert status == 200 and [len(camera["corners"]) for camera in json.loads(said)["cameras"]] == [54, 54]
+    status, printed = ask(port, "POST", path, data[0] + data[1])
+    assert status == 200 and [len(camera["corners"]) for camera in json.loads(printed)["cameras"]] == [54, 54]
     status, page = ask(port, "GET", "/secret/")
     assert status == 200 and b'data-names="[&quot;camera0&quot;, &quot;camera1&quot;]"' in page
     # As from another machine of the network, by the address that it was told, and by another name.
@@ -188,7 +188,7 @@ def test_two_images_come_in_one_upload(
 
 def test_a_look_at_a_smaller_picture_shows_the_same(pairs: Sequence[list[np.ndarray]]) -> None:
     image = pairs[0][0]
-    whole, half = glance_at(image, [BOARD], "a"), glance_at(image, [BOARD], "a", shrink=2)
+    whole, half = observe_frame(image, [BOARD], "a"), observe_frame(image, [BOARD], "a", shrink=2)
     assert whole.view is not None and half.view is not None and half.size_px == SIZE
     order = [np.lexsort(g.view.pixels.T) for g in (whole, half) if g.view is not None]
     assert np.abs(whole.view.pixels[order[0]] - half.view.pixels[order[1]]).max() < 0.6
@@ -235,8 +235,8 @@ def test_the_goal_may_be_a_length_in_mm(tmp_path: Path, rng: np.random.Generator
     coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=guide, length=length))
     held = held_boards(CAMERA, BOARD, REACH)
     for k in range(0, 120, 10):
-        coach.guide.add([glance(held.pose(k), rng, f"{k}")])
-    advice = coach.guide.advise([glance(held.pose(7), rng, "x")])
+        coach.guide.add([frame_observation(held.pose(k), rng, f"{k}")])
+    advice = coach.guide.advise([frame_observation(held.pose(7), rng, "x")])
     (lens,) = advice.lenses
     in_px, in_mm = lens.left
     assert in_px.reached and in_mm.requirement.goal.unit == "mm"

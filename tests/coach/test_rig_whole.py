@@ -19,7 +19,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.calibrate import calibrate_rig
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.coach.guide import CHECKING, GuideOptions
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig import MAX_HELP, RigGuide
 from rigkit.coach.rig_whole import RigKnown, left_of_rig, whole_rig
 from rigkit.coach.whole import STEADY, WholeCalibration
@@ -34,11 +34,11 @@ from rigkit.workflows.capture.coach import finished_words
 
 NAMES, OTHER = ("left", "right"), "right"
 FRAMES = 10
-EMPTY = [Glance(size_px=SIZE, view=None)] * 2
+EMPTY = [FrameObservation(size_px=SIZE, view=None)] * 2
 LENGTH = Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=600.0)
 
 
-def frame(k: int, rng: np.random.Generator) -> list[Glance]:
+def frame(k: int, rng: np.random.Generator) -> list[FrameObservation]:
     """What both cameras see of a board that both see."""
     in_a, _ = shared_boards(60)
     seen = both(in_a.pose(k), rng, f"{k}")
@@ -46,13 +46,13 @@ def frame(k: int, rng: np.random.Generator) -> list[Glance]:
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[list[Glance]]:
+def frames() -> list[list[FrameObservation]]:
     rng = np.random.default_rng(5)
     return [frame(4 * k, rng) for k in range(FRAMES)]
 
 
 @pytest.fixture(scope="module")
-def rig(frames: list[list[Glance]]) -> RigCalibration:
+def rig(frames: list[list[FrameObservation]]) -> RigCalibration:
     views = {
         name: [(f"{k}", seen[c].view) for k, seen in enumerate(frames) if seen[c].view is not None]
         for c, name in enumerate(NAMES)
@@ -91,7 +91,7 @@ class Later(Executor):
         return count
 
 
-def guide_of(frames: Sequence[Sequence[Glance]], executor: Executor, **more: Any) -> RigGuide:
+def guide_of(frames: Sequence[Sequence[FrameObservation]], executor: Executor, **more: Any) -> RigGuide:
     wanted: dict[str, Any] = {"boards": (BOARD,), "hfov_deg": 52.0, "goal_px": 3.0, "reach": REACH} | more
     guide = RigGuide(NAMES, GuideOptions(**wanted), executor)
     for seen in frames:
@@ -99,7 +99,7 @@ def guide_of(frames: Sequence[Sequence[Glance]], executor: Executor, **more: Any
     return guide
 
 
-def told(guide: RigGuide, later: Later, found: RigCalibration) -> None:
+def reported(guide: RigGuide, later: Later, found: RigCalibration) -> None:
     """Tell the guide what came of all frames, and of all but the last."""
     assert guide.advise(EMPTY).waits
     assert later.tell(found) == FRAMES and guide.advise(EMPTY).waits, "no held-out error of fewer to compare with"
@@ -107,14 +107,14 @@ def told(guide: RigGuide, later: Later, found: RigCalibration) -> None:
 
 
 def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
-    frames: list[list[Glance]], rig: RigCalibration
+    frames: list[list[FrameObservation]], rig: RigCalibration
 ) -> None:
     later = Later(rig)
     guide = guide_of(frames, later)
     now = guide.advise(EMPTY)
     assert all(lens.enough for lens in now.lenses) and now.mount_px is not None and now.mount_px < 3.0
     assert now.waits and now.words == CHECKING and not now.enough and guide.advise(frames[0]).take is False
-    told(guide, later, rig)
+    reported(guide, later, rig)
     now = guide.advise(EMPTY)
     assert now.enough and now.words.startswith("Enough: left ") and "together" in now.words
     assert [own.requirement.whose for own in now.left] == ["left", "right", "together"]
@@ -127,7 +127,7 @@ def test_a_rig_waits_for_its_own_calibration_and_says_what_that_states(
     assert state["error"].startswith("left ") and state["share"] <= 1.0 and state["mount_px"] is None
 
 
-def test_a_rig_is_asked_with_what_its_lenses_found(frames: list[list[Glance]], rig: RigCalibration) -> None:
+def test_a_rig_is_asked_with_what_its_lenses_found(frames: list[list[FrameObservation]], rig: RigCalibration) -> None:
     later = Later(rig, slow=1)
     guide = guide_of(frames, later)
     for _ in range(3):
@@ -140,7 +140,7 @@ def test_a_rig_is_asked_with_what_its_lenses_found(frames: list[list[Glance]], r
 
 
 def test_what_the_rig_is_less_sure_of_is_asked_for(
-    frames: list[list[Glance]], rig: RigCalibration, rng: np.random.Generator
+    frames: list[list[FrameObservation]], rig: RigCalibration, rng: np.random.Generator
 ) -> None:
     # The mount is a hundred times less sure than the boards that both see say.
     unsure, mount = rig.covariance.copy(), rig.mount(1)
@@ -149,7 +149,7 @@ def test_what_the_rig_is_less_sure_of_is_asked_for(
     doubtful = replace(rig, covariance=unsure)
     later = Later(rig)
     guide = guide_of(frames, later)
-    told(guide, later, doubtful)
+    reported(guide, later, doubtful)
     now = guide.advise(EMPTY)
     *lenses, together = now.left
     assert all(own.reached for own in lenses) and not together.reached
@@ -160,18 +160,18 @@ def test_what_the_rig_is_less_sure_of_is_asked_for(
 
 
 def test_a_held_out_error_of_the_rig_that_changes_asks_for_one_more(
-    frames: list[list[Glance]], rig: RigCalibration
+    frames: list[list[FrameObservation]], rig: RigCalibration
 ) -> None:
-    usual = rig.heldout_rms_px
-    assert usual is not None
+    typical = rig.heldout_rms_px
+    assert typical is not None
     later = Later(rig)
     guide = guide_of(frames, later)
-    told(guide, later, replace(rig, heldout_rms_px=(1.0 + 2.0 * STEADY) * usual))
+    reported(guide, later, replace(rig, heldout_rms_px=(1.0 + 2.0 * STEADY) * typical))
     now = guide.advise(EMPTY)
     assert not now.enough and now.words.startswith("One more, to see that it is steady: hold the board")
 
 
-def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig: RigCalibration) -> None:
+def test_a_length_that_both_measure_is_required(frames: list[list[FrameObservation]], rig: RigCalibration) -> None:
     def measured(cameras: Sequence[Any], cam_from_rig: Sequence[Any]) -> Any:
         return length_goals(cameras, cam_from_rig, LENGTH)
 
@@ -181,19 +181,19 @@ def test_a_length_that_both_measure_is_required(frames: list[list[Glance]], rig:
     for part, enough in ((2.0, True), (0.5, False)):
         later = Later(rig)
         guide = guide_of(frames, later, goal_mm=part * in_mm.error, measured=measured)
-        told(guide, later, rig)
+        reported(guide, later, rig)
         now = guide.advise(EMPTY)
         assert all(own.reached for own in now.left[:-1]) and now.left[-1].reached is enough
         assert now.enough is enough or f"not {0.5 * in_mm.error:g} mm" in now.words
 
 
-def test_a_length_that_is_nowhere_in_view_is_said(frames: list[list[Glance]], rig: RigCalibration) -> None:
+def test_a_length_that_is_nowhere_in_view_is_said(frames: list[list[FrameObservation]], rig: RigCalibration) -> None:
     def nowhere(*_: object) -> Any:
         raise DegenerateError("nowhere is it in view")
 
     later = Later(rig)
     guide = guide_of(frames, later, goal_mm=1.0, measured=nowhere)
-    told(guide, later, rig)
+    reported(guide, later, rig)
     now = guide.advise(EMPTY)
     assert not now.enough and now.words == "nowhere is it in view"
 
@@ -217,13 +217,13 @@ def test_what_came_of_a_rig_is_said_as_the_rig_states_it(
 
 
 def test_frames_of_a_rig_are_calibrated_by_their_moments(
-    frames: list[list[Glance]], rig: RigCalibration, monkeypatch: pytest.MonkeyPatch
+    frames: list[list[FrameObservation]], rig: RigCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "rigkit.coach.rig_whole.calibrate_rig",
         lambda views, sizes, model, board, begun: calibrate_rig(views, sizes, model="brown", degree=5, folds=0),
     )
-    views = [[glance.view for glance in seen] for seen in frames]
+    views = [[frame_observation.view for frame_observation in seen] for seen in frames]
     found = whole_rig([*views[:-1], [views[-1][0], None]], NAMES, [SIZE, SIZE])
     assert found is not None and found.shared_count == FRAMES - 1
     assert found.baseline_mm(*NAMES)[0] == pytest.approx(rig.baseline_mm(*NAMES)[0], rel=0.02)
@@ -234,7 +234,7 @@ def test_frames_of_a_rig_are_calibrated_by_their_moments(
 
 
 def test_cameras_that_help_each_other_are_enough_before_each_is_alone(
-    frames: list[list[Glance]], rig: RigCalibration
+    frames: list[list[FrameObservation]], rig: RigCalibration
 ) -> None:
     goal_px = max(own.error for own in left_of_rig(rig, GuideOptions(boards=(BOARD,), reach=REACH)))
     for factor, enough in ((0.7 * MAX_HELP, True), (1.5 * MAX_HELP, False)):

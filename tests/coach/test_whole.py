@@ -17,9 +17,9 @@ from helpers.calibration_scenes import noisy_view
 from rigkit.cameras.base import Camera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.coach.coach import Coach
-from rigkit.coach.guide import CHECKING, WORTH_GOING_ON, CaptureGuide, GuideOptions
+from rigkit.coach.guide import CHECKING, MIN_GAIN_TO_CONTINUE, CaptureGuide, GuideOptions
 from rigkit.coach.keeper import Keeper
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.whole import STEADY, WholeCalibration, WholeCalibrations, whole_calibration
 from rigkit.core.detections import BoardView
 from rigkit.geometry.rigid3 import Rigid3
@@ -30,7 +30,7 @@ from rigkit.workflows.calibration.calibrate import SessionCalibration
 from rigkit.workflows.capture.coach import CoachOptions, finished_words, open_coach
 
 FRAMES, NOISE_PX = 10, 0.05
-EMPTY = Glance(size_px=SIZE, view=None)
+EMPTY = FrameObservation(size_px=SIZE, view=None)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_it_waits_for_all_of_calibrate_and_says_what_that_states(
 ) -> None:
     later = Later()
     guide = guide_of(views, later, goal_px=10.0)
-    seen = Glance(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
+    seen = FrameObservation(size_px=SIZE, view=views[0], edge_px=2.0, moved_px=0.0, contrast=150.0)
     now = guide.advise(seen)
     assert now.waits and now.words == CHECKING and not now.enough and not now.take
     assert later.tell(whole) == FRAMES and guide.advise(seen).waits, "no held-out error of fewer to compare with"
@@ -108,9 +108,9 @@ def test_what_all_of_calibrate_is_less_sure_of_is_not_enough(views: list[BoardVi
 
 
 def test_a_held_out_error_that_changes_asks_for_one_more(views: list[BoardView], whole: WholeCalibration) -> None:
-    usual = whole.calibration.heldout_rms_px
-    assert usual is not None
-    worse = replace(whole.calibration, heldout_rms_px=(1.0 + 2.0 * STEADY) * usual)
+    typical = whole.calibration.heldout_rms_px
+    assert typical is not None
+    worse = replace(whole.calibration, heldout_rms_px=(1.0 + 2.0 * STEADY) * typical)
     later = Later()
     guide = guide_of(views, later, goal_px=10.0)
     guide.advise(EMPTY)
@@ -147,7 +147,7 @@ def test_who_asks_how_things_are_is_told_what_was_calibrated_meanwhile(
     wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=10.0)
     coach = open_coach(CoachOptions(folder=tmp_path, boards=("9x6x25",), guide=wanted), executor=later)
     for view in views:
-        coach.guide.add([Glance(size_px=SIZE, view=view)])
+        coach.guide.add([FrameObservation(size_px=SIZE, view=view)])
     coach.look([np.full((SIZE[1], SIZE[0], 3), 90, np.uint8)])
     assert coach.state()["waits"]
     for _ in range(2):
@@ -174,7 +174,7 @@ def test_there_are_enough_only_where_the_projection_and_the_length_are_as_wanted
         later.tell(whole)
     now = guide.advise(EMPTY)
     assert [own.reached for own in now.left] == [px > 1.0, mm > 1.0]
-    assert now.more_percent is not None and now.more_percent > 100.0 * WORTH_GOING_ON, "more pictures would help"
+    assert now.more_percent is not None and now.more_percent > 100.0 * MIN_GAIN_TO_CONTINUE, "more pictures would help"
     assert now.enough is (min(px, mm) > 1.0) and not now.waits
     assert wanted.stated(whole.calibration).count("as wanted") == (px > 1.0) + (mm > 1.0)
 
@@ -188,10 +188,10 @@ def test_what_came_of_one_camera_is_said_as_its_calibration_states_it(
     written = (tmp_path / "calibration.json", tmp_path / "page.html")
     done = SessionCalibration(session=session, calibration=whole.calibration, unreadable={}, written=written)
     monkeypatch.setattr("rigkit.workflows.capture.coach.calibrate_session_file", lambda *_: done)
-    told: list[str] = []
+    reported: list[str] = []
     wanted = GuideOptions(boards=(BOARD,), hfov_deg=52.0, goal_px=100.0)
-    coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), tell=told.append)
+    coach = Coach(wanted, Keeper(tmp_path, {}), lambda: finished_words(tmp_path, wanted), tell=reported.append)
     words = coach.finish(". What it lacks: nothing")
     assert words.startswith(f"Done: {whole.calibration.camera.model}, {wanted.stated(whole.calibration)}, held-out ")
     assert "(as wanted)" in words and "calibration.json written" in words and words.endswith("What it lacks: nothing")
-    assert told == [words] and coach.finished == words
+    assert reported == [words] and coach.finished == words

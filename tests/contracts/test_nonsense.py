@@ -37,7 +37,7 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "printed"),
     [
         (lambda: camera_model("pinhole")((640.5, 480), PINHOLE.parameters), "whole numbers"),  # type: ignore[arg-type]
         (lambda: camera_model("pinhole")((float("nan"), 480), PINHOLE.parameters), "camera size"),  # type: ignore[arg-type]
@@ -53,8 +53,8 @@ def test_no_file_s_camera_has_a_focal_length_that_is_not_positive(
         (lambda: rigkit.PoseType("sideways"), "general, planar, standard, forward, auto"),
     ],
 )
-def test_nonsense_is_named(make: Callable[[], object], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_nonsense_is_named(make: Callable[[], object], printed: str) -> None:
+    with pytest.raises(InputError, match=printed):
         make()
 
 

@@ -339,7 +339,7 @@ def test_tables(cells: list[str | float]) -> None:
     assert len(row) == len(cells) or len(row) == len(cells) + 1
     for cell in row:
         assert not cell.startswith(("=", "@", "\t")) and "\r" not in cell
-    told = json.dumps(json.loads(tables_to_json([table])))
+    reported = json.dumps(json.loads(tables_to_json([table])))
     for value in cells:
         if isinstance(value, float):
-            assert json.dumps(value) in told
+            assert json.dumps(value) in reported

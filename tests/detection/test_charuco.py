@@ -16,11 +16,11 @@ from rigkit.core.errors import InputError
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.detect import detect_boards
+from rigkit.detection.duplicate_marks import duplicate_boards
 from rigkit.detection.saddles.response import grey_image
-from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
+from rigkit.detection.tags.in_squares import between_markers, place_by_markers
 from rigkit.detection.targets.base import Search
 from rigkit.detection.targets.charuco import _between_markers, _by_squares, _marked_corners, _of
-from rigkit.detection.twins import alike_boards
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.optim.robust_scale import MEDIAN_OF_NORMAL
 from rigkit.synthetic.photometry import Photometry
@@ -117,7 +117,7 @@ def test_corners_are_added_between_markers_that_are_read_and_under_no_cover(rng:
     truth = scene.truth()[0].lattice()
     part = truth.copy()
     part[:, 4:] = np.nan
-    grown = beside_markers(grey_image(scene.render(supersample=2, noise_levels=2.0, rng=rng)), part, BOARD)
+    grown = between_markers(grey_image(scene.render(supersample=2, noise_levels=2.0, rng=rng)), part, BOARD)
     added = np.isfinite(grown[..., 0])
     # At its corners hardly more than the tip of a marker is covered.
     assert not added[1:4, 6].any() and not added[2, 5:8].any()
@@ -264,11 +264,11 @@ def test_boards_alike_in_one_image_are_told() -> None:
     grid = Board("g", 6, 6, 40.0, 40.0, pattern=AprilGrid(0.3))
     for board in (BOARD, grid):
         picture = one_board(np.random.default_rng(0), board=board, max_tilt_deg=10.0).render()
-        assert alike_boards(picture, [board]) is None
-        words = alike_boards(np.hstack([picture, picture]), [board])
+        assert duplicate_boards(picture, [board]) is None
+        words = duplicate_boards(np.hstack([picture, picture]), [board])
         assert words is not None
         assert f"'{board.board_id}' are seen twice" in words
-    assert alike_boards(picture, [Board("plain", 9, 6, 30.0, 30.0)]) is None
+    assert duplicate_boards(picture, [Board("plain", 9, 6, 30.0, 30.0)]) is None
 
 
 def _scored(scene: BenchScene, image: np.ndarray, camera: Camera | None = None) -> tuple[np.ndarray, np.ndarray]:

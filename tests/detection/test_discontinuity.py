@@ -69,8 +69,8 @@ def wrong(found: Sequence[BoardDetection], scene: Scene) -> int:
             exact, own = {tuple(p): g for p, g in zip(item.pixels, truth[mine][0][index], strict=True)}, turned.grid
             off = np.array([exact[tuple(p)] for p in turned.pixels]) - own
             other = np.array([dict(zip(map(tuple, item.pixels), bad, strict=True))[tuple(p)] for p in turned.pixels])
-            usual = np.median(off, axis=0)
-            best = min(best, int((other | (off != usual).any(axis=1)).sum()))
+            typical = np.median(off, axis=0)
+            best = min(best, int((other | (off != typical).any(axis=1)).sum()))
         out += best
     return out
 

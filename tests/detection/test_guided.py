@@ -199,7 +199,7 @@ def test_corners_are_judged_by_those_beside_them() -> None:
     state = replace(state, contrast=120.0 * shade, residual=2.0 * shade)
     missing = np.zeros((6, 9), bool)
     missing[2:4, [0, 8]] = True
-    contrast, residual = state.without(missing).usual_near(missing)
+    contrast, residual = state.without(missing).typical_near(missing)
     assert np.array_equal(contrast, [30.0, 120.0, 30.0, 120.0])
     assert np.array_equal(residual, [0.5, 2.0, 0.5, 2.0])
 

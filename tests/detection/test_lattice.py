@@ -58,7 +58,7 @@ def test_local_fit_of_a_cubic_is_exact_at_the_border() -> None:
     assert np.abs(fit.pixels - np.stack([u, v], axis=-1)[known]).max() < 1e3 * ROUNDING_PX
     slope = 20.0 + 0.6 * column - 0.15 * column**2 + 0.1 * row**2
     assert np.abs(fit.along_column[:, 0] - slope[known]).max() < 1e4 * ROUNDING_PX
-    assert np.abs(fit.bend_column[:, 0] - (0.6 - 0.3 * column)[known]).max() < 1e4 * ROUNDING_PX
+    assert np.abs(fit.curvature_column[:, 0] - (0.6 - 0.3 * column)[known]).max() < 1e4 * ROUNDING_PX
 
 
 def test_curvature_of_a_circle() -> None:

@@ -62,13 +62,13 @@ def test_slopes_of_the_light_are_no_shadows() -> None:
     squares = np.where((row // 20 + column // 20) % 2 == 1, 200.0, 30.0)
     pixels = np.array([[79.5, 59.5], [99.5, 39.5]])
     sides = np.broadcast_to(20.0 * np.eye(2), (2, 2, 2))
-    aside, inner = np.full(2, 18.0), np.zeros(2, bool)
+    lateral, inner = np.full(2, 18.0), np.zeros(2, bool)
     sloping = (squares * (0.5 + column / 320.0)).astype(np.float32)
-    assert not beside_shadows(sloping, pixels, sides, aside, inner).any()
+    assert not beside_shadows(sloping, pixels, sides, lateral, inner).any()
     shaded = (squares * np.where(column > 81, 0.25, 1.0)).astype(np.float32)
-    assert beside_shadows(shaded, pixels, sides, aside, inner).tolist() == [True, False]
+    assert beside_shadows(shaded, pixels, sides, lateral, inner).tolist() == [True, False]
     # Beyond the image there is nothing to see.
-    assert not beside_shadows(shaded[:, :84], pixels, sides, aside, inner).any()
+    assert not beside_shadows(shaded[:, :84], pixels, sides, lateral, inner).any()
 
 
 def test_corners_fitted_as_well_as_usual_are_not_looked_at(
@@ -82,13 +82,13 @@ def test_corners_fitted_as_well_as_usual_are_not_looked_at(
     shaded, _ = in_shadow(image.astype(np.float64), through, 0.7, 0.3)
     crossed = np.abs((found.pixels - through) @ (np.cos(0.7), np.sin(0.7))) < NEAR_PX
     assert np.count_nonzero(crossed) > 3
-    unsure = replace(found, sigma_px=np.where(crossed, 5.0, 1.0) * found.sigma_px)
+    uncertain = replace(found, sigma_px=np.where(crossed, 5.0, 1.0) * found.sigma_px)
     residual, sigma = np.full((6, 9), 3.0), found.sigma_px.reshape(6, 9)
     contrast = np.full((6, 9), 100.0)
     fits = RefinedLattice(Lattice(found.lattice(), contrast, False), sigma, np.full((6, 9), 0.8), residual, residual)
     with monkeypatch.context() as blind:
         blind.delattr("rigkit.detection.guided.relit.beside_shadows")
-        assert relit(shaded, unsure, fits) is unsure
+        assert relit(shaded, uncertain, fits) is uncertain
     residual[found.grid[crossed, 1], found.grid[crossed, 0]] = 30.0
-    again = relit(shaded, unsure, fits)
-    assert np.median(again.sigma_px[crossed]) < 0.5 * np.median(unsure.sigma_px[crossed])
+    again = relit(shaded, uncertain, fits)
+    assert np.median(again.sigma_px[crossed]) < 0.5 * np.median(uncertain.sigma_px[crossed])

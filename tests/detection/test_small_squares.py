@@ -15,7 +15,7 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.subpixel import edge_fit, subpixel
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, Promise, refine
+from rigkit.detection.subpixel.subpixel import BESIDE_PAPER, EvidenceScore, refine
 
 BLUR_PX, COLUMNS, ROWS = 1.6, 9, 6
 MATRIX = np.array([[1.0, 0.1], [-0.07, 0.96]])
@@ -92,8 +92,8 @@ def test_a_board_that_is_expected_promises_more_until_there_is_one(scene: tuple[
     own = Evidence.of(doubtful).score
     assert own < 0.0
 
-    def promised(sizes: list[tuple[int, int]]) -> Promise:
-        return lattices_of_images._promise(image, lattices_of_images.Sought(12, sizes))
+    def promised(sizes: list[tuple[int, int]]) -> EvidenceScore:
+        return lattices_of_images._evidence_score(image, lattices_of_images.Sought(12, sizes))
 
     promise = promised([(ROWS, COLUMNS)])
     assert promise(doubtful, []) == own + OF_EXPECTED_SIZE

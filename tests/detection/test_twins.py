@@ -7,7 +7,7 @@ import pytest
 
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
-from rigkit.detection import twins
+from rigkit.detection import duplicate_marks
 from rigkit.detection.saddles.response import GreyImage
 
 
@@ -24,5 +24,5 @@ def test_a_few_misread_marks_are_no_second_board(twice: int, alike: bool, monkey
     def marks(_: GreyImage, __: Board) -> tuple[np.ndarray, np.ndarray]:
         return seen
 
-    monkeypatch.setattr(twins, "_marks", marks)
-    assert (twins.alike_boards(np.zeros((40, 40), np.uint8), [board]) is not None) is alike
+    monkeypatch.setattr(duplicate_marks, "_marks", marks)
+    assert (duplicate_marks.duplicate_boards(np.zeros((40, 40), np.uint8), [board]) is not None) is alike

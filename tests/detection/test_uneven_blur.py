@@ -14,9 +14,9 @@ from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.saddles.response import pyramid
 from rigkit.detection.saddles.saddle import find_corners
 from rigkit.detection.subpixel.blur_shape import blur_covariance
-from rigkit.detection.subpixel.evened import UNEVEN_WIDTHS
 from rigkit.detection.subpixel.resampled import resampled
-from rigkit.detection.subpixel.unsure import strays
+from rigkit.detection.subpixel.uncertain_corners import strays
+from rigkit.detection.subpixel.uniform_blur import UNEVEN_WIDTHS
 from rigkit.io.media.images import read_image
 
 FINER, NOISE_LEVELS, LENS_PX = 4, 1.5, 0.7
@@ -60,14 +60,16 @@ def moved_board(length_px: float, direction: float, turned: float, seed: int = 0
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8), corners
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["size given", "size not given"])
+@pytest.mark.parametrize("reported", [True, False], ids=["size given", "size not given"])
 @pytest.mark.parametrize(
     ("length_px", "direction"), [(8.0, 0.5), (12.0, 1.0), (14.0, 2.6)], ids=["8 px", "12 px", "14 px"]
 )
-def test_boards_smeared_by_motion_are_found_whole_and_in_place(length_px: float, direction: float, told: bool) -> None:
+def test_boards_smeared_by_motion_are_found_whole_and_in_place(
+    length_px: float, direction: float, reported: bool
+) -> None:
     image, truth = moved_board(length_px, direction, 0.2)
-    (found,) = detect_boards(image, [BOARD] if told else None)
-    assert len(found.grid) >= COLUMNS * ROWS - (0 if told else 1)
+    (found,) = detect_boards(image, [BOARD] if reported else None)
+    assert len(found.grid) >= COLUMNS * ROWS - (0 if reported else 1)
     apart = found.pixels[:, None] - truth
     nearest = np.linalg.norm(apart, axis=2).argmin(axis=1)
     assert len(set(nearest.tolist())) == len(found.grid)

@@ -17,8 +17,8 @@ from rigkit.core.patterns.circles import Circles
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.tags import unknown_tags
 from rigkit.detection.tags.codes import Codes, TagCode
-from rigkit.detection.tags.unknown_charuco import MarkerSightings, guessed_charuco
-from rigkit.detection.tags.unknown_tags import TagSightings
+from rigkit.detection.tags.unknown_charuco import MarkerObservations, guessed_charuco
+from rigkit.detection.tags.unknown_tags import TagObservations
 from rigkit.detection.unknown import LOOKING, difference, guess_board
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
@@ -95,16 +95,16 @@ def test_empty_squares_are_a_chessboard_without_reading_marks(mosaic: bool, monk
     def asked(*_: object) -> bool:
         raise AssertionError("marks are read")
 
-    monkeypatch.setattr(TagSightings, "look", asked)
-    monkeypatch.setattr(MarkerSightings, "look", asked)
+    monkeypatch.setattr(TagObservations, "look", asked)
+    monkeypatch.setattr(MarkerObservations, "look", asked)
     image = shown(Board("b", 8, 6, 60.0, 60.0))
     if mosaic:
         image = image.copy()
         image[::2, ::2] //= 2
-    told: list[tuple[str, int, int]] = []
-    guess = guess_board([image, image], lambda *what: told.append(what))
+    determined: list[tuple[str, int, int]] = []
+    guess = guess_board([image, image], lambda *what: determined.append(what))
     assert guess is not None and guess.board.size == (8, 6)
-    assert told == [(LOOKING, 0, 2), (LOOKING, 1, 2), (LOOKING, 2, 2)]
+    assert determined == [(LOOKING, 0, 2), (LOOKING, 1, 2), (LOOKING, 2, 2)]
 
 
 @pytest.mark.parametrize("pattern", [AprilGrid(0.3), Charuco("DICT_5X5_50", 45.0), Chessboard()])
@@ -140,14 +140,14 @@ def test_a_board_that_the_frame_cuts_in_every_image() -> None:
     images = [framed(CUT, 560, 250, (0.0, 200.0), s) for s in (0.0, 8.0)]
     images += [framed(CUT, 300, 480, (x, 0.0)) for x in (150.0, 160.0)]
     guess = guess_board(images)
-    assert guess is not None and guess.told
+    assert guess is not None and guess.determined
     assert guess.board.size == (10, 7) and guess.images == (0, 1, 2, 3)
 
 
 def test_images_that_do_not_tell_how_large_a_board_is() -> None:
     """No image shows the shorter side from end to end: it may be longer than what is seen."""
     guess = guess_board([framed(CUT, 560, 250, (0.0, y)) for y in (250.0, 200.0, 140.0)])
-    assert guess is not None and not guess.told
+    assert guess is not None and not guess.determined
     assert guess.board.columns == 10 and guess.board.rows in (5, 6)
 
 
@@ -165,7 +165,7 @@ def dimmed(columns: int, count: int) -> list[GreyImage]:
 def test_columns_at_the_rim_of_a_lens_are_of_the_board() -> None:
     """Three images show eight columns and two all ten: what is seen is there."""
     guess = guess_board([*dimmed(8, 3), *dimmed(11, 2)])
-    assert guess is not None and guess.told
+    assert guess is not None and guess.determined
     assert guess.board.size == (10, 7) and guess.images == (3, 4)
 
 
@@ -196,7 +196,7 @@ def test_markers_far_into_a_dictionary_are_told() -> None:
 def test_markers_of_a_blurred_board_are_read() -> None:
     """Edges as wide as modules: OpenCV reads none."""
     image = shown(Board("b", 8, 5, 60.0, 60.0, pattern=Charuco("DICT_4X4_1000", 45.0, first_marker=600)))
-    seen = MarkerSightings()
+    seen = MarkerObservations()
     assert seen.look(0, cv2.GaussianBlur(np.asarray(image), (0, 0), 2.0).astype(np.uint8))
     (kind, (numbers, _, _)) = seen.markers[0]
     assert kind == ("DICT_4X4_1000", False)
@@ -209,7 +209,7 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
     numbers = np.arange(len(places))
     misread = numbers.copy()
     misread[5] = 900
-    seen, kind = MarkerSightings(images=[0, 1]), ("DICT_4X4_1000", False)
+    seen, kind = MarkerObservations(images=[0, 1]), ("DICT_4X4_1000", False)
     seen.kinds[kind] = len(places)
     # No image shows its whole height.
     for part in (places[:, 1] < 4, places[:, 1] > 2):
@@ -228,7 +228,7 @@ def test_a_misread_marker_does_not_make_the_board_larger() -> None:
 )
 def test_markers_without_order_are_no_board(numbers: list[int], places: list[list[int]]) -> None:
     """Chance reads numbers of which none is where another has it."""
-    seen, kind = MarkerSightings(images=[0]), ("DICT_4X4_1000", False)
+    seen, kind = MarkerObservations(images=[0]), ("DICT_4X4_1000", False)
     seen.kinds[kind] = len(numbers)
     seen.markers.append((kind, (np.array(numbers), np.array(places), 0.75)))
     assert guessed_charuco(seen) == []
@@ -249,7 +249,7 @@ def of_nine_squares_a_row(legacy: bool) -> tuple[GreyImage, float, float]:
 def test_half_markers_tell_the_pattern_where_those_read_fit_both(legacy: bool) -> None:
     paper, left, right = of_nine_squares_a_row(legacy)
     paper[:, : int(left)] = paper[:, int(right) :] = 200.0
-    seen = MarkerSightings()
+    seen = MarkerObservations()
     assert seen.look(0, paper)
     assert len(guessed_charuco(seen)) == 2
     guess = guess_board([paper])
@@ -263,7 +263,7 @@ def test_markers_too_blurred_to_be_read_tell_the_pattern_by_their_place(legacy: 
     blurred = np.asarray(cv2.GaussianBlur(image, (0, 0), 6.0), np.float32)
     for end in (slice(0, int(left) + 50), slice(int(right) - 50, None)):
         image[:, end] = blurred[:, end]
-    seen = MarkerSightings()
+    seen = MarkerObservations()
     assert seen.look(0, image)
     boards = guessed_charuco(seen)
     assert len(boards) == 2
@@ -284,8 +284,8 @@ def test_numbers_that_repeat_in_a_lattice_are_chance(monkeypatch: pytest.MonkeyP
         return TagCode(codes.numbers[4 * (np.arange(count) % 3)], np.zeros(count, np.int64), np.ones(count))
 
     monkeypatch.setattr(unknown_tags, "read_tags", repeated)
-    monkeypatch.setattr(TagSightings, "look_alone", lambda *_: False)
-    assert not TagSightings().look(0, shown(Board("b", 8, 6, 60.0, 60.0)))
+    monkeypatch.setattr(TagObservations, "look_alone", lambda *_: False)
+    assert not TagObservations().look(0, shown(Board("b", 8, 6, 60.0, 60.0)))
 
 
 def test_circles_are_told_where_there_are_no_squares() -> None:

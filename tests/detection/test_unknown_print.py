@@ -15,8 +15,8 @@ from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.saddles.response import GreyImage, grey_image
 from rigkit.detection.tags import unknown_tags
-from rigkit.detection.tags.unknown_charuco import MarkerSightings
-from rigkit.detection.tags.unknown_tags import TagSightings
+from rigkit.detection.tags.unknown_charuco import MarkerObservations
+from rigkit.detection.tags.unknown_tags import TagObservations
 from rigkit.detection.unknown import guess_board
 from rigkit.detection.whole_charuco import next_row
 from rigkit.geometry.rigid3 import Rigid3
@@ -54,13 +54,13 @@ def test_tags_whose_edges_have_moved(pattern: AprilGrid, moved_px: int, rough: b
     found = guess.board.pattern
     assert (found.border, found.corner_squares) == (pattern.border, pattern.corner_squares)
     assert abs(found.spacing - pattern.spacing) <= (SPREAD_PLACES if rough else SURE_PLACES)
-    assert (guess.rough, guess.told) == (rough, not rough)
+    assert (guess.rough, guess.determined) == (rough, not rough)
 
 
 @pytest.mark.parametrize("sure", [False, True])
 def test_edges_that_have_moved_too_far_for_the_border(sure: bool) -> None:
     """Both borders are named, with modules as large and tags as far apart; one image that is sure is enough."""
-    seen = TagSightings()
+    seen = TagObservations()
     row, column = np.divmod(np.arange(12), 4)
     for image, either in enumerate((True, not sure)):
         own = unknown_tags._SeenTags(
@@ -106,15 +106,15 @@ def test_whether_a_board_has_one_more_row_of_markers(board: Board) -> None:
 
 
 @pytest.mark.parametrize(
-    ("level", "told"), [(235.0, False), (0.0, None)], ids=["paper", "outside of a corrected picture"]
+    ("level", "determined"), [(235.0, False), (0.0, None)], ids=["paper", "outside of a corrected picture"]
 )
-def test_bare_paper_ends_a_board_and_what_is_black_does_not(level: float, told: bool | None) -> None:
+def test_bare_paper_ends_a_board_and_what_is_black_does_not(level: float, determined: bool | None) -> None:
     noise = np.random.default_rng(0).normal(0.0, 1.0, (520, 720)).astype(np.float32)
     whole = [image + noise * (level > 0.0) for image in straight(MARKED)]
     for image in whole:
         # Seven rows of corners, and the squares beyond the last, end 460 px down.
         image[461:] = level + noise[461:] * (level > 0.0)
-    assert next_row(MARKED, whole) is told
+    assert next_row(MARKED, whole) is determined
 
 
 def test_paper_that_covers_a_part_of_a_row_does_not_end_a_board() -> None:
@@ -134,17 +134,17 @@ def test_paper_laid_aslant_over_a_board_does_not_end_it() -> None:
 
 def test_a_marked_board_that_the_frame_cuts_has_more_rows() -> None:
     guess = guess_board([image[:330].copy() for image in straight(MARKED)])
-    assert guess is not None and guess.board.pattern.type == "charuco" and not guess.told
+    assert guess is not None and guess.board.pattern.type == "charuco" and not guess.determined
     assert guess.sizes == ((10, 4),)
 
 
 def test_rows_that_were_not_read_are_added(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blur hides markers, not where they are."""
-    read = MarkerSightings.look
+    read = MarkerObservations.look
 
-    def upper(self: MarkerSightings, index: int, image: GreyImage) -> bool:
+    def upper(self: MarkerObservations, index: int, image: GreyImage) -> bool:
         return read(self, index, image[:380].copy())
 
-    monkeypatch.setattr(MarkerSightings, "look", upper)
+    monkeypatch.setattr(MarkerObservations, "look", upper)
     guess = guess_board(straight(MARKED))
-    assert guess is not None and guess.told and guess.board.size == (10, 7)
+    assert guess is not None and guess.determined and guess.board.size == (10, 7)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigkit.core.detections import BoardDetection
-from rigkit.detection.whole_grids import GridSeen, Size, grid_seen, sizes_beside, told_size
+from rigkit.detection.whole_grids import GridSeen, Size, board_size_in, grid_seen, other_sizes
 
 WHOLE = (True, True)
 ONE_SIDE = (True, False)
@@ -19,41 +19,41 @@ def seen(*sizes: Size, ends: tuple[bool, bool] = WHOLE) -> list[list[GridSeen]]:
 
 def test_corners_seen_outweigh_corners_missed() -> None:
     """The rim of a fisheye hides two columns of three images."""
-    assert told_size(seen((8, 7), (8, 7), (8, 7), (10, 7), (10, 7))) == (((10, 7),), (3, 4))
+    assert board_size_in(seen((8, 7), (8, 7), (8, 7), (10, 7), (10, 7))) == (((10, 7),), (3, 4))
 
 
 def test_a_row_beside_the_board_is_none_of_it() -> None:
-    assert told_size(seen(*[(9, 6)] * 4, (10, 6))) == (((9, 6),), (0, 1, 2, 3))
+    assert board_size_in(seen(*[(9, 6)] * 4, (10, 6))) == (((9, 6),), (0, 1, 2, 3))
 
 
 def test_images_that_do_not_decide_between_two_sizes() -> None:
-    told = told_size(seen(*[(9, 6)] * 5, (10, 6), (10, 6)))
-    assert told is not None and set(told[0]) == {(9, 6), (10, 6)}
+    reported = board_size_in(seen(*[(9, 6)] * 5, (10, 6), (10, 6)))
+    assert reported is not None and set(reported[0]) == {(9, 6), (10, 6)}
 
 
 def test_parts_of_other_lengths_are_no_board() -> None:
     """Two are alike by chance; each of the others has more, and none is seen twice."""
-    told = told_size(seen((8, 7), (8, 7), (9, 7), (10, 7), (11, 7)))
-    assert told is not None and len(told[0]) == 2 and told[0][0] == (8, 7)
+    reported = board_size_in(seen((8, 7), (8, 7), (9, 7), (10, 7), (11, 7)))
+    assert reported is not None and len(reported[0]) == 2 and reported[0][0] == (8, 7)
 
 
 def test_a_board_whose_last_line_blur_hides() -> None:
     """One side is seen to end, of the other a few corners of the last line are; no image shows more."""
-    assert told_size([*seen((8, 8), (8, 8), ends=ONE_SIDE), *seen((8, 5), (8, 6))]) == (((8, 8),), (0, 1))
+    assert board_size_in([*seen((8, 8), (8, 8), ends=ONE_SIDE), *seen((8, 5), (8, 6))]) == (((8, 8),), (0, 1))
     # Where the frame cuts it there may be more.
     cut = [[GridSeen((8, 8), ONE_SIDE, cut=True)]] * 2
-    assert told_size([*cut, *seen((8, 5), (8, 6))]) is None
+    assert board_size_in([*cut, *seen((8, 5), (8, 6))]) is None
 
 
 def test_another_board_beside_the_one_told_contradicts_nothing() -> None:
     both = [[GridSeen((9, 6), WHOLE), GridSeen((12, 9), WHOLE)]] * 2
-    assert told_size([*both, *seen(*[(9, 6)] * 3, (12, 9), (12, 9))]) == (((9, 6),), (0, 1, 2, 3, 4))
+    assert board_size_in([*both, *seen(*[(9, 6)] * 3, (12, 9), (12, 9))]) == (((9, 6),), (0, 1, 2, 3, 4))
 
 
 def test_what_most_images_show_beside_the_board() -> None:
     three = [GridSeen((8, 6), WHOLE), GridSeen((8, 6), WHOLE), GridSeen((7, 6), ONE_SIDE)]
-    assert sizes_beside([three, three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1, 2)) == ((7, 6),)
-    assert sizes_beside([three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1)) == ()
+    assert other_sizes([three, three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1, 2)) == ((7, 6),)
+    assert other_sizes([three, [GridSeen((8, 6), WHOLE)]], (8, 6), (0, 1)) == ()
 
 
 @pytest.mark.parametrize(("missing", "ends"), [(0, WHOLE), (5, ONE_SIDE)])

@@ -32,8 +32,8 @@ def test_one_camera(
     folder.mkdir()
     for path in pictures.glob("left*.jpg"):
         shutil.copy(path, folder)
-    said = run("one_camera.py", [str(folder), "9x6x30"], monkeypatch, capsys, tmp_path)
-    assert "held-out RMS" in said and "100% of it seen" in said
+    printed = run("one_camera.py", [str(folder), "9x6x30"], monkeypatch, capsys, tmp_path)
+    assert "held-out RMS" in printed and "100% of it seen" in printed
     assert (folder / "camera.yaml").is_file() and (folder / "calibration.html").is_file()
 
 
@@ -48,16 +48,16 @@ def test_stereo(
         for path in pictures.glob(f"{side}*.jpg"):
             shutil.copy(path, tmp_path / side / path.name.replace(side, "IMG"))
     sides = [str(tmp_path / side) for side in ("left", "right")]
-    said = run("stereo.py", [*sides, "9x6x30"], monkeypatch, capsys, tmp_path)
+    printed = run("stereo.py", [*sides, "9x6x30"], monkeypatch, capsys, tmp_path)
     # The cameras stand 90 mm apart.
-    assert "mm apart" in said and abs(float(said.split(" ±")[0].split()[-1]) - 90.0) < 0.3
+    assert "mm apart" in printed and abs(float(printed.split(" ±")[0].split()[-1]) - 90.0) < 0.3
     assert len(list((tmp_path / "rectified").rglob("*.jpg"))) == 2 * len(list((tmp_path / "left").iterdir()))
 
 
 def test_against_a_ruler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     lab = str(REPOSITORY / "datasets" / "lab-a")
-    said = run("against_a_ruler.py", [lab, "fisheye-standard"], monkeypatch, capsys, tmp_path)
-    assert "baseline" in said and "FAILS" not in said and "144 oriented points" in said
+    printed = run("against_a_ruler.py", [lab, "fisheye-standard"], monkeypatch, capsys, tmp_path)
+    assert "baseline" in printed and "FAILS" not in printed and "144 oriented points" in printed
 
 
 def test_every_example_is_listed() -> None:

@@ -47,13 +47,13 @@ def test_faults_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     from rigkit.core.errors import InputError
 
     call = ["fuzzing.readers:read_vnl", "case.toml"]
-    for error, said in (
+    for error, printed in (
         (ValueError("bad"), "ValueError: bad"),
         (InputError("no name; write one"), "does not name"),
         (InputError("case.toml: it is wrong"), "does not say what to do"),
     ):
         monkeypatch.setattr(readers, "read_vnl", raising(error))
-        assert said in str(fuzz.fault_of(call, "case.toml", sound=False))
+        assert printed in str(fuzz.fault_of(call, "case.toml", sound=False))
     monkeypatch.setattr(readers, "read_vnl", raising(InputError("case.toml: one line is wrong; correct it")))
     assert fuzz.fault_of(call, "case.toml", sound=False) is None
     assert "though sound" in str(fuzz.fault_of(call, "case.toml", sound=True))
@@ -86,10 +86,10 @@ def test_a_few_damaged_inputs_of_each_class(
 def test_the_harness_counts_what_it_finds(tmp_path: Path, seeds: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """In processes of their own: one that ends badly, here for want of memory, is a finding, and the rest goes on."""
     shutil.copytree(seeds, tmp_path / "seeds")
-    told = ["--classes", "truth-csv", "--count", "2", "--seed", "1", "--keep", str(tmp_path)]
-    assert fuzz.main(told) == 0
+    reported = ["--classes", "truth-csv", "--count", "2", "--seed", "1", "--keep", str(tmp_path)]
+    assert fuzz.main(reported) == 0
     assert "truth-csv: 2 cases, 0 findings" in capsys.readouterr().out
-    assert fuzz.main([*told, "--memory-gb", "0.001"]) == 1
+    assert fuzz.main([*reported, "--memory-gb", "0.001"]) == 1
     assert "truth-csv: 2 cases, 2 findings" in capsys.readouterr().out
 
 
@@ -97,7 +97,7 @@ def test_a_case_that_could_not_be_made_is_a_finding(tmp_path: Path, capsys: pyte
     """The process ends before it notes anything: no good files to change are there."""
     (tmp_path / "seeds").mkdir()
     for label in ("truth-csv", "api"):
-        told = ["--classes", label, "--count", "1", "--seed", "1", "--keep", str(tmp_path)]
+        reported = ["--classes", label, "--count", "1", "--seed", "1", "--keep", str(tmp_path)]
         lost = [] if label == "truth-csv" else ["--memory-gb", "0.00001"]
-        assert fuzz.main([*told, *lost]) == 1
+        assert fuzz.main([*reported, *lost]) == 1
         assert f"{label}: 1 cases, 1 findings" in capsys.readouterr().out

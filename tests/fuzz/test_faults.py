@@ -84,8 +84,8 @@ def rigkit(*words: str, **options: object) -> subprocess.Popen[str]:
 
 def ended(program: subprocess.Popen[str]) -> tuple[int, list[str]]:
     """Return the exit code, and what was said of an error."""
-    _, said = program.communicate(timeout=PATIENCE_S)
-    return program.returncode, [line for line in said.splitlines() if line.startswith("rigkit: ") or "Error" in line]
+    _, printed = program.communicate(timeout=PATIENCE_S)
+    return program.returncode, [line for line in printed.splitlines() if line.startswith("rigkit: ") or "Error" in line]
 
 
 @pytest.mark.parametrize("kills", [1, pytest.param(60, marks=pytest.mark.slow)])
@@ -136,12 +136,12 @@ def test_a_full_disk(words: str, place: Path) -> None:
     before, text = sorted(place.rglob("*")), io.StringIO()
     with redirect_stdout(text), redirect_stderr(text), small_files():
         code = main(words.split())
-    said = [line for line in text.getvalue().splitlines() if line.startswith("rigkit: ") or "Error" in line]
+    printed = [line for line in text.getvalue().splitlines() if line.startswith("rigkit: ") or "Error" in line]
     if code == 0:
         for path in set(place.rglob("*")) - set(before):
             assert path.is_dir() or path.stat().st_size <= 600
         return
-    assert code == 2 and len(said) == 1 and "File too large" in said[0] and "out/" in said[0]
+    assert code == 2 and len(printed) == 1 and "File too large" in printed[0] and "out/" in printed[0]
     assert sorted(place.rglob("*")) == before
 
 
@@ -150,8 +150,8 @@ def test_a_log_that_cannot_grow_does_not_end_the_work(place: Path) -> None:
     (place / "run.log").write_text("2026-01-01 00:00:00,000 DEBUG rigkit.cli.main: " + 552 * "x" + "\n")
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as text, small_files():
         main(words.split())
-    said = text.getvalue()
-    assert "Traceback" not in said and "Logging error" not in said and said.count("the log ends here") == 1
+    printed = text.getvalue()
+    assert "Traceback" not in printed and "Logging error" not in printed and printed.count("the log ends here") == 1
 
 
 @pytest.mark.parametrize("words", COMMANDS)
@@ -166,8 +166,8 @@ def test_a_folder_that_may_not_be_written(words: str, seeds: Path) -> None:
         python = Path(sys.executable)
         if user and not all(p.stat().st_mode & stat.S_IXOTH for p in (*python.parents, *python.resolve().parents)):
             pytest.skip("nobody may run this Python")
-        code, said = ended(rigkit(*words.split(), cwd=place, **user))
-        assert code == 2 and len(said) == 1 and "no permission" in said[0] and "out" in said[0]
+        code, printed = ended(rigkit(*words.split(), cwd=place, **user))
+        assert code == 2 and len(printed) == 1 and "no permission" in printed[0] and "out" in printed[0]
     finally:
         for path in (place, *place.rglob("*")):
             path.chmod(0o755)
@@ -180,7 +180,7 @@ def test_two_runs_at_once(force: bool, place: Path) -> None:
     outcomes = [ended(program) for program in [rigkit(*words) for _ in range(3)]]
     codes = sorted(code for code, _ in outcomes)
     assert codes == ([0, 0, 0] if force else [0, 2, 2])
-    assert all(len(said) == 1 and "--force" in said[0] for code, said in outcomes if code)
+    assert all(len(printed) == 1 and "--force" in printed[0] for code, printed in outcomes if code)
     results = sorted((place / "out").iterdir())
     assert [p.name for p in results] == ["board.pdf", "board.svg", "board.toml"]
     assert all(map(whole, results))
@@ -207,8 +207,8 @@ def test_a_worker_that_is_killed(place: Path) -> None:
         victim = next((pid for pid in _children(program.pid) if _is_worker(pid)), 0)
         time.sleep(0.01)
     os.kill(victim, signal.SIGKILL)
-    code, said = ended(program)
-    assert code == 2 and len(said) == 1 and "-j 1" in said[0]
+    code, printed = ended(program)
+    assert code == 2 and len(printed) == 1 and "-j 1" in printed[0]
     assert not (place / "new.csv").exists()
 
 

@@ -18,7 +18,7 @@ from fuzzing.kinds import KINDS
 from rigkit.calibration.hand_eye import HandEye
 from rigkit.cli.main import main
 from rigkit.coach.guide import GuideOptions
-from rigkit.coach.sources import watched_frames
+from rigkit.coach.sources import frames_of_folders
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.calibrations.history_file import load_history
@@ -46,18 +46,18 @@ def test_a_check(capsys: pytest.CaptureFixture[str]) -> None:
     codes, words = [], []
     for images in (["pairs/view1.png"], ["pairs/bad.png", "pairs/view1.png"]):
         codes.append(main([*CHECK, *images, "--json"]))
-        said = capsys.readouterr()
-        words.append(json.loads(said.out))
+        printed = capsys.readouterr()
+        words.append(json.loads(printed.out))
     # Nothing contradicts it, but not all could be looked at.
     assert codes == [0, 2] and words[0]["chance"] == words[1]["chance"]
-    assert "pairs/bad.png" in said.err and len(words[1]["unreadable"]) == 1
+    assert "pairs/bad.png" in printed.err and len(words[1]["unreadable"]) == 1
     assert main([*CHECK, "pairs/bad.png"]) == 2 and "bad.png" in capsys.readouterr().err
 
 
 def test_identify_and_handeye(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(["board", "identify", "pairs"]) == 2
-    said = capsys.readouterr()
-    assert "5 x 4" in said.out and "seen in 2 of 2" in said.out and "pairs/bad.png" in said.err
+    printed = capsys.readouterr()
+    assert "5 x 4" in printed.out and "seen in 2 of 2" in printed.out and "pairs/bad.png" in printed.err
     assert main(["board", "identify", "pairs", "-o", "image.png"]) == 2 and "--square-mm" in capsys.readouterr().err
 
     def solved(camera: object, views: list[object], stands: list[object]) -> HandEye:
@@ -76,8 +76,8 @@ def test_identify_and_handeye(capsys: pytest.CaptureFixture[str], monkeypatch: p
 def test_videos(capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture) -> None:
     Path("bad.avi").write_bytes(b"no video")
     assert main(["detect", "-j", "1", "--board", "floor.toml", "bad.avi", "film.avi", "image.png"]) == 2
-    said = capsys.readouterr()
-    assert "image.png" in said.out and "film-frames" in said.out and "'bad.avi'" in said.err
+    printed = capsys.readouterr()
+    assert "image.png" in printed.out and "film-frames" in printed.out and "'bad.avi'" in printed.err
     cut("film.avi", "half.avi")
     frames_of_video(Path("half.avi"), Path("half"), [BOARD])
     assert "half.avi" in caplog.text and "of 8 frames can be decoded" in caplog.text
@@ -108,7 +108,7 @@ def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pyte
     caplog.clear()
     for path in (place / "pairs").iterdir():
         os.utime(path, (0.0, 0.0))  # written long ago
-    assert len(list(watched_frames([place / "pairs"], until_idle_s=0.1))) == 2 and "bad.png" in caplog.text
+    assert len(list(frames_of_folders([place / "pairs"], until_idle_s=0.1))) == 2 and "bad.png" in caplog.text
     (place / "coach/session.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(InputError, match=r"session\.toml"):
         open_coach(options)
@@ -117,15 +117,15 @@ def test_the_coach(place: Path, capsys: pytest.CaptureFixture[str], caplog: pyte
 def test_many_data_sets_and_captures(capsys: pytest.CaptureFixture[str]) -> None:
     Path("other/dataset.toml").write_text("schema = ")
     assert main(["validate", "other", "dataset.toml", "-o", "new", "-j", "1", "--no-pictures"]) in (2, 3)
-    said = capsys.readouterr()
-    assert "other/dataset.toml" in said.err and "'dataset.toml'" in said.err and "small" in said.out
+    printed = capsys.readouterr()
+    assert "other/dataset.toml" in printed.err and "'dataset.toml'" in printed.err and "small" in printed.out
     first = Path("catalogue/small.toml").read_text()
     Path("away.png").write_bytes(b"another picture")
     text = first.replace('"small"', '"second"') + f'\n[urls]\n"left.png" = "file://{Path("away.png").absolute()}"\n'
     Path("catalogue/a.toml").write_text(text)
     assert main(["fetch", "second", "small", "--catalogue", "catalogue", "-o", "new"]) == 2
-    said = capsys.readouterr()
-    assert "second: " in said.err and "small: 0 files" in said.out
+    printed = capsys.readouterr()
+    assert "second: " in printed.err and "small: 0 files" in printed.out
 
 
 def test_a_register_loses_nothing(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,5 +186,5 @@ def test_an_image_of_another_size_than_its_camera(words: str, capsys: pytest.Cap
     data["camera"]["size_px"].reverse()
     Path("turned.json").write_text(json.dumps(data))
     assert main(words.split()) == 2
-    said = capsys.readouterr().err
-    assert "turned.json" in said and next(word for word in words.split() if word.endswith(".png")) in said
+    printed = capsys.readouterr().err
+    assert "turned.json" in printed and next(word for word in words.split() if word.endswith(".png")) in printed

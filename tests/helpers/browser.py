@@ -46,6 +46,6 @@ def probed(text: str, folder: Path) -> list[str]:
     """Return what the probe in a page left in `document.body.dataset.probe`, split at its bars."""
     page = folder / "page.html"
     page.write_text(text, encoding="utf-8")
-    told = re.search(r'data-probe="([^"]*)"', loaded(page))
-    assert told is not None
-    return told[1].split("|")
+    reported = re.search(r'data-probe="([^"]*)"', loaded(page))
+    assert reported is not None
+    return reported[1].split("|")

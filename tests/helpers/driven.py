@@ -45,8 +45,8 @@ class DrivenPage:
         self._rest, self._count = b"", 0
         self._session: str | None = None
         pages = [t for t in self._ask("Target.getTargets")["targetInfos"] if t["type"] == "page"]
-        told = self._ask("Target.attachToTarget", targetId=pages[0]["targetId"], flatten=True)
-        self._session = told["sessionId"]
+        reported = self._ask("Target.attachToTarget", targetId=pages[0]["targetId"], flatten=True)
+        self._session = reported["sessionId"]
         self._ask("Runtime.enable")
         self._ask("Log.enable")
         self._ask("Page.enable")
@@ -93,13 +93,13 @@ class DrivenPage:
             asked["sessionId"] = self._session
         os.write(self._write, json.dumps(asked).encode() + b"\0")
         while True:
-            said = self._next()
-            if said.get("id") == self._count:
-                assert "error" not in said, said
-                result: dict[str, Any] = said["result"]
+            printed = self._next()
+            if printed.get("id") == self._count:
+                assert "error" not in printed, printed
+                result: dict[str, Any] = printed["result"]
                 return result
-            if said.get("method") in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
-                self.complaints.append(json.dumps(said["params"])[:500])
+            if printed.get("method") in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
+                self.complaints.append(json.dumps(printed["params"])[:500])
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
@@ -109,5 +109,5 @@ class DrivenPage:
             assert more, "the browser has ended"
             self._rest += more
         one, self._rest = self._rest.split(b"\0", 1)
-        told: dict[str, Any] = json.loads(one)
-        return told
+        reported: dict[str, Any] = json.loads(one)
+        return reported

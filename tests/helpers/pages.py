@@ -16,7 +16,7 @@ class Page(HTMLParser):
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.said: list[str] = []
+        self.printed: list[str] = []
         self.tables: list[tuple[str, list[list[str]]]] = []
         self._open: list[str] = []
         self._first = 0
@@ -45,7 +45,7 @@ class Page(HTMLParser):
         if tag in ("td", "th"):
             self.tables[-1][1][-1].append(words)
         if tag == "p" and self._first:
-            self.said.append(words)
+            self.printed.append(words)
         if tag in ("h3", "p", "td", "th"):
             self._words = ""
         self._first -= self._first > 0
@@ -73,10 +73,10 @@ def assert_all_is_in(html: str, page: dict[str, Any], also: tuple[str, ...] = ()
     read = Page(html)
     words, tables = facts_of(page)
     known = [plain(w) for w in words]
-    assert read.said
-    for said in read.said:
-        if said and not said.startswith(also):
-            assert any(plain(said) in w or (w and w in plain(said)) for w in known), said
+    assert read.printed
+    for printed in read.printed:
+        if printed and not printed.startswith(also):
+            assert any(plain(printed) in w or (w and w in plain(printed)) for w in known), printed
     shown = [(title, rows) for title, rows in read.tables if title != "Provenance"]
     assert shown
     cells = 0

@@ -18,7 +18,7 @@ from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import plan_views
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import SentinelCheck, check_views
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import monitored_camera
 
 NOISE_PX = 0.03
 CHANGED_PX = 0.25
@@ -41,7 +41,7 @@ def poses_held(name: str, count: int, reach: Reach | None = None) -> list[Rigid3
 def checked(calibration: Calibration, camera: Camera, rng: np.random.Generator) -> SentinelCheck:
     poses = poses_held("reg", 3)
     views = [FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
-    return check_views(watched_camera(calibration, "cam"), views)
+    return check_views(monitored_camera(calibration, "cam"), views)
 
 
 def changed_lens(what: Callable[[np.ndarray], np.ndarray]) -> Camera:

@@ -74,9 +74,9 @@ def test_nothing_is_said_of_boards_that_fit_are_covered_or_moved(rng: np.random.
     scene = trihedral_scene(rng, EQUAL, regular_camera())
     one, two = both_views(scene, rng)
 
-    def said(first: list[BoardDetection], second: list[BoardDetection]) -> int:
+    def printed(first: list[BoardDetection], second: list[BoardDetection]) -> int:
         return len(fitting_squares(first, second, EQUAL, scene.camera1, scene.camera2))
 
-    assert said(one, two) == said(one[:2], two) == said(one[:1], two) == 0
+    assert printed(one, two) == printed(one[:2], two) == printed(one[:1], two) == 0
     moved = replace(two[0], pixels=two[0].pixels @ np.array([[0.9, 0.2], [-0.2, 0.9]]) + [90.0, -60.0])
-    assert said(one, [moved, *two[1:]]) == 0
+    assert printed(one, [moved, *two[1:]]) == 0

@@ -44,9 +44,9 @@ def test_boards_in_words() -> None:
     assert plain is not None
     assert (plain.size, plain.square_x_mm) == ((9, 6), 25.0)
     for as_people_say in ("9x6, 25 mm", "9x6x25mm", "9x6,25"):
-        said = board_in_words(as_people_say)
-        assert said is not None
-        assert (said.board_id, said.size, said.square_x_mm) == (plain.board_id, plain.size, 25.0)
+        printed = board_in_words(as_people_say)
+        assert printed is not None
+        assert (printed.board_id, printed.size, printed.square_x_mm) == (plain.board_id, plain.size, 25.0)
     assert board_in_words("board.toml") is None
     with pytest.raises(InputError, match="say how large a square is as well: 9x6x25"):
         board_of_words("9x6")

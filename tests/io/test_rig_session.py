@@ -86,8 +86,8 @@ def test_reads_boards_on_one_mount(tmp_path: Path) -> None:
 )
 def test_bad_files_are_explained(text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["calibrate", str(session(tmp_path, text))]) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert words in printed and printed.count("\n") == 1
 
 
 def test_frames() -> None:

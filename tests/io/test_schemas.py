@@ -182,8 +182,10 @@ def test_every_key_is_said_and_every_schema_is_one(capsys: pytest.CaptureFixture
         assert main(["schema", name]) == 0
         assert json.loads(capsys.readouterr().out) == schema
     for name in ("board", "session", "dataset", "study", "calibration", "rig"):
-        untold = [key for key, _, words in key_rows(SCHEMAS[name]) if not words.removesuffix("(optional)").strip()]
-        assert len(untold) <= 9, (name, untold)
+        undocumented = [
+            key for key, _, words in key_rows(SCHEMAS[name]) if not words.removesuffix("(optional)").strip()
+        ]
+        assert len(undocumented) <= 9, (name, undocumented)
     assert main(["schema", "session", "--keys"]) == 0
     assert "cameras[].calibration" in capsys.readouterr().out
     assert main(["schema", "nothing"]) == 2

@@ -28,5 +28,5 @@ def test_an_editor_s_lock_is_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_table_goes_into_a_line_of_toml() -> None:
-    said = {"a": 1, "words": ["x", "y"]}
-    assert tomllib.loads(f"one = {toml_text(said)}") == {"one": said}
+    printed = {"a": 1, "words": ["x", "y"]}
+    assert tomllib.loads(f"one = {toml_text(printed)}") == {"one": printed}

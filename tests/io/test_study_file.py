@@ -100,13 +100,13 @@ def test_processes_and_interruptions_do_not_change_the_numbers(tmp_path: Path) -
     alone = run_study(study)
     assert [chunk.shape[3] for chunk in alone] == [50, 50, 20]
     parts = tmp_path / "parts"
-    told: list[int] = []
+    reported: list[int] = []
 
     class Interrupt(Exception):
         pass
 
     def stop_after_two(what: str, done: int, total: int) -> None:
-        told.append(done)
+        reported.append(done)
         if done == 2:
             raise Interrupt
 
@@ -116,9 +116,9 @@ def test_processes_and_interruptions_do_not_change_the_numbers(tmp_path: Path) -
     assert len(left) == 2
     # A damaged part is computed again, not trusted.
     left[0].write_bytes(left[0].read_bytes()[:100])
-    told.clear()
-    resumed = run_study(study, jobs=2, parts=parts, progress=lambda what, done, total: told.append(done))
-    assert told == [1, 2, 3]
+    reported.clear()
+    resumed = run_study(study, jobs=2, parts=parts, progress=lambda what, done, total: reported.append(done))
+    assert reported == [1, 2, 3]
     for first, second in zip(alone, resumed, strict=True):
         np.testing.assert_array_equal(first, second)
     assert not parts.exists()

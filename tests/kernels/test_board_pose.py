@@ -26,9 +26,9 @@ def test_residuals_of_boards_are_those_of_their_points(sets: tuple[int, ...], rn
     expected = residual, np.concatenate([-d_residuals_d_point @ skew(turned), d_residuals_d_point], axis=-1)
     found = ray_residuals(rays, bases, points, rotation, translation)
     for one, other in zip(found, expected, strict=True):
-        usual = np.arange(7) != 2
-        limit = ROUNDING * np.abs(other[:, usual]).max()
-        np.testing.assert_allclose(one[:, usual], other[:, usual], rtol=0.0, atol=limit)
+        typical = np.arange(7) != 2
+        limit = ROUNDING * np.abs(other[:, typical]).max()
+        np.testing.assert_allclose(one[:, typical], other[:, typical], rtol=0.0, atol=limit)
         # Its residual is rounding over almost nothing: so large that nobody takes it for a fit.
         assert np.isfinite(one).all()
     alone = ray_residuals(rays[(0,) * len(sets)], bases[(0,) * len(sets)], points, rotation[0], translation[0])
@@ -37,5 +37,5 @@ def test_residuals_of_boards_are_those_of_their_points(sets: tuple[int, ...], rn
     there = turned[0] + translation[0]
     of_points = point_residuals(rays[(0,) * len(sets)], bases[(0,) * len(sets)], there)
     for one, other in zip(of_points, (found[0][0], found[1][0, :, :, 3:]), strict=True):
-        usual = np.arange(7) != 2
-        np.testing.assert_allclose(one[usual], other[usual], rtol=0.0, atol=ROUNDING * np.abs(other[usual]).max())
+        typical = np.arange(7) != 2
+        np.testing.assert_allclose(one[typical], other[typical], rtol=0.0, atol=ROUNDING * np.abs(other[typical]).max())

@@ -42,13 +42,13 @@ def test_a_blur_that_differs_with_the_direction_comes_from_what_fits_leave(name:
     matrix, bend = (np.array(part) for part in CIRCLES[name])
     centre, uneven = np.array([31.3, 29.8]), np.array([0.9, -0.5])
     image = picture((64, 60), centre, matrix, bend, 1.4, 200.0, -170.0, np.zeros(2), (0.9, -0.5)).astype(np.float32)
-    told = np.zeros(2)
+    projected = np.zeros(2)
     for _ in range(5):
         args = (image, centre[None], matrix[None], bend[None], np.array([1.2]), np.array([1.7]))
-        fit = fit_circles(*args, uneven_px2=told)
+        fit = fit_circles(*args, uneven_px2=projected)
         one, two, xx, xy, yy = fit.uneven[0]
-        told = told + np.linalg.solve([[xx, xy], [xy, yy]], [one, two])
-    assert told == pytest.approx(uneven, abs=UNEVEN_PX2)
+        projected = projected + np.linalg.solve([[xx, xy], [xy, yy]], [one, two])
+    assert projected == pytest.approx(uneven, abs=UNEVEN_PX2)
     assert fit.valid.all() and np.abs(fit.pixels[0] - centre).max() < WIDE_SERIES_PX
 
 

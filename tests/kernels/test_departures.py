@@ -33,11 +33,11 @@ def test_amounts_displace_as_defined(rng: np.random.Generator) -> None:
     )
 
 
-@pytest.mark.parametrize("told", [0.0, 1.0, 1e6])
-def test_amounts_are_averaged_as_defined(told: float, rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("usable", [0.0, 1.0, 1e6])
+def test_amounts_are_averaged_as_defined(usable: float, rng: np.random.Generator) -> None:
     """Where nothing is told, a little, and all: other sizes are the likely ones."""
     root = rng.normal(size=(DISPLACEMENTS, 2 * DISPLACEMENTS))
-    information = told * root @ root.T
+    information = usable * root @ root.T
     score = information @ rng.normal(0.0, 0.1, DISPLACEMENTS)
     sizes = np.geomspace(1e-3, 1.0, 5)
     ours, theirs = (one(information, score, sizes) for one in (averaged_amounts, reference.averaged_amounts))
@@ -51,16 +51,16 @@ def test_products_are_as_defined(parameters: int, rng: np.random.Generator) -> N
     count = int(counts.sum())
     d_pixels_d_point, d_pixels_d_parameters = rng.normal(size=(2, 3, count)), rng.normal(size=(2, parameters, count))
     lever, pixels = rng.normal(size=(3, count)), rng.uniform(0.0, 640.0, (count, 2))
-    residuals, sigmas, told = rng.normal(size=(count, 2)), rng.uniform(0.1, 2.0, parameters), rng.random(count) < 0.8
-    residuals[~told] = d_pixels_d_point[..., ~told] = np.nan
+    residuals, sigmas, usable = rng.normal(size=(count, 2)), rng.uniform(0.1, 2.0, parameters), rng.random(count) < 0.8
+    residuals[~usable] = d_pixels_d_point[..., ~usable] = np.nan
     uv = (pixels[:, 0], pixels[:, 1])
     corners = LensCorners.make(
-        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, uv, residuals, told, counts, SIZE
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, uv, residuals, usable, counts, SIZE
     )
     ours = corners.products()
     view = np.repeat(np.arange(len(counts)), counts)
     theirs = reference.products(
-        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, pixels, residuals, told, view, SIZE
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, pixels, residuals, usable, view, SIZE
     )
     for one, other in zip(ours, theirs, strict=True):
         assert np.abs(one - other).max() < ROUNDING * np.abs(other).max()

@@ -50,7 +50,7 @@ def test_local_fits(
     plain = fitted()
     clear = plain.support > 15
     assert clear.sum() > 60
-    for name in ("pixels", "along_column", "along_row", "bend_column", "bend_row", "support", "gain"):
+    for name in ("pixels", "along_column", "along_row", "curvature_column", "curvature_row", "support", "gain"):
         one, two = getattr(compiled, name), getattr(plain, name)
         assert one.shape == two.shape
         assert np.abs(one - two)[clear].max() < ROUNDING * (1.0 + np.abs(two).max()), name

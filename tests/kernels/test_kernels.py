@@ -40,7 +40,7 @@ def test_a_whole_library_of_these_sources_is_taken(copy: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "change", "said"),
+    ("file", "change", "printed"),
     [
         (library_name(), None, "are missing"),
         (Path(library_name()).with_suffix(".json").name, None, "no record"),
@@ -52,13 +52,13 @@ def test_a_whole_library_of_these_sources_is_taken(copy: Path) -> None:
         ("pose_minimum.c", None, "are stale"),
     ],
 )
-def test_what_is_missing_cut_or_stale_is_refused(copy: Path, file: str, change: object, said: str) -> None:
+def test_what_is_missing_cut_or_stale_is_refused(copy: Path, file: str, change: object, printed: str) -> None:
     path = copy / file
     before = path.read_bytes()
     path.unlink()
     if callable(change):
         path.write_bytes(change(before))
-    with pytest.raises(InstallationError, match=said) as error:
+    with pytest.raises(InstallationError, match=printed) as error:
         kernels.__wrapped__()
     assert "pip install" in str(error.value)
 

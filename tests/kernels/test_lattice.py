@@ -90,7 +90,7 @@ def test_excess_scatter(
 
 
 def test_scatter_about_surfaces(rng: np.random.Generator) -> None:
-    told = 0
+    projected = 0
     for _ in range(60):
         rows, columns = (int(count) for count in rng.integers(2, 7, 2))
         cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).astype(np.float64)
@@ -100,8 +100,8 @@ def test_scatter_about_surfaces(rng: np.random.Generator) -> None:
         rules = scatter._rules()
         ours, theirs = native.surface_scatter(pixels, sigma, rules), reference.surface_scatter(pixels, sigma, rules)
         assert np.allclose(ours, theirs, rtol=1e-9, atol=0.0, equal_nan=True)
-        told += int(np.count_nonzero(np.isfinite(theirs)))
-    assert told >= 20
+        projected += int(np.count_nonzero(np.isfinite(theirs)))
+    assert projected >= 20
 
 
 def test_scatter_of_a_flat_board_is_no_perspective(rng: np.random.Generator) -> None:

@@ -51,9 +51,9 @@ def test_steps_agree(dtype: type, rng: np.random.Generator) -> None:
     start = truth + rng.uniform(-0.4, 0.4, truth.shape)
     # One at the frame, of whose window a part is seen.
     start[-1] += [40.0, 20.0]
-    curvature, aside = rng.uniform(-1e-3, 1e-3, (len(start), 2)), rng.uniform(6.0, 18.0, len(start))
-    ours, found = light_steps(image, start, sides, curvature, BLUR_PX, aside)
-    theirs, seen = reference.light_steps(image, start, sides, curvature, BLUR_PX, aside)
+    curvature, lateral = rng.uniform(-1e-3, 1e-3, (len(start), 2)), rng.uniform(6.0, 18.0, len(start))
+    ours, found = light_steps(image, start, sides, curvature, BLUR_PX, lateral)
+    theirs, seen = reference.light_steps(image, start, sides, curvature, BLUR_PX, lateral)
     assert (found == seen).all()
     assert np.abs(ours.pixels - theirs[:, :2])[found].max() < SERIES_PX
     others = np.column_stack([ours.sigma_px, ours.towards, ours.place, ours.width, ours.left])

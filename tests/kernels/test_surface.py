@@ -71,25 +71,27 @@ def test_polynomials(bend: float, rng: np.random.Generator) -> None:
     assert best == int(whole.misses.argmin())
     np.testing.assert_allclose(ours.misses[:tried], whole.misses, rtol=1e-6)
     assert ours.plain == int(np.argmax(whole.misses <= HARDLY_MORE * whole.misses.min()))
-    off, leverage = np.hypot(*whole.foretold[best].T), whole.leverage[:, TERMS_OF_DEGREE[best] - 1]
+    off, leverage = np.hypot(*whole.predicted[best].T), whole.leverage[:, TERMS_OF_DEGREE[best] - 1]
     np.testing.assert_allclose(ours.off, off, atol=SAME)
     np.testing.assert_allclose(ours.gain, np.sqrt(leverage / (1.0 - leverage)), atol=1e-9)
     assert ours.scatter == pytest.approx(np.median(ours.off / np.hypot(1.0, ours.gain)))
     wanted = rng.uniform([-2.0, -2.0], [13.0, 11.0], (50, 2))
-    plain, surest = (ours.added_to(None, wanted, surest=which) for which in (False, True))
+    plain, most_certain = (ours.added_to(None, wanted, most_certain=which) for which in (False, True))
     for one, two in zip((plain.pixels, plain.sides, plain.curvatures), whole.at(wanted, ours.plain), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
-    for one, two in zip((surest.pixels, surest.gain), whole.surest(wanted, tried), strict=True):
+    for one, two in zip((most_certain.pixels, most_certain.gain), whole.most_certain(wanted, tried), strict=True):
         np.testing.assert_allclose(one, two, atol=100.0 * SAME)
-    np.testing.assert_array_equal(plain.rows[:, 2:10], surest.rows[:, 2:10])
+    np.testing.assert_array_equal(plain.rows[:, 2:10], most_certain.rows[:, 2:10])
 
 
 def test_lines_of_a_surface(rng: np.random.Generator) -> None:
     places, pixels = seen(rng, bend=0.6)
     polynomials = Polynomials.through(places, pixels, len(places) // 2, MAX_LEVERAGE)
     base = projected(np.array([[3.0, 0.1, 2.0], [-0.2, 2.0, 1.0], [0.01, 0.02, 1.0]]), places)
-    surface = polynomials.added_to(base, places, surest=False)
-    np.testing.assert_allclose(surface.pixels, base.pixels + polynomials.added_to(None, places, surest=False).pixels)
+    surface = polynomials.added_to(base, places, most_certain=False)
+    np.testing.assert_allclose(
+        surface.pixels, base.pixels + polynomials.added_to(None, places, most_certain=False).pixels
+    )
     lengths = np.linalg.norm(surface.sides, axis=2)
     bent = surface.sides[..., 0] * surface.curvatures[..., 1] - surface.sides[..., 1] * surface.curvatures[..., 0]
     np.testing.assert_allclose(surface.curvature, bent / lengths**3)

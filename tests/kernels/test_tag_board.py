@@ -132,10 +132,10 @@ def test_most_tags_tell_the_place_and_others_do_not(turn: int, rng: np.random.Ge
     turns = np.full(len(cells), -turn % 4)
     places[:3] += rng.integers(-2, 3, (3, 2))
     turns[3:5] = rng.integers(0, 4, 2)
-    votes, told, shift = voted_place(lattice, cells, turns, places)
+    votes, projected, shift = voted_place(lattice, cells, turns, places)
     wanted = reference.voted_place(lattice, cells, turns, places)
-    assert (votes, told, shift.tolist()) == (wanted[0], wanted[1], wanted[2].tolist())
-    assert (told, shift.tolist()) == (turn, [4, -2])
+    assert (votes, projected, shift.tolist()) == (wanted[0], wanted[1], wanted[2].tolist())
+    assert (projected, shift.tolist()) == (turn, [4, -2])
 
 
 def test_ties_between_places_go_to_the_first(rng: np.random.Generator) -> None:

@@ -20,7 +20,7 @@ BENT = 0.02 * np.array([[1.0, -0.5, 0.8, 0.3, 0.2, -0.3, 0.1], [-0.6, 0.9, 0.4, 
 SHAPES = {"straight": (0.0, 0.0), "aslant": (0.35, -0.1), "bent": (0.2, 0.3)}
 
 
-def told(name: str) -> tuple[np.ndarray, np.ndarray]:
+def projected(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the polynomials of a tag some 12 px wide, and the ink of it, of tags beside and squares between."""
     shear, turn = SHAPES[name]
     linear = np.linalg.inv(np.array([[0.75, shear], [turn, 0.75]]))
@@ -35,7 +35,7 @@ def told(name: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("blur_px", [0.5, 0.76, 1.0])
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_picture_of_the_model_gives_its_numbers_back(name: str, blur_px: float) -> None:
-    maps, ink = told(name)
+    maps, ink = projected(name)
     image = picture((42, 40), maps, CENTRE, SCALE, MOVES, ink, BREAKS, blur_px, 190.0, 160.0).astype(np.float32)
     found = fit_tags(
         *(image, maps[None], CENTRE[None], np.array([SCALE]), ink[None], BREAKS, 0.2),
@@ -48,7 +48,7 @@ def test_a_picture_of_the_model_gives_its_numbers_back(name: str, blur_px: float
 
 
 def test_sigmas_are_those_of_the_errors(rng: np.random.Generator) -> None:
-    maps, ink = told("bent")
+    maps, ink = projected("bent")
     clean = picture((42, 40), maps, CENTRE, SCALE, MOVES, ink, BREAKS, 0.76, 190.0, 160.0)
     off = []
     for _ in range(100):
@@ -64,7 +64,7 @@ def test_sigmas_are_those_of_the_errors(rng: np.random.Generator) -> None:
 
 def test_what_is_left_is_noise_where_corners_were_right_from_the_start(rng: np.random.Generator) -> None:
     """Then the first step moves nothing, and the light is not fitted yet."""
-    maps, ink = told("straight")
+    maps, ink = projected("straight")
     image = picture((42, 40), maps, CENTRE, SCALE, np.zeros((4, 2)), ink, BREAKS, 0.76, 190.0, 160.0)
     found = fit_tags(
         (image + rng.normal(0.0, 2.0, image.shape)).astype(np.float32),
@@ -76,7 +76,7 @@ def test_what_is_left_is_noise_where_corners_were_right_from_the_start(rng: np.r
 
 
 def test_a_tag_outside_the_image_is_not_valid() -> None:
-    maps, ink = told("straight")
+    maps, ink = projected("straight")
     image = np.full((40, 42), 100.0, np.float32)
     centres = np.array([[-60.0, 10.0], [np.nan, 10.0], [20.0, 20.0]])
     found = fit_tags(

@@ -60,7 +60,7 @@ def test_end_is_said() -> None:
     nowhere = minimise(np.array([-1.2, 1.0]), rosenbrock, lambda x, step: None, TENFOLD, Stop(steps=99))
     assert nowhere.reason == StopReason.NO_SMALLER_COST
     assert (nowhere.state == [-1.2, 1.0]).all()
-    start = minimise(np.array([1.0, 1.0]), rosenbrock, moved, TENFOLD, Stop(steps=99, promise=1e-12))
+    start = minimise(np.array([1.0, 1.0]), rosenbrock, moved, TENFOLD, Stop(steps=99, predicted_gain=1e-12))
     assert start.reason == StopReason.STATIONARY and start.steps == 1
     broken = DenseProblem(np.ones(2), np.full((2, 2), np.nan))
     lost = minimise(np.zeros(2), lambda x: broken, moved, TENFOLD, Stop(steps=99))
@@ -119,7 +119,7 @@ def batch_of(x: FloatArray, y: FloatArray) -> Callable[[tuple[FloatArray, ...]],
 @pytest.mark.parametrize("until_all", [False, True])
 def test_batch_finds_every_minimum(rng: np.random.Generator, until_all: bool) -> None:
     x, truth, y = exponentials(rng, 40)
-    stop = Stop(steps=100, gain=1e-14, promise=1e-28)
+    stop = Stop(steps=100, gain=1e-14, predicted_gain=1e-28)
     (found,), cost = minimise_each(
         (np.full((40, 2), 1.0),), batch_of(x, y), lambda s, d: (s[0] + d,), TENFOLD, stop, until_all=until_all
     )

@@ -147,13 +147,13 @@ def test_planned_views_beat_views_anyhow(rng: np.random.Generator) -> None:
     known, goal = Knowledge.guessed(camera, error), projection_goal(camera)
     plan = plan_views(known, [BOARD], goal, 6)
     assert [v.error for v in plan.views] == sorted((v.error for v in plan.views), reverse=True)
-    anyhow = []
+    unplanned = []
     for _ in range(20):
         _, rotation, translation = random_views(camera, 6, rng, reach_deg=REACH_DEG["reg"])
         seen = np.ones((6, BOARD.corner_count), dtype=bool)
         views = known.with_views(HeldBoards(BOARD.points(), rotation, translation, seen))
-        anyhow.append(float(goal.error(covariance_of(views.information))))
-    assert plan.views[-1].error < 0.6 * np.median(anyhow)
+        unplanned.append(float(goal.error(covariance_of(views.information))))
+    assert plan.views[-1].error < 0.6 * np.median(unplanned)
     with pytest.raises(InputError, match="at least one board"):
         plan_views(known, [], goal, 1)
 

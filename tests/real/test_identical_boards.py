@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, judge_pair
+from detection_bench.pairs import EQUAL_BOARDS, PairVerdict, equal_boards_pair, evaluate_pair
 from detection_bench.scenes import BENCH_PHOTOMETRY, bench_field_deg
 
 from rigkit.detection.detect import detect_boards
@@ -34,7 +34,7 @@ def test_rendered_pairs(first: int, noise_levels: float) -> None:
         )
         one, two = map(detect_boards, images)
         found = identify_pair(one, two, EQUAL_BOARDS, scene.camera1, scene.camera2)
-        verdict = judge_pair(scene, found.pairs(), found.ambiguous)
+        verdict = evaluate_pair(scene, found.pairs(), found.ambiguous)
         assert verdict != PairVerdict.WRONG, f"seed {seed}: {what}"
         symmetric = "symmetric" in what
         if verdict == PairVerdict.RIGHT and not symmetric:

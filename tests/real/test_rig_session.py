@@ -50,7 +50,7 @@ def stereo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def told_of(
+def report_of(
     session: Path, text: str, capsys: pytest.CaptureFixture[str], *options: str, code: int = 0
 ) -> dict[str, Any]:
     session.write_text(text)
@@ -60,12 +60,12 @@ def told_of(
 
 def test_stereo_session(stereo: Path, capsys: pytest.CaptureFixture[str]) -> None:
     session = stereo / "session.toml"
-    told = told_of(session, SESSION.format(value=BASELINE_MM[0], shape="auto"), capsys, "-r")
-    baseline = told["baselines"][0]
+    reported = report_of(session, SESSION.format(value=BASELINE_MM[0], shape="auto"), capsys, "-r")
+    baseline = reported["baselines"][0]
     assert abs(baseline["value_mm"] - BASELINE_MM[0]) < BASELINE_MM[1]
     assert 0.02 < baseline["sigma_mm"] < 0.2
-    assert told["checks"][0]["passed"]
-    assert told["heldout_rms_px"] < 0.1
+    assert reported["checks"][0]["passed"]
+    assert reported["heldout_rms_px"] < 0.1
     rig = load_rig(stereo / "rig.json")
     assert list(rig) == ["left", "right"]
     assert (load_camera(stereo / "rig-left.json").parameters == rig["left"][0].parameters).all()
@@ -75,7 +75,7 @@ def test_stereo_session(stereo: Path, capsys: pytest.CaptureFixture[str]) -> Non
     # The board taken for flat, as the published figures have it: another model of the same images, the same baseline
     # within what both say of themselves; the residuals alone would promise three times as much. Beside a wrong rule:
     # the check fails, and so does the program.
-    flat = told_of(session, SESSION.format(value=110.0, shape="flat"), capsys, code=1)
+    flat = report_of(session, SESSION.format(value=110.0, shape="flat"), capsys, code=1)
     assert not flat["checks"][0]["passed"]
     other = flat["baselines"][0]
     apart = abs(other["value_mm"] - baseline["value_mm"])
@@ -116,9 +116,9 @@ def test_the_laboratory_s_own_boards(lens: str, tmp_path: Path, capsys: pytest.C
     boards = [Board(f"plane{k}", 8, 6, 50.0, 50.0) for k in (1, 2, 3)]
     text = mounted(tmp_path, images, boards, "scaramuzza")
     text += 'layout = { plane1 = "right", plane2 = "floor", plane3 = "left" }\n'
-    told = told_of(tmp_path / "session.toml", text, capsys)
-    assert told["left_out"] == [] and told["heldout_rms_px"] < 0.06
-    for angle in told["angles"]:
+    reported = report_of(tmp_path / "session.toml", text, capsys)
+    assert reported["left_out"] == [] and reported["heldout_rms_px"] < 0.06
+    for angle in reported["angles"]:
         assert abs(angle["value_deg"] - 90.0) < 4.0 * angle["sigma_deg"] < 0.04
     truth = json.loads((images[0].parent / "truth.json").read_text())
     middle = {
@@ -135,9 +135,9 @@ def test_two_images_of_a_trihedral(tmp_path: Path, capsys: pytest.CaptureFixture
     folder = shared_data("real/trihedral-stereo")
     boards = [Board("left", 8, 6, 28.0, 28.0), Board("right", 6, 8, 28.0, 28.0), Board("floor", 7, 6, 28.0, 28.0)]
     images = [folder / "left.jpg", folder / "right.jpg"]
-    told = told_of(tmp_path / "session.toml", mounted(tmp_path, images, boards, "kannala_brandt"), capsys)
-    assert all(abs(angle["value_deg"] - 90.0) < 1.0 for angle in told["angles"])
-    camera = told["cameras"][0]
+    reported = report_of(tmp_path / "session.toml", mounted(tmp_path, images, boards, "kannala_brandt"), capsys)
+    assert all(abs(angle["value_deg"] - 90.0) < 1.0 for angle in reported["angles"])
+    camera = reported["cameras"][0]
     assert abs(camera["parameters"]["fx"] - 1640.0) < 3.0 * camera["sigmas"]["fx"]
     views = [v for v in load_calibration(tmp_path / "calibration.json").views if v.board_id == "floor"]
     moved = views[0].cam_from_board @ views[1].cam_from_board.inverse()

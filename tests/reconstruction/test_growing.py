@@ -19,7 +19,7 @@ from rigkit.core.progress import silent
 from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import angle_between, exp_so3, log_so3
 from rigkit.reconstruction.growing.dense import DenseScene, grow_scene
-from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_both_ways
+from rigkit.reconstruction.growing.grow import GrowingView, LineKnowledge, grow, grow_in_both_directions
 from rigkit.reconstruction.growing.surface import PairRays
 from rigkit.reconstruction.scene import SceneReconstruction, reconstruct_scene
 from rigkit.reconstruction.scene_pose import KnownPose
@@ -144,7 +144,7 @@ def test_no_place_of_image_2_is_grown_from_two_places_of_image_1() -> None:
     )
     anywhere = LineKnowledge(np.zeros((3, 3)), np.inf)
     twice = grow(*views, seeds, step=3, known=anywhere)
-    once = grow_both_ways(*views, seeds, step=3, known=anywhere)
+    once = grow_in_both_directions(*views, seeds, step=3, known=anywhere)
     assert len(twice) > 1000
     assert 0.45 < len(once) / len(twice) < 0.55
     places = once.pixels2[once.valid]
@@ -162,13 +162,13 @@ def test_what_the_calibration_leaves_open_is_in_the_sigmas() -> None:
     in_sigmas = {}
     for calibrations in (None, (UncertainCamera(camera, np.diag(sigmas**2)), None)):
         r = grow_scene(sparse, seeds, *images, calibrations=calibrations).scene.reconstruction
-        told = calibrations is not None
-        assert r.cloud.calibration_in_sigmas == told and r.pose_covariance is not None
+        declared = calibrations is not None
+        assert r.cloud.calibration_in_sigmas == declared and r.pose_covariance is not None
         turn = log_so3(CAM2_FROM_CAM1.rotation @ r.cam2_from_cam1.rotation.T)
         pose = np.sqrt(turn @ np.linalg.solve(r.pose_covariance[:3, :3], turn) / 3.0)
         points, _ = corner.surface(true, r.pixels1)
         off = np.abs(np.linalg.norm(r.cloud.points_mm, axis=1) - np.linalg.norm(points, axis=1))
-        in_sigmas[told] = pose, np.median(off / r.cloud.sigma_mm)
+        in_sigmas[declared] = pose, np.median(off / r.cloud.sigma_mm)
     # Four parameters at one sigma each.
     assert in_sigmas[True][0] < 2.0 < in_sigmas[False][0]
     assert 0.2 < in_sigmas[True][1] < 2.0

@@ -168,11 +168,11 @@ def test_a_cloud_on_the_lattices_says_what_its_sigmas_include(rng: np.random.Gen
     exact, whole = (on_planes(free, one).cloud for one in planes)
     assert (whole.sigma_mm > exact.sigma_mm).all()
     assert (whole.normal_sigma_rad > exact.normal_sigma_rad).all()
-    for name, cloud, told in (("exact", exact, False), ("whole", whole, True)):
+    for name, cloud, declared in (("exact", exact, False), ("whole", whole, True)):
         write_ply(tmp_path / f"{name}.ply", cloud)
-        assert cloud.calibration_in_sigmas == read_ply(tmp_path / f"{name}.ply").calibration_in_sigmas == told
+        assert cloud.calibration_in_sigmas == read_ply(tmp_path / f"{name}.ply").calibration_in_sigmas == declared
         header = (tmp_path / f"{name}.ply").read_bytes().split(b"end_header")[0]
-        assert (b"covariance of the calibrations" in header) == told
+        assert (b"covariance of the calibrations" in header) == declared
 
 
 def test_points_of_boards_without_a_fit_are_left_out(rng: np.random.Generator) -> None:

@@ -55,8 +55,8 @@ def test_where_angles_fit_several_names_the_fewest_change_and_it_is_said(seed: i
     """Front and floor may be either way round to an angle between them; the floor keeps the name that it has."""
     angles = (75.0, 90.0, 90.0)
     made = scene(np.random.default_rng(seed), angles)
-    for said in (measured(angles), measured(angles)[:1]):
-        pair = matched(made, angles=said)
+    for printed in (measured(angles), measured(angles)[:1]):
+        pair = matched(made, angles=printed)
         assert names_are_right(pair, made)
         (words,) = [words for words in pair.notes if "measured angles" in words]
         assert "2 orders of the names fit" in words
@@ -78,8 +78,8 @@ def test_angles_that_say_nothing_or_that_fit_no_names_change_nothing(
 ) -> None:
     made = scene(rng, angles)
     plain = matched(made)
-    for said in ((90.0, 90.0, 90.0), (70.0, 80.0, 110.0)):
-        pair = matched(made, angles=measured(said))
+    for printed in ((90.0, 90.0, 90.0), (70.0, 80.0, 110.0)):
+        pair = matched(made, angles=measured(printed))
         assert pair.notes == plain.notes
         assert [d.board_id for d in pair.identity.detections1] == [d.board_id for d in plain.identity.detections1]
         np.testing.assert_array_equal(pair.matches.pixels1, plain.matches.pixels1)

@@ -112,8 +112,8 @@ def test_without_a_baseline_it_is_the_unit(rng):
 @pytest.mark.parametrize(("wrong", "warned"), [(0.5, False), (0.8, True)])
 def test_few_matches_on_one_pose_are_a_warning(rng, wrong, warned):
     found, *_ = contaminated(rng, outliers=wrong, count=400)
-    told = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=200.0).reconstruction.notes
-    assert any("agree with this pose" in words for words in told) == warned
+    reported = reconstruct_scene(found, REGULAR, REGULAR, baseline_mm=200.0).reconstruction.notes
+    assert any("agree with this pose" in words for words in reported) == warned
 
 
 def test_the_pose_type_is_chosen_and_contradicted(rng):
@@ -121,8 +121,8 @@ def test_the_pose_type_is_chosen_and_contradicted(rng):
     auto = reconstruct_scene(found, REGULAR, REGULAR, pose_type="auto")
     assert str(auto.reconstruction.pose_type) == "standard"
     turned, *_ = contaminated(rng, "general", outliers=0.2)
-    said = reconstruct_scene(turned, REGULAR, REGULAR, pose_type="auto")
-    assert str(said.reconstruction.pose_type) == "general"
+    printed = reconstruct_scene(turned, REGULAR, REGULAR, pose_type="auto")
+    assert str(printed.reconstruction.pose_type) == "general"
 
 
 def test_directions_instead_of_affinities(rng):
@@ -252,9 +252,9 @@ def test_the_calibrations_share_is_what_drawn_calibrations_show(rng, pose_is_kno
         assert 0.6 < np.sqrt(observed / stated) < 1.6
 
 
-@pytest.mark.parametrize(("agree", "said"), [(29, True), (31, False)])
-def test_a_pose_that_few_correspondences_agree_with_is_doubted(agree: int, said: bool) -> None:
+@pytest.mark.parametrize(("agree", "printed"), [(29, True), (31, False)])
+def test_a_pose_that_few_correspondences_agree_with_is_doubted(agree: int, printed: bool) -> None:
     fit = cast(ScenePose, SimpleNamespace(notes=("first",), inliers=np.arange(100) < agree))
     notes = _notes(fit, np.ones(100, dtype=bool), 100.0)
     assert notes[0] == "first"
-    assert any(f"only {agree} of 100 correspondences agree" in note for note in notes) == said
+    assert any(f"only {agree} of 100 correspondences agree" in note for note in notes) == printed

@@ -20,7 +20,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.kernels.sweep import swept_costs, swept_surfaces
 from rigkit.reconstruction.growing import sweep as sweep_module
 from rigkit.reconstruction.growing.dense import grow_scene
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_both_ways
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow_in_both_directions
 from rigkit.reconstruction.growing.surface import NodeMeasurements, PairRays
 from rigkit.reconstruction.growing.sweep import filled
 from rigkit.reconstruction.scene import reconstruct_scene
@@ -58,7 +58,7 @@ def grown_with_hole(lens: str) -> tuple[GrownPatches, NodeMeasurements, tuple[Gr
     A21 = np.stack([each - pixels2 for each in near], axis=-1)
     seeds = Correspondences(pixels, pixels2, A21, None, None, None).select(seen)
     known = LineKnowledge(essential_from_pose(CAM2_FROM_CAM1), 0.7, 0.1, 0.01)
-    grown = grow_both_ways(view1, view2, seeds, step=STEP, known=known).centred()
+    grown = grow_in_both_directions(view1, view2, seeds, step=STEP, known=known).centred()
     keep = np.ones(grown.valid.shape, dtype=bool)
     keep[HOLE] = False
     grown = grown.where(keep)
@@ -108,11 +108,11 @@ def test_pairs_that_the_sweep_contradicts_give_way_to_its_own() -> None:
     assert np.median(np.linalg.norm(done.pixels2[wrong] - expected, axis=1)) < 0.5
     # Nor is a plane there distinct, whatever lies in it.
     at = wrong & np.isfinite(measured.z[..., 0])
-    told = []
-    for said in (measured.z, z):
-        plane = np.asarray(np.linalg.solve(measured.frame[at], said[at][..., None])[..., 0], np.float64)
-        told.append(sweep.distinct(grown.pixels1[at], plane, measured.slope[at], np.ones(at.sum())).mean())
-    assert told[0] > 0.95 and told[1] < 0.05
+    reported = []
+    for printed in (measured.z, z):
+        plane = np.asarray(np.linalg.solve(measured.frame[at], printed[at][..., None])[..., 0], np.float64)
+        reported.append(sweep.distinct(grown.pixels1[at], plane, measured.slope[at], np.ones(at.sum())).mean())
+    assert reported[0] > 0.95 and reported[1] < 0.05
 
 
 def test_nothing_is_filled_where_there_is_no_texture() -> None:
@@ -212,7 +212,7 @@ def test_two_images_that_have_nothing_in_common_show_no_surface(seed: int) -> No
         costs,
         levels,
         images[0],
-        bend=sweep_module.BEND_COST,
+        bend=sweep_module.CURVATURE_COST,
         jump=sweep_module.JUMP_COST,
         even=sweep_module.EVEN_LEVELS,
     )
@@ -228,9 +228,9 @@ def test_two_images_that_have_nothing_in_common_show_no_surface(seed: int) -> No
     )
     inside = (best > 0) & (best < levels - 1)
     agreed = np.where(np.arange(shape[1]) < 20, sweep.winners, np.nan)
-    assert sweep_module._believed(sweep, inside, np.full(shape, np.nan)).mean() < 0.002
+    assert sweep_module._reliable(sweep, inside, np.full(shape, np.nan)).mean() < 0.002
     # As many are as large as surfaces are.
-    assert sweep_module._believed(sweep, inside, agreed)[:, :20].mean() > 0.02
+    assert sweep_module._reliable(sweep, inside, agreed)[:, :20].mean() > 0.02
 
 
 def test_no_light_falls_around_the_circle_of_a_fisheye_but_does_on_its_dark_spots() -> None:

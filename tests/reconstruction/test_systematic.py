@@ -123,7 +123,7 @@ def test_the_field_of_a_known_pose_is_measured(rng: np.random.Generator) -> None
         m = with_field(rng, m, amplitude_px)
         found = pose_with_lens_errors(m, BOTH, pose, PoseType.STANDARD, None, 1.0)
         # One draw of four waves, of which the part across the epipolar lines is seen.
-        assert found.misfit_px < 0.06 if amplitude_px == 0.0 else 0.1 < found.misfit_px < 0.6
+        assert found.epipolar_rms_px < 0.06 if amplitude_px == 0.0 else 0.1 < found.epipolar_rms_px < 0.6
 
 
 def test_pairs_that_a_known_pose_is_turned_away_from_err_by_that(rng: np.random.Generator) -> None:
@@ -132,6 +132,6 @@ def test_pairs_that_a_known_pose_is_turned_away_from_err_by_that(rng: np.random.
     sigma = np.full(len(m), NOISE_PX)
     shifted = np.array(m.pixels2) + np.array([0.0, 0.1])
     m = Matches.from_cameras(REGULAR, REGULAR, m.pixels1, shifted, sigma1_px=sigma, sigma2_px=sigma)
-    assert 0.08 < pose_with_lens_errors(m, BOTH, pose, PoseType.STANDARD, None, 1.0).misfit_px < 0.13
+    assert 0.08 < pose_with_lens_errors(m, BOTH, pose, PoseType.STANDARD, None, 1.0).epipolar_rms_px < 0.13
     # A pose that is estimated follows, and nothing is left.
-    assert pose_with_lens_errors(m, BOTH, pose, PoseType.GENERAL, None, 1.0).misfit_px < 0.06
+    assert pose_with_lens_errors(m, BOTH, pose, PoseType.GENERAL, None, 1.0).epipolar_rms_px < 0.06

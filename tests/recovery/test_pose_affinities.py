@@ -129,10 +129,10 @@ def test_affinities_from_the_epipolar_geometry_tell_nothing_about_it(rng):
     circular = replace(m, A21=computed.A21, sigma_A=np.full(40, 1e-4))
     assert estimate_sigma_A(circular, wrong) < 1e-12
     # Exact affinities of the surface, believed as much, do tell.
-    told, again = (
+    declared, again = (
         choose_pose(fundamental_for("general").solve(v).E21, m.rays1, m.rays2)
         for v in (replace(m, sigma_A=np.full(40, 1e-4)), circular)
     )
     before = choose_pose(wrong, m.rays1, m.rays2)
     assert max(pose_errors_deg(again, before)) < 0.02 * max(pose_errors_deg(before, pose))
-    assert max(pose_errors_deg(told, pose)) < 0.5 * max(pose_errors_deg(before, pose))
+    assert max(pose_errors_deg(declared, pose)) < 0.5 * max(pose_errors_deg(before, pose))

@@ -35,12 +35,12 @@ COVARIANCE_REL = 0.15
 
 def test_the_rule_auto_takes_how_sure_affinities_are_from_themselves(rng):
     m, _, _ = pair(rng, 60, noise_px=1.0, sigma_A=0.002)
-    told = [replace(m, sigma_A=np.full(len(m), sigma)) for sigma in (0.002, 1.0)]
-    one, two = (estimate_pose(matches, weights="auto") for matches in told)
+    declared = [replace(m, sigma_A=np.full(len(m), sigma)) for sigma in (0.002, 1.0)]
+    one, two = (estimate_pose(matches, weights="auto") for matches in declared)
     assert np.allclose(two.cam2_from_cam1.matrix(), one.cam2_from_cam1.matrix(), atol=1e-9)
     assert np.allclose(two.covariance, one.covariance, rtol=1e-6)
     # As sure as they are: told so, about the same comes out, and told another number, another one.
-    so, less = (np.sqrt(np.trace(estimate_pose(matches).covariance)) for matches in told)
+    so, less = (np.sqrt(np.trace(estimate_pose(matches).covariance)) for matches in declared)
     assert np.sqrt(np.trace(one.covariance)) == pytest.approx(so, rel=0.2) and less > 1.2 * so
 
 

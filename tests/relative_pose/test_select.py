@@ -52,10 +52,10 @@ def test_a_wrong_declaration_is_contradicted_with_the_figure(rng):
     m, _ = board_pair(rng, pose, 0.1)
     evidence = pose_type_evidence(m)
     assert evidence.choice == PoseType.GENERAL
-    said = evidence.contradiction("standard")
-    assert said is not None
-    assert re.search(r"(2\.9|3\.0)\d deg", said)
-    assert "speak for 'general'" in said
+    printed = evidence.contradiction("standard")
+    assert printed is not None
+    assert re.search(r"(2\.9|3\.0)\d deg", printed)
+    assert "speak for 'general'" in printed
     assert evidence.contradiction("general") is None
     assert evidence.contradiction("auto") is None
     turned, _ = board_pair(rng, POSES["planar"], 0.1)

@@ -88,6 +88,6 @@ def test_axe_finds_no_fault(axe: str, make: Callable[[], str], tmp_path: Path) -
     page = tmp_path / "page.html"
     page.write_text(make().replace("</body>", RUN % axe.replace("</script>", "<\\/script>")), encoding="utf-8")
     for scheme, setting in SCHEMES.items():
-        told = dict(re.findall(r'data-(faults|checked|scheme)="([^"]*)"', loaded(page, setting, seconds=240.0)))
-        assert told["scheme"] == scheme and int(told["checked"]) >= MIN_CHECKED
-        assert json.loads(html.unescape(told["faults"])) == []
+        found_words = dict(re.findall(r'data-(faults|checked|scheme)="([^"]*)"', loaded(page, setting, seconds=240.0)))
+        assert found_words["scheme"] == scheme and int(found_words["checked"]) >= MIN_CHECKED
+        assert json.loads(html.unescape(found_words["faults"])) == []

@@ -77,17 +77,17 @@ def text(calibration: Calibration) -> str:
 
 
 @pytest.fixture(scope="module")
-def told(text: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+def found_words(text: str, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """What the page is in a browser, which starts once for all: five things of `PROBE`, five of `SORT_PROBE`."""
     probes = PROBE.replace("</body>", SORT_PROBE)
     return probed(text.replace("</body>", probes).replace('loading="lazy"', ""), tmp_path_factory.mktemp("page"))
 
 
-def test_works_without_network(text: str, told: list[str]) -> None:
+def test_works_without_network(text: str, found_words: list[str]) -> None:
     assert not re.search(r"""(src|href)=["']?https?:""", text)
     assert len(text) < MAX_BYTES
     assert "&lt;b&gt;.jpg" in text and "<b>.jpg" not in text
-    assert told[:5] == ["8", "true", str(IMAGES), "true", "true"]
+    assert found_words[:5] == ["8", "true", str(IMAGES), "true", "true"]
 
 
 @pytest.mark.thorough
@@ -97,8 +97,8 @@ def test_fits_a_phone_a_tablet_and_a_screen(calibration: Calibration, tmp_path: 
         assert small >= MIN_FONT_PX
 
 
-def test_tables_sort_pictures_enlarge_and_the_view_turns(calibration: Calibration, told: list[str]) -> None:
-    up, down, names, open_, view = told[5:]
+def test_tables_sort_pictures_enlarge_and_the_view_turns(calibration: Calibration, found_words: list[str]) -> None:
+    up, down, names, open_, view = found_words[5:]
     assert (up, down, open_) == ("true", "true", "true")
     images = sorted((v.image for v in calibration.views), key=lambda n: int(re.sub(r"\D", "", n)))
     assert names.split(",") == images
@@ -121,14 +121,14 @@ def test_what_was_chosen_is_called_what_it_is(calibration: Calibration) -> None:
     moving, central = (
         describe(replace(calibration, candidates=(*models, *two))) for two in (asked, kept_central(asked))
     )
-    for said in (moving, central):
-        assert "model brown 5, of 2 compared: why brown 5" in said
+    for printed in (moving, central):
+        assert "model brown 5, of 2 compared: why brown 5" in printed
     assert f"lens with {MOVING}, of 2 compared: why {MOVING}" in moving
     assert f"lens with {CENTRAL}, of 2 compared: images do not surely agree" in central
     assert [one.reason for one in kept_central(models)] == [one.reason for one in models]
 
 
-def told_focal_px(calibration: Calibration) -> tuple[float, float]:
+def reported_focal_px(calibration: Calibration) -> tuple[float, float]:
     """Return the focal length and its standard deviation as they are printed."""
     words = re.search(r"focal length on the axis ([\d.]+) ± ([\d.]+) px, sees [\d.]+ degrees", describe(calibration))
     assert words is not None and "focal length on the axis" in page(calibration)
@@ -136,7 +136,7 @@ def told_focal_px(calibration: Calibration) -> tuple[float, float]:
 
 
 def test_the_focal_length_is_told_whatever_a_model_calls_fx(calibration: Calibration) -> None:
-    focal_px, sigma_px = told_focal_px(calibration)
+    focal_px, sigma_px = reported_focal_px(calibration)
     fx, fy = calibration.camera.parameters[:2]
     half = 0.5 * np.array([np.sqrt(fy / fx), np.sqrt(fx / fy)])
     expected = calibration.widening * np.sqrt(half @ calibration.covariance[:2, :2] @ half)
@@ -145,7 +145,7 @@ def test_the_focal_length_is_told_whatever_a_model_calls_fx(calibration: Calibra
     truth = lens("wide")
     views = random_views(truth, IMAGES, np.random.default_rng(2), reach_deg=55.0, noise_px=NOISE_PX)[0]
     sphere = calibrate(views, truth.size_px, model="double_sphere", board="flat")
-    focal_px, sigma_px = told_focal_px(sphere)
+    focal_px, sigma_px = reported_focal_px(sphere)
     assert abs(sphere.camera.parameters[0] - truth.focal_px) > 50.0 > 10.0 * abs(focal_px - truth.focal_px)
 
 
@@ -241,9 +241,11 @@ def test_what_a_bad_calibration_says_of_the_rest_of_the_image_is_no_advice(
     most: float, advice: str, calibration: Calibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rigkit.report.pages.calibration_facts.MAX_RATIO_BEYOND", most)
-    said = [_reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))]
-    assert "px at worst outside" in said[1] and said[0].startswith(said[1].rstrip("."))
-    assert advice in said[0] and advice not in said[1]
+    printed = [
+        _reach(replace(calibration, verdicts=(finding,))) for finding in (Finding.good("well"), Finding.bad("ill"))
+    ]
+    assert "px at worst outside" in printed[1] and printed[0].startswith(printed[1].rstrip("."))
+    assert advice in printed[0] and advice not in printed[1]
 
 
 @pytest.mark.parametrize("range_mm", [500.0, np.inf])

@@ -38,9 +38,9 @@ def test_a_check_that_failed_stands_first_with_its_cause() -> None:
     report = reported(88.0)
     first = words_of(page_of(report))
     assert "a check failed" in first and "3 of 4 facts" in first
-    told = first.index("angle plane1-plane2: 90.000 deg, measured 88 ± 0.3 (set square)")
+    found_words = first.index("angle plane1-plane2: 90.000 deg, measured 88 ± 0.3 (set square)")
     cause = first.index("88 was probably misread")
-    assert told < cause
+    assert found_words < cause
     assert "lengths to 0.50 mm" in first
     assert page_of(report).index("canvas") < page_of(report).index("<h2>")
 

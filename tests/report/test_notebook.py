@@ -62,11 +62,11 @@ def test_a_calibration_and_a_rig_show_their_boards_and_the_verdict(rng: np.rando
 def test_progress_is_silent_without_a_notebook_and_a_bar_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     assert notebook_progress() is silent
     ipython = pytest.importorskip("IPython")
-    told: list[str] = []
+    found_words: list[str] = []
 
     class Handle:
         def update(self, shown: object) -> None:
-            told.append(str(getattr(shown, "data", "")))
+            found_words.append(str(getattr(shown, "data", "")))
 
     def display(shown: object, display_id: bool) -> Handle:
         Handle().update(shown)
@@ -77,5 +77,5 @@ def test_progress_is_silent_without_a_notebook_and_a_bar_in_one(monkeypatch: pyt
     show = notebook_progress()
     for done in range(4):
         show("corners <1>", done, 3)
-    assert 'value="0" max="3"' in told[0] and 'value="3" max="3"' in told[-1]
-    assert "corners &lt;1&gt;" in told[0]
+    assert 'value="0" max="3"' in found_words[0] and 'value="3" max="3"' in found_words[-1]
+    assert "corners &lt;1&gt;" in found_words[0]

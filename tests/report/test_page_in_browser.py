@@ -83,8 +83,8 @@ for (const width of widths) {
 def measured_at_widths(page: str, folder: Path) -> dict[int, tuple[int, float]]:
     """Return by width of the window how wide the page gets, and its smallest words, px."""
     coded = base64.b64encode(page.encode()).decode()
-    told = probed(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), folder)
-    rows = [text.split() for text in told]
+    found_words = probed(FRAMES.replace("%PAGE%", coded).replace("%WIDTHS%", str(list(WIDTHS))), folder)
+    rows = [text.split() for text in found_words]
     return {int(width): (int(wide), float(small)) for width, wide, small in rows}
 
 

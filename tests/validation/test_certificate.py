@@ -30,7 +30,7 @@ from rigkit.validation.certificate.propagation import (
     measured_points,
     variances,
 )
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 
 TRIALS = 800
 COVERAGE = (0.93, 0.97)
@@ -67,8 +67,8 @@ def rig_covariance(camera: Camera, rng: np.random.Generator) -> FloatArray:
     return joint
 
 
-def known_rig(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Watched:
-    return Watched(
+def known_rig(name: str, joint: FloatArray, *, scale_sigma: float = 4e-4) -> Monitored:
+    return Monitored(
         names=("left", "right"),
         cameras=(lens(name), lens(name)),
         cam_from_rig=(Rigid3.identity(), SECOND),

@@ -257,9 +257,9 @@ def test_fitted_planes_stand_beside_the_free_ones_or_judge_in_their_place() -> N
     assert {c.name for c in judged.checks if not c.passed} == {"angle plane1-plane3"}
     assert judged.check("baseline").ours == judged.baseline_mm == pytest.approx(BASELINE_MM + 1.0)
     assert next(b for b in judged.boards if b.board.board_id == "plane1").normal_errors.mean_deg > 0.99
-    told = json.loads(judged.to_json())
-    assert told["planes"] == "coplanar"
-    assert told["boards"][0]["lattice_normal_errors"] is None
+    reported = json.loads(judged.to_json())
+    assert reported["planes"] == "coplanar"
+    assert reported["boards"][0]["lattice_normal_errors"] is None
     part = validate(
         reconstruction, truth(), fitted=FittedPlanes(replace(planes, board_ids=("plane1", "plane2")), None, "coplanar")
     )

@@ -30,7 +30,7 @@ TRUTH = PairTruth(None, (MeasuredAngle("plane1", "plane2", 90.0, 0.3, "set squar
 
 def declared(
     true: PoseType,
-    said: PoseType,
+    printed: PoseType,
     rng: np.random.Generator,
     level_deg: float = 0.2,
     boards: Sequence[Board] = BOARDS,
@@ -40,7 +40,7 @@ def declared(
         BOARDS, regular_camera(), true, rng, level_sigma_deg=level_deg, distance=(0.9, 1.3), walls=False
     )
     pair = noisy_pair(scene, BOARDS, rng, 0.03, declared=boards)
-    return reconstruct_pair(pair, pose_type=said, level_sigma_rad=np.deg2rad(0.2))
+    return reconstruct_pair(pair, pose_type=printed, level_sigma_rad=np.deg2rad(0.2))
 
 
 @pytest.mark.parametrize("pose_type", [PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD])
@@ -52,11 +52,11 @@ def test_what_holds_passes(rng: np.random.Generator, pose_type: PoseType) -> Non
 
 
 @pytest.mark.parametrize(
-    ("true", "said"), [(PoseType.FORWARD, PoseType.STANDARD), (PoseType.STANDARD, PoseType.FORWARD)]
+    ("true", "printed"), [(PoseType.FORWARD, PoseType.STANDARD), (PoseType.STANDARD, PoseType.FORWARD)]
 )
-def test_another_pose_type_fails_by_a_right_angle(rng: np.random.Generator, true: PoseType, said: PoseType) -> None:
-    report = validate(declared(true, said, rng), TRUTH)
-    row = report.check(f"pose type {said}")
+def test_another_pose_type_fails_by_a_right_angle(rng: np.random.Generator, true: PoseType, printed: PoseType) -> None:
+    report = validate(declared(true, printed, rng), TRUTH)
+    row = report.check(f"pose type {printed}")
     assert not row.passed
     assert not report.passed
     assert row.ours == pytest.approx(90.0, abs=1.0)
@@ -102,8 +102,8 @@ def test_a_chance_is_told_as_that_many_standard_deviations() -> None:
 
 
 def test_nothing_declared_is_nothing_to_check(rng: np.random.Generator) -> None:
-    for said in (PoseType.GENERAL, PoseType.AUTO):
-        report = validate(declared(PoseType.STANDARD, said, rng), TRUTH)
+    for printed in (PoseType.GENERAL, PoseType.AUTO):
+        report = validate(declared(PoseType.STANDARD, printed, rng), TRUTH)
         assert {check.kind for check in report.checks} == {"angle"}
 
 

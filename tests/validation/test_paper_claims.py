@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.reconstructions import make_reconstruction
 
-from rigkit.core.claims import Comparison, judge_claim
+from rigkit.core.claims import Comparison, evaluate_claim
 from rigkit.core.posetype import PoseType
 from rigkit.core.truth import MeasuredLength, PairTruth
 from rigkit.validation.checks import ValidationReport, validate
@@ -63,8 +63,8 @@ def test_the_order_of_the_estimators() -> None:
 
 
 def test_what_is_not_known_bears_nothing_out() -> None:
-    unknown = judge_claim("x", [Comparison(float("nan"), "a", 1.0, "b")])
+    unknown = evaluate_claim("x", [Comparison(float("nan"), "a", 1.0, "b")])
     assert unknown is not None and not unknown.holds
-    assert judge_claim("x", []) is None
-    limit = judge_claim("x", [Comparison(20.0, "a", 20.0, "limit", or_equal=True)])
+    assert evaluate_claim("x", []) is None
+    limit = evaluate_claim("x", [Comparison(20.0, "a", 20.0, "limit", or_equal=True)])
     assert limit is not None and limit.holds

@@ -232,13 +232,13 @@ def test_points_that_shared_errors_move_far_pull_less(rng: np.random.Generator) 
     points, normal = board_points()
     moves = bend(2, 0.5)
     common, covariance = moves[:, :, None] * normal, np.tile(np.eye(3), (48, 1, 1))
-    tilts: dict[str, list[np.ndarray]] = {"told": [], "untold": []}
+    tilts: dict[str, list[np.ndarray]] = {"declared": [], "undeclared": []}
     for _ in range(200):
         off = points + (rng.normal(size=2) @ moves + 0.05 * rng.normal(size=48))[:, None] * normal
-        tilts["told"].append(angle_between(fit_plane(off, covariance, common).normal, normal))
-        tilts["untold"].append(angle_between(fit_plane(off, covariance).normal, normal))
-    told, untold = (np.sqrt(np.mean(np.square(tilts[name]))) for name in ("told", "untold"))
-    assert told < 0.4 * untold
+        tilts["declared"].append(angle_between(fit_plane(off, covariance, common).normal, normal))
+        tilts["undeclared"].append(angle_between(fit_plane(off, covariance).normal, normal))
+    declared, undeclared = (np.sqrt(np.mean(np.square(tilts[name]))) for name in ("declared", "undeclared"))
+    assert declared < 0.4 * undeclared
 
 
 def test_points_that_nobody_can_place_are_left_out_without_a_word(rng: np.random.Generator) -> None:

@@ -26,7 +26,7 @@ from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, check_views
 from rigkit.validation.sentinel.power import FOUND
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import monitored_camera
 from rigkit.workflows.checks.check import fixed_text
 from rigkit.workflows.checks.history import add_to_history
 
@@ -64,7 +64,7 @@ def test_what_changed_is_found_named_and_undone(
     assert check.change is not None and check.change.hypothesis.kind == kind
     goal = projection_goal(camera)
     before, after = (
-        lens_of(c).parameters - camera.parameters for c in (check.watched.cameras[0], check.fixed.cameras[0])
+        lens_of(c).parameters - camera.parameters for c in (check.monitored.cameras[0], check.fixed.cameras[0])
     )
     assert goal.weight @ after @ after < 0.25 * (goal.weight @ before @ before)
     assert check.rms_fixed_px < check.rms_px
@@ -72,7 +72,7 @@ def test_what_changed_is_found_named_and_undone(
 
 
 def test_changes_are_found_as_often_as_the_check_says() -> None:
-    camera, found, said = lens("reg"), [], []
+    camera, found, printed = lens("reg"), [], []
     poses, fresh = poses_held("reg", 10), poses_held("reg", 3)
     focus = camera.parameters * [1, 1, 0, 0, 0, 0, 0, 0, 0]
     for seed in range(POWER_DRAWS):
@@ -85,14 +85,14 @@ def test_changes_are_found_as_often_as_the_check_says() -> None:
         seen = [
             FreshView(f"{k}", 0, noisy_view(changed, pose, f"{k}", rng, POWER_NOISE_PX)) for k, pose in enumerate(fresh)
         ]
-        check = check_views(watched_camera(known, "cam"), seen)
+        check = check_views(monitored_camera(known, "cam"), seen)
         (power,) = (p for p in check.powers if p.kind == "focus")
         assert power.size == 0.15
-        said.append(power.chance)
+        printed.append(power.chance)
         (change,) = (c for c in check.tried if c.hypothesis.kind == "focus")
         found.append(change.chance < ALARM_CHANCE / len(check.tried))
-    assert 0.2 < np.mean(said) < 0.8
-    assert np.mean(found) == pytest.approx(np.mean(said), abs=POWER_WITHIN)
+    assert 0.2 < np.mean(printed) < 0.8
+    assert np.mean(found) == pytest.approx(np.mean(printed), abs=POWER_WITHIN)
 
 
 def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibration) -> None:
@@ -107,15 +107,15 @@ def test_a_check_that_holds_says_what_it_could_have_missed(calibration: Calibrat
     assert "rigkit plan CALIBRATION --check" in check_facts(check).sentences[-1]
     # A calibration that is no surer finds no more with any number of pictures.
     vague = replace(calibration, covariance=1e4 * calibration.covariance)
-    said = checked(vague, lens("reg"), np.random.default_rng(0))
-    assert all(p.frames is None and p.chance < 0.5 for p in said.powers)
-    assert "the calibration is" in check_facts(said).sentences[-2]
+    printed = checked(vague, lens("reg"), np.random.default_rng(0))
+    assert all(p.frames is None and p.chance < 0.5 for p in printed.powers)
+    assert "the calibration is" in check_facts(printed).sentences[-2]
     # One from many times as many pictures would, with as many fresh ones.
     unsure = replace(calibration, covariance=UNSURE * calibration.covariance)
     powers = {p.kind: p for p in checked(unsure, lens("reg"), np.random.default_rng(0)).powers}
     focus = powers["focus"]
     assert focus.frames is None and focus.both is not None and 1 < focus.both <= UNSURE * 4
-    assert "times as many, in the calibration too" in check_page(said, "t", {})
+    assert "times as many, in the calibration too" in check_page(printed, "t", {})
 
 
 def test_another_camera_is_explained_by_nothing(calibration: Calibration, rng: np.random.Generator) -> None:
@@ -131,9 +131,9 @@ def test_a_view_all_of_whose_corners_stray_says_nothing(calibration: Calibration
     views = [noisy_view(camera, pose, f"{k}", rng, NOISE_PX) for k, pose in enumerate(poses)]
     box = noisy_view(camera, poses[0], "box", rng, NOISE_PX)
     box = replace(box, pixels=np.clip(box.pixels + 12.0 * rng.standard_normal(box.pixels.shape), 0.0, [1623.0, 1239.0]))
-    watched = watched_camera(calibration, "cam")
-    alone = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate(views)])
-    beside = check_views(watched, [FreshView(f"{k}", 0, view) for k, view in enumerate([*views, box])])
+    monitored = monitored_camera(calibration, "cam")
+    alone = check_views(monitored, [FreshView(f"{k}", 0, view) for k, view in enumerate(views)])
+    beside = check_views(monitored, [FreshView(f"{k}", 0, view) for k, view in enumerate([*views, box])])
     assert beside.holds and beside.rms_px == pytest.approx(alone.rms_px, rel=0.05)
 
 
@@ -158,19 +158,19 @@ def test_what_a_lens_does_beyond_its_model_is_no_change() -> None:
     longer = beyond(camera.with_parameters(camera.parameters * [LONGER, LONGER, 1, 1, 1, 1, 1, 1]))
     poses = [Rigid3(rotations[k], translations[k]) for k in right]
     other = [FreshView(f"{k}", 0, noisy_view(longer, pose, f"{k}", rng, NOISE_PX)) for k, pose in enumerate(poses)]
-    assert not check_views(watched_camera(known, "cam", beyond_model=False), same).holds
-    watched = watched_camera(known, "cam")
-    check, changed = check_views(watched, same), check_views(watched, other)
+    assert not check_views(monitored_camera(known, "cam", beyond_model=False), same).holds
+    monitored = monitored_camera(known, "cam")
+    check, changed = check_views(monitored, same), check_views(monitored, other)
     assert check.holds and not changed.holds
-    assert len(watched.of_models) == camera.parameters.size < watched.layout.count
+    assert len(monitored.of_models) == camera.parameters.size < monitored.layout.count
     assert np.array_equal(
-        np.delete(changed.step, watched.of_models), np.zeros(watched.layout.count - len(watched.of_models))
+        np.delete(changed.step, monitored.of_models), np.zeros(monitored.layout.count - len(monitored.of_models))
     )
 
 
 def test_nothing_to_look_at_is_refused(calibration: Calibration) -> None:
     with pytest.raises(InputError, match="no board was found"):
-        check_views(watched_camera(calibration, "cam"), [])
+        check_views(monitored_camera(calibration, "cam"), [])
 
 
 def test_the_correction_is_a_calibration_that_says_so(calibration: Calibration, tmp_path: Path) -> None:
@@ -190,8 +190,8 @@ def test_a_lens_that_changed_in_several_ways_is_told_by_what_it_does(calibration
     def several(p: np.ndarray) -> np.ndarray:
         return p * [1.004, 1.004, 1, 1, 1.1, 1, 1, 1, 1] + [0, 0, 9.0, -7.0, 0, 0, 0, 0, 0]
 
-    usual = lens("reg").parameters
-    much = lens("reg").with_parameters(usual + 6.0 * (changed_lens(several).parameters - usual))
+    typical = lens("reg").parameters
+    much = lens("reg").with_parameters(typical + 6.0 * (changed_lens(several).parameters - typical))
     check = checked(calibration, much, np.random.default_rng(1))
     assert check.change is not None and check.change.hypothesis.kind == "lens" and not check.holds
     words = check_facts(check)
@@ -222,7 +222,7 @@ def test_a_declared_board_of_another_size_is_accepted(calibration: Calibration, 
     views = []
     for k, pose in enumerate(best_held(camera, larger, 3, NOISE_PX)):
         views.append(FreshView(f"{k}", 0, noisy_view(camera, pose, f"{k}", rng, NOISE_PX, board=larger)))
-    assert check_views(watched_camera(calibration, "cam"), views).holds
+    assert check_views(monitored_camera(calibration, "cam"), views).holds
 
 
 def test_images_that_disagree_are_judged_more_carefully(calibration: Calibration) -> None:

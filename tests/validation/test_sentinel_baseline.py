@@ -15,9 +15,9 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.sentinel.baseline import judge_since
-from rigkit.validation.sentinel.epipolar import PairMatches, matches_say
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
-from rigkit.validation.sentinel.judge import Look, judge_evidence
+from rigkit.validation.sentinel.epipolar import PairMatches, evidence_of_matches
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
+from rigkit.validation.sentinel.judge import Look, evaluate_evidence
 
 MOUNT = Rigid3(exp_so3(np.array([0.01, -0.08, 0.02])), [-120.0, 2.0, 3.0])
 MATCH_NOISE_PX = 0.1
@@ -30,12 +30,12 @@ def _turned(pose: Rigid3, degrees: float) -> Rigid3:
     return Rigid3(turn @ pose.rotation, turn @ pose.translation_mm)
 
 
-def _file() -> Watched:
+def _file() -> Monitored:
     """A rig whose file is off: by 0.3 % of the left focus and a tenth of a degree, 15 and 87 of its sigmas."""
     camera = lens("wide")
     longer = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, 1.003, 1.0))
     sigmas = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
-    return Watched(
+    return Monitored(
         names=("left", "right"),
         cameras=(longer, camera),
         cam_from_rig=(Rigid3.identity(), _turned(MOUNT, WRONG_DEG)),
@@ -58,7 +58,7 @@ def _scene(pose: Rigid3, rng: np.random.Generator) -> PairMatches:
 
 def _scenes(pose: Rigid3, count: int, rng: np.random.Generator) -> Look:
     matches = [_scene(pose, rng) for _ in range(count)]
-    return lambda now: matches_say(now, matches)
+    return lambda now: evidence_of_matches(now, matches)
 
 
 def _boards(camera: Camera, rng: np.random.Generator, which: slice) -> Look:
@@ -71,7 +71,7 @@ def test_a_rig_that_never_held_is_checked_for_what_moved_since() -> None:
     for seed in range(2):
         rng = np.random.default_rng(seed)
         before, same, moved = (_scenes(_turned(MOUNT, d), n, rng) for d, n in ((0.0, 2), (0.0, 1), (TURN_DEG, 1)))
-        assert not judge_evidence(_file(), same).holds
+        assert not evaluate_evidence(_file(), same).holds
         quiet, check = (judge_since(_file(), before, look) for look in (same, moved))
         assert quiet.holds and quiet.baseline is not None and quiet.baseline.frames == 2
         assert quiet.baseline.rms_corrected_px < 0.5 * quiet.baseline.rms_px
@@ -83,12 +83,12 @@ def test_a_rig_that_never_held_is_checked_for_what_moved_since() -> None:
         assert check_facts(check).headline.startswith("Moved since (")
 
 
-def _known(focus: float) -> tuple[Camera, Watched]:
+def _known(focus: float) -> tuple[Camera, Monitored]:
     """A lens, and its file, that is off by a focal length so many times as long."""
     camera = lens("reg")
     wrong = camera.with_parameters(camera.parameters * np.where(np.arange(camera.parameters.size) < 2, focus, 1.0))
     sigmas: FloatArray = np.array([0.3, 0.3, 0.3, 0.3, *[1e-3] * (camera.parameters.size - 4)])
-    file = Watched(
+    file = Monitored(
         names=("cam",),
         cameras=(wrong,),
         cam_from_rig=(Rigid3.identity(),),
@@ -108,7 +108,7 @@ def test_a_lens_whose_file_is_off_is_checked_for_what_moved_since() -> None:
         before, same, moved = (
             _boards(c, rng, which) for c, which in ((camera, slice(BEFORE)), (camera, fresh), (longer, fresh))
         )
-        assert not judge_evidence(file, same).holds
+        assert not evaluate_evidence(file, same).holds
         assert judge_since(file, before, same).holds
         check = judge_since(file, before, moved)
         assert not check.holds and check.change is not None and check.change.hypothesis.kind == "focus"
@@ -122,11 +122,11 @@ def test_frames_that_disagree_count_less() -> None:
     def erring(count: int, rng: np.random.Generator) -> Look:
         own = rng.standard_normal((count, camera.parameters.size)) * np.sqrt(np.diag(file.covariance))
 
-        def look(now: Watched) -> FreshEvidence:
-            said = told(now)
-            return replace(said, score=said.score + np.einsum("nij,nj->ni", said.information, own))
+        def look(now: Monitored) -> FreshEvidence:
+            printed = reported(now)
+            return replace(printed, score=printed.score + np.einsum("nij,nj->ni", printed.information, own))
 
-        told = _boards(camera, rng, slice(count))
+        reported = _boards(camera, rng, slice(count))
         return look
 
     checks = [judge_since(file, erring(4, rng), erring(4, rng)) for rng in map(np.random.default_rng, range(3))]

@@ -23,9 +23,9 @@ from rigkit.planning.candidates import Reach
 from rigkit.report.pages.check_page import check_facts
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
-from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, matches_say, straightened
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched
-from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, judge_evidence
+from rigkit.validation.sentinel.epipolar import PairMatches, check_matches, evidence_of_matches, straightened
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored
+from rigkit.validation.sentinel.judge import ALARM_PX, SentinelCheck, check_views, evaluate_evidence
 from rigkit.workflows.calibration.next_pictures import TASK_CELLS, length_goals
 
 MATCH_NOISE_PX, FINE_MATCH_NOISE_PX = 0.3, 0.07
@@ -36,9 +36,9 @@ TURN_DEG = [0.02, -0.015, 0.03]
 LENS_SIGMAS = [0.1, 0.1, 0.1, 0.1, 2e-5, 2e-5, 2e-5, 2e-5]
 
 
-def _rig() -> Watched:
+def _rig() -> Monitored:
     camera = lens("wide")
-    return Watched(
+    return Monitored(
         names=("left", "right"),
         cameras=(camera, camera),
         cam_from_rig=(Rigid3.identity(), MOUNT),
@@ -182,23 +182,23 @@ def test_pictures_too_far_off_to_linearise_are_not_of_these_cameras(tmp_path: Pa
         overdispersion=1.0,
         freedom=10.0,
     )
-    check = judge_evidence(rig, lambda _: far)
+    check = evaluate_evidence(rig, lambda _: far)
     assert check.unexplained and not check.holds and check.change is None
     assert "nothing that moved explains it" in check_facts(check).headline
     assert HistoryEntry.of_check(check, tmp_path).verdict == "nothing that moved explains it"
     # Where nothing is off, it is the calibration's numbers that are.
     with pytest.raises(DegenerateError, match="calibration's numbers"):
-        judge_evidence(rig, lambda _: replace(far, rms_px=0.1))
+        evaluate_evidence(rig, lambda _: replace(far, rms_px=0.1))
 
 
 def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     """The old rig measures points that the changed one sees."""
-    watched, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
-    step = np.zeros(watched.layout.count)
-    step[watched.layout.cameras[0]][:2] = 0.3
-    step[watched.layout.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
-    now, (goal,) = watched.changed(step), length_goals(watched.cameras, watched.cam_from_rig, task)
-    rays, valid = watched.cameras[0].unproject(grid_pixels(watched.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
+    monitored, task = _rig(), Task(quantity=Quantity.LENGTH, size_mm=100.0, distance_mm=700.0)
+    step = np.zeros(monitored.layout.count)
+    step[monitored.layout.cameras[0]][:2] = 0.3
+    step[monitored.layout.mount(1)] = 2e-4, 4e-4, -3e-4, 0.02, 0.0, 0.01
+    now, (goal,) = monitored.changed(step), length_goals(monitored.cameras, monitored.cam_from_rig, task)
+    rays, valid = monitored.cameras[0].unproject(grid_pixels(monitored.cameras[0].size_px, TASK_CELLS).reshape(-1, 2))
     points = measured_points(rays[valid], task, is_rig=True)[0]
     seen, shown = np.ones(len(points), dtype=bool), []
     for camera, pose in zip(now.cameras, now.cam_from_rig, strict=True):
@@ -208,7 +208,7 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     found = points.copy()
     for _ in range(4):
         rows, left = [], []
-        for camera, pose, pixels in zip(watched.cameras, watched.cam_from_rig, shown, strict=True):
+        for camera, pose, pixels in zip(monitored.cameras, monitored.cam_from_rig, shown, strict=True):
             projected, _, d_pixels_d_point, _ = camera.project_with_jacobians(pose.apply(found))
             rows.append(d_pixels_d_point @ pose.rotation)
             left.append(pixels - projected)
@@ -220,7 +220,7 @@ def test_what_a_change_of_a_rig_costs_in_a_length() -> None:
     assert goal.unit == "mm" and np.sqrt(step @ goal.weight @ step) == pytest.approx(wrong, rel=0.02)
     far = Task(quantity=Quantity.LENGTH, size_mm=90000.0, distance_mm=700.0)
     with pytest.raises(DegenerateError, match="of no two cameras"):
-        length_goals(watched.cameras, watched.cam_from_rig, far)
+        length_goals(monitored.cameras, monitored.cam_from_rig, far)
 
 
 def test_what_a_calibration_leaves_open_is_no_other_rig() -> None:
@@ -304,13 +304,13 @@ def test_a_step_so_wide_that_nothing_is_seen_ends_no_check(rng: np.random.Genera
     moved = Rigid3(exp_so3(turn) @ MOUNT.rotation, exp_so3(turn) @ MOUNT.translation_mm)
     matches, looks = [_matches(moved, rng)], []
 
-    def look(now: Watched) -> FreshEvidence:
+    def look(now: Monitored) -> FreshEvidence:
         looks.append(now)
         if len(looks) == 3:
             raise DegenerateError("check: the lenses see none of the matches")
-        return matches_say(now, matches)
+        return evidence_of_matches(now, matches)
 
-    check = judge_evidence(_rig(), look)
+    check = evaluate_evidence(_rig(), look)
     assert (
         len(looks) >= 3 and not check.holds and check.change is not None and check.change.hypothesis.kind == "rotation"
     )

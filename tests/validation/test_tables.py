@@ -125,8 +125,8 @@ def test_what_brackets_mean_is_said_wherever_there_are_any(tables: tuple[Table, 
     for key, words in (("planes", True), ("checks", False)):
         table = by_key(tables, key)
         page = render("table.html", table=shown_table(table))
-        said = [tables_to_markdown([table]), tables_to_text([table]), tables_to_latex([table]), page]
-        assert [("In brackets" in text) for text in said] == [words] * 4
+        printed = [tables_to_markdown([table]), tables_to_text([table]), tables_to_latex([table]), page]
+        assert [("In brackets" in text) for text in printed] == [words] * 4
 
 
 def test_averages_are_over_the_cells_that_the_paper_has(tables: tuple[Table, ...]) -> None:

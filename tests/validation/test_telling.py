@@ -20,12 +20,12 @@ from rigkit.planning.goal import projection_goal
 from rigkit.planning.information import CornerError, HeldBoards, Knowledge
 from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.plan_page import plan_words
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, told_by
+from rigkit.validation.sentinel.change_aim import informative_views
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, board_information
 from rigkit.validation.sentinel.hypotheses import hypotheses_of
 from rigkit.validation.sentinel.judge import ALARM_CHANCE, SentinelCheck, check_views
 from rigkit.validation.sentinel.power import Power, powers_of
-from rigkit.validation.sentinel.telling import views_that_tell
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.watch import monitored_camera
 
 NOISE_PX = 0.05
 FRESH = 3
@@ -50,14 +50,14 @@ def calibration() -> Calibration:
 
 def _checked(calibration: Calibration, plan: Plan, rng: np.random.Generator) -> SentinelCheck:
     fresh = [FreshView(view.image, 0, view) for view in _views(plan, rng)]
-    return check_views(watched_camera(calibration, "cam"), fresh)
+    return check_views(monitored_camera(calibration, "cam"), fresh)
 
 
 def test_pictures_find_what_was_promised_and_more_than_others(calibration: Calibration) -> None:
-    plan, promised = views_that_tell(watched_camera(calibration, "cam"), [BOARD], FRESH)
-    said = _checked(calibration, plan, np.random.default_rng(3)).powers
-    assert [p.kind for p in said] == [p.kind for p in promised] and len(said) == 3
-    for one, other in zip(said, promised, strict=True):
+    plan, promised = informative_views(monitored_camera(calibration, "cam"), [BOARD], FRESH)
+    printed = _checked(calibration, plan, np.random.default_rng(3)).powers
+    assert [p.kind for p in printed] == [p.kind for p in promised] and len(printed) == 3
+    for one, other in zip(printed, promised, strict=True):
         assert one.chance == pytest.approx(other.chance, abs=PROMISED_WITHIN)
     # What improves the calibration most is not what tells changes best: a focus is seen worst.
     improving = plan_views(Knowledge.of(calibration), [BOARD], projection_goal(calibration.camera), FRESH)
@@ -66,7 +66,7 @@ def test_pictures_find_what_was_promised_and_more_than_others(calibration: Calib
 
 
 def test_each_picture_tells_more(calibration: Calibration) -> None:
-    plan, _ = views_that_tell(watched_camera(calibration, "cam"), [BOARD], FRESH)
+    plan, _ = informative_views(monitored_camera(calibration, "cam"), [BOARD], FRESH)
     errors = [plan.error, *(view.error for view in plan.views)]
     assert not np.isfinite(errors[0])
     assert all(after < before for before, after in pairwise(errors))
@@ -76,9 +76,9 @@ MOUNT = Rigid3(exp_so3(np.array([0.01, -0.3, 0.02])), [-180.0, 2.0, 30.0])
 LENS_SIGMAS = [0.05, 0.05, 0.05, 0.05, 2e-5, 2e-5, 2e-5, 2e-5]
 
 
-def _rig(mount: Rigid3) -> Watched:
+def _rig(mount: Rigid3) -> Monitored:
     camera = lens("wide")
-    return Watched(
+    return Monitored(
         names=("left", "right"),
         cameras=(camera, camera),
         cam_from_rig=(Rigid3.identity(), mount),
@@ -94,7 +94,7 @@ def _turn(powers: tuple[Power, ...]) -> float:
 
 def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_lens() -> None:
     rig, rng = _rig(MOUNT), np.random.default_rng(5)
-    plan, promised = views_that_tell(rig, [BOARD], FRESH)
+    plan, promised = informative_views(rig, [BOARD], FRESH)
     assert [p.kind for p in promised] == ["focus"] * 2 + ["principal point"] * 2 + ["distortion"] * 2 + ["rotation"]
     # What tells of a mount is a board that both see.
     assert sum(len(view.seen_by) == 2 for view in plan.views) >= 2
@@ -106,21 +106,21 @@ def test_pictures_for_a_rig_find_what_was_promised_and_more_than_those_for_one_l
             own = noisy_view(rig.cameras[c], rig.cam_from_rig[c] @ rig_from_board, f"{k}", rng, NOISE_PX)
             assert len(own.grid) == BOARD.corner_count
             frames.append(FreshView(f"{k}", c, own))
-    said = check_views(rig, frames).powers
-    assert [(p.kind, p.camera) for p in said] == [(p.kind, p.camera) for p in promised]
-    assert [p.chance for p in said] == pytest.approx([p.chance for p in promised], abs=PROMISED_WITHIN)
+    printed = check_views(rig, frames).powers
+    assert [(p.kind, p.camera) for p in printed] == [(p.kind, p.camera) for p in promised]
+    assert [p.chance for p in printed] == pytest.approx([p.chance for p in promised], abs=PROMISED_WITHIN)
     left = replace(rig, names=("left",), cameras=rig.cameras[:1], cam_from_rig=rig.cam_from_rig[:1])
-    for_left, _ = views_that_tell(replace(left, covariance=rig.covariance[:8, :8]), [BOARD], FRESH)
+    for_left, _ = informative_views(replace(left, covariance=rig.covariance[:8, :8]), [BOARD], FRESH)
     poses = [view.cam_from_board for view in for_left.views]
     rotation, shift = np.array([p.rotation for p in poses]), np.array([p.translation_mm for p in poses])
     held = HeldBoards(BOARD.points(), rotation, shift, np.tile(BOARD.exists(), (FRESH, 1)))
     whole = sees_held(rig.cameras[1], BOARD, held.transformed(MOUNT), Reach())
     seen = [held.seen, whole[:, None] & held.seen]
-    others = _powers(rig, told_by(rig, BOARD, rotation, shift, seen))
+    others = _powers(rig, board_information(rig, BOARD, rotation, shift, seen))
     assert min(p.chance for p in others) < 0.9 * min(p.chance for p in promised)
 
 
-def _powers(rig: Watched, information: FloatArray) -> tuple[Power, ...]:
+def _powers(rig: Monitored, information: FloatArray) -> tuple[Power, ...]:
     """Return what frames of this information find."""
     sigma = rig.fresh_sigma_px
     evidence = FreshEvidence(
@@ -139,7 +139,7 @@ def _powers(rig: Watched, information: FloatArray) -> tuple[Power, ...]:
 
 def test_cameras_that_never_see_one_board_are_checked_lens_by_lens() -> None:
     rig = _rig(Rigid3(exp_so3(np.array([0.0, np.pi, 0.0])), [0.0, 0.0, -50.0]))
-    plan, promised = views_that_tell(rig, [BOARD], 2)
+    plan, promised = informative_views(rig, [BOARD], 2)
     assert {view.seen_by for view in plan.views} == {("left",), ("right",)}
     assert all(np.isfinite(view.error) for view in plan.views) and _turn(promised) < 0.05
     assert plan_words(plan)[0].startswith("1. before camera 'left': ")

@@ -11,7 +11,7 @@ from helpers.stereo_pictures import RIGHT_FROM_LEFT
 
 from rigkit.cli.main import main
 from rigkit.io.calibrations.rig_file import load_rig
-from rigkit.workflows.checks.check import load_watched
+from rigkit.workflows.checks.check import load_monitored
 
 COVERED = {"01": {"left": 240, "right": 138}, "02": {"left": 311, "right": 184}, "05": {"left": 294, "right": 259}}
 """Frames in which something stands before the board, for the left camera from this column on, for the right one up to
@@ -56,7 +56,7 @@ def test_parts_of_boards_are_no_change_of_the_rig(cut: Path, capsys: pytest.Capt
 def test_parts_are_no_boards_to_hold_or_to_look_for(cut: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [cut / "rig.json", *(cut / f"rig-{side}.json" for side in ("left", "right"))]
     for path in files:
-        _, boards = load_watched(path)
+        _, boards = load_monitored(path)
         assert [board.board_id for board in boards] == ["board-9x6x30"]
         assert main(["plan", str(path), "-n", "1"]) == 0
         assert "part of" not in capsys.readouterr().out

@@ -11,12 +11,12 @@ from rigkit.workflows.checks.diff import CameraPair
 from rigkit.workflows.checks.diff_words import words_of
 
 
-@pytest.mark.parametrize(("usual_times", "surer"), [((0.5, 5.0), True), ((0.1, 0.5), False)])
-def test_another_camera_that_differs_by_no_more_than_usual(usual_times: tuple[float, float], surer: bool) -> None:
+@pytest.mark.parametrize(("typical_times", "surer"), [((0.5, 5.0), True), ((0.1, 0.5), False)])
+def test_another_camera_that_differs_by_no_more_than_usual(typical_times: tuple[float, float], surer: bool) -> None:
     """Rms and chance ask different things: where most of what is usual is of one kind, little of another is none."""
     camera = lens("reg")
     difference = compare_cameras(camera, camera.with_parameters(camera.parameters * [1.002, 1.0, *[1.0] * 7]))
-    low, high = (times * difference.rms_px for times in usual_times)
+    low, high = (times * difference.rms_px for times in typical_times)
     judged = CalibrationComparison(difference, 0.5 * (low + high), (low, high), 0.001, True)
     words = words_of(CameraPair(difference, judged))[-1]
     assert "another camera or a moved lens" in words

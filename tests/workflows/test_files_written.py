@@ -91,9 +91,9 @@ def test_a_bad_camera_and_a_lost_image_end_their_own_pairs_only(
     arguments = ["reconstruct", str(dataset), "--json", "--no-pictures", "-j", "1", "-o", str(tmp_path / "out")]
     # The first pair's camera is a letter.
     assert main(arguments) == 2
-    told = json.loads(capsys.readouterr().out)
-    assert [pair["pair"] for pair in told["pairs"]] == ["second"]
-    assert "letter.txt" in told["failed"]["first"] and "nowhere" in told["failed"]["third"]
+    reported = json.loads(capsys.readouterr().out)
+    assert [pair["pair"] for pair in reported["pairs"]] == ["second"]
+    assert "letter.txt" in reported["failed"]["first"] and "nowhere" in reported["failed"]["third"]
     assert (tmp_path / "out" / "second" / "3SDIR.ply").is_file()
 
 
@@ -134,6 +134,6 @@ def test_a_truncated_image_is_named_and_the_rest_is_done(lens: Path, capsys: pyt
     assert "dropped 02.jpg" in capsys.readouterr().out
     assert len(load_calibration(lens / "calibration.json").views) == 4
     assert main(["detect", str(lens), "-o", str(lens / "corners.csv"), "-j", "1"]) == 2
-    said = capsys.readouterr()
-    assert "02.jpg" in said.err and "4 boards in 4 of 5 images; 1 cannot be used" in said.out
+    printed = capsys.readouterr()
+    assert "02.jpg" in printed.err and "4 boards in 4 of 5 images; 1 cannot be used" in printed.out
     assert (lens / "corners.csv").is_file()

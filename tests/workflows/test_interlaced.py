@@ -46,15 +46,15 @@ def test_interlaced_images_are_called_that(tmp_path: Path, rng: np.random.Genera
     result = calibrate(views, SIZE, model="brown", board="flat")
     images = {view.image: tmp_path / view.image for view in views}
 
-    def said(*shifts_px: float) -> str:
+    def printed(*shifts_px: float) -> str:
         for path, shift_px in zip(images.values(), shifts_px, strict=True):
             cv2.imwrite(str(path), np.clip(picture(shift_px, rng), 0.0, 255.0).astype(np.uint8))
         return str(interlaced(result, images))
 
-    assert "every second line is of another moment" in said(0.0, *[0.8] * 7) and "(3 of 4 images" in said(
+    assert "every second line is of another moment" in printed(0.0, *[0.8] * 7) and "(3 of 4 images" in printed(
         0.0, *[1.0] * 7
     )
-    assert said(*[0.0] * 8) == said(2.0, *[0.0] * 7) == "[]"
-    said(*[1.0] * 8)
+    assert printed(*[0.0] * 8) == printed(2.0, *[0.0] * 7) == "[]"
+    printed(*[1.0] * 8)
     next(iter(images.values())).write_bytes(b"no image")
     assert "(3 of 3 images" in str(interlaced(result, images)) and interlaced(result, {}) == []

@@ -27,9 +27,9 @@ from rigkit.validation.certificate.propagation import measured_points
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
 from rigkit.workflows.checks.certify import certify_file
-from rigkit.workflows.checks.check import fixed_text, load_watched
+from rigkit.workflows.checks.check import fixed_text, load_monitored
 from rigkit.workflows.checks.diff import CameraPair, diff
-from rigkit.workflows.handeye import _from_afar
+from rigkit.workflows.handeye import _with_fixed_pupil
 from rigkit.workflows.inputs.camera_files import import_camera, import_near_camera
 from rigkit.workflows.outputs.export_camera import ExportCameraOptions, export_camera
 
@@ -153,44 +153,44 @@ def test_diff_compares_what_is_far_away(saved: Path, tmp_path: Path, caplog: pyt
 
 
 def test_fresh_boards_are_checked_with_the_pupil(saved: Path) -> None:
-    watched, _ = load_watched(saved)
+    monitored, _ = load_monitored(saved)
     seen = [FreshView(f"{k}", 0, view) for k, view in enumerate(views_of(2, 6))]
-    assert check_views(watched, seen).rms_px < 0.06
-    near = watched.cameras[0]
+    assert check_views(monitored, seen).rms_px < 0.06
+    near = monitored.cameras[0]
     assert isinstance(near, NearCamera)
     # As if from one point; and the lens and the pupil as sure together as they were solved for.
-    central = replace(watched, cameras=(near.with_parameters([*near.lens.parameters, 0.0, 0.0]),))
+    central = replace(monitored, cameras=(near.with_parameters([*near.lens.parameters, 0.0, 0.0]),))
     assert check_views(central, seen).rms_px > 0.2
     own, known = slice(near.lens.parameters.size, None), load_calibration(saved)
     assert known.pupil is not None
-    assert (np.diag(watched.covariance[own, own]) >= 0.999 * np.diag(known.pupil.covariance)).all()
+    assert (np.diag(monitored.covariance[own, own]) >= 0.999 * np.diag(known.pupil.covariance)).all()
     # What the lens may do beyond its model adds to both.
-    np.testing.assert_allclose(watched.covariance[:2, own], known.pupil.with_frame[:2], rtol=0.1)
+    np.testing.assert_allclose(monitored.covariance[:2, own], known.pupil.with_frame[:2], rtol=0.1)
 
 
 def test_a_pupil_that_is_not_known_well_alarms_nobody(saved: Path) -> None:
     """What fresh views see of it is no change of the lens, where the calibration is as unsure."""
-    watched, _ = load_watched(saved)
-    near, p = watched.cameras[0], watched.cameras[0].parameters.size
+    monitored, _ = load_monitored(saved)
+    near, p = monitored.cameras[0], monitored.cameras[0].parameters.size
     sigma = 0.3
-    unsure = watched.covariance.copy()
+    unsure = monitored.covariance.copy()
     unsure[p - 2, p - 2] += sigma**2
     off = near.with_parameters(near.parameters + np.where(np.arange(p) == p - 2, 1.5 * sigma, 0.0))
     views = random_views(off, 6, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
     seen = [FreshView(f"{k}", 0, view) for k, view in enumerate(views)]
-    assert not check_views(watched, seen).holds
-    assert check_views(replace(watched, covariance=unsure), seen).holds
+    assert not check_views(monitored, seen).holds
+    assert check_views(replace(monitored, covariance=unsure), seen).holds
 
 
 def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path: Path) -> None:
     """Surer of the lens, it is surer of the pupil, and of both together."""
-    watched, _ = load_watched(saved)
-    zoomed = watched.cameras[0].parameters.copy()
+    monitored, _ = load_monitored(saved)
+    zoomed = monitored.cameras[0].parameters.copy()
     zoomed[:2] *= 1.01
-    changed = watched.cameras[0].with_parameters(zoomed)
+    changed = monitored.cameras[0].with_parameters(zoomed)
     assert isinstance(changed, NearCamera)
     views = random_views(changed, 12, np.random.default_rng(4), reach_deg=80.0, board=NEAR, noise_px=0.03)[0]
-    check = check_views(watched, [FreshView(f"{k}", 0, v) for k, v in enumerate(views)])
+    check = check_views(monitored, [FreshView(f"{k}", 0, v) for k, v in enumerate(views)])
     assert not check.holds and check.change is not None
     path = tmp_path / "fixed.json"
     path.write_text(fixed_text(saved, check), encoding="utf-8")
@@ -206,6 +206,6 @@ def test_a_corrected_file_keeps_a_pupil_that_goes_with_it(saved: Path, tmp_path:
 
 def test_a_pose_takes_the_pupil_out(saved: Path) -> None:
     view, near = views_of(3, 1)[0], import_near_camera(saved)
-    afar = _from_afar(near, view)
-    assert np.abs(afar.pixels - view.pixels).max() > 1.0
-    assert _from_afar(import_camera(saved), view) is view
+    fixed_pupil = _with_fixed_pupil(near, view)
+    assert np.abs(fixed_pupil.pixels - view.pixels).max() > 1.0
+    assert _with_fixed_pupil(import_camera(saved), view) is view

@@ -22,7 +22,7 @@ def test_a_name_with_its_ending_has_it_once(given: str, stem: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("board", "said"),
+    ("board", "printed"),
     [
         (
             Board("c", 7, 6, 1.0, 1.0, pattern=Circles(diameter_mm=0.6)),
@@ -33,6 +33,6 @@ def test_a_name_with_its_ending_has_it_once(given: str, stem: str, tmp_path: Pat
     ],
     ids=["circles", "charuco", "chessboard"],
 )
-def test_no_millimetres_without_a_scale(board: Board, said: str) -> None:
+def test_no_millimetres_without_a_scale(board: Board, printed: str) -> None:
     words = without_scale(board.describe())
-    assert said in words and "mm" not in words
+    assert printed in words and "mm" not in words

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bench_rig_planner import watched
+from bench_rig_planner import monitored
 from helpers.calibration_scenes import BOARD
 from helpers.rig_scenes import MODELS, NOISE_PX, Views, mounts, rig_views, sizes
 
@@ -21,7 +21,7 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.planning.goal import GOAL_GRID
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.certificate.contracts import Quantity, Task
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.workflows.calibration.next_pictures import next_frames
 
 NAMES = ("reg", "wide")
@@ -53,7 +53,7 @@ def frame(number: int, rig_from_board: Rigid3, rng: np.random.Generator) -> View
 def test_frames_bring_what_was_promised_and_more_than_others() -> None:
     rng = np.random.default_rng(0)
     first = {name: own for name, own in rig_views(rng, 6).items() if name in NAMES}
-    rig = watched(calibrated(first))
+    rig = monitored(calibrated(first))
     plan = next_frames(rig, [BOARD], 3)
     errors = [plan.error, *(view.error for view in plan.views)]
     assert errors == sorted(errors, reverse=True) and plan.gain > 0.9
@@ -118,7 +118,7 @@ def test_a_length_is_for_pairs() -> None:
     camera, pose = mounts()["reg"]
     names, count = ("a", "b", "c"), 3 * camera.parameters.size + 12
     shifted = (pose, Rigid3(np.eye(3), [-100.0, 0.0, 0.0]), Rigid3(np.eye(3), [-200.0, 0.0, 0.0]))
-    three = Watched(
+    three = Monitored(
         names=names, cameras=(camera,) * 3, cam_from_rig=shifted, covariance=1e-8 * np.eye(count), sigma_px=0.1
     )
     with pytest.raises(InputError, match="a rig of two"):

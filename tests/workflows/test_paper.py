@@ -88,7 +88,7 @@ def test_what_does_not_go_together_is_refused(capsys: pytest.CaptureFixture[str]
 def test_command_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = ["validate", str(LAB), "--paper", "-p", "regular-standard", "-j", "1", "-o", str(tmp_path / "out")]
     assert main([*arguments, "--json"]) == ExitCode.WELL
-    said = capsys.readouterr()
-    assert [r["affine_method"] for r in json.loads(said.out)["reports"]] == list(METHODS)
+    printed = capsys.readouterr()
+    assert [r["affine_method"] for r in json.loads(printed.out)["reports"]] == list(METHODS)
     # Exit code 0 is no word on the baseline.
-    assert "neither what was measured nor what is declared" in said.err
+    assert "neither what was measured nor what is declared" in printed.err

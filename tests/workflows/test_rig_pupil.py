@@ -23,13 +23,13 @@ from rigkit.geometry.rotation import exp_so3
 from rigkit.io.calibrations.rig_file import load_saved_rig, rig_text
 from rigkit.validation.certificate.contracts import Quantity, Task
 from rigkit.validation.certificate.propagation import measured_points
+from rigkit.validation.sentinel.change_aim import informative_views
 from rigkit.validation.sentinel.evidence import FreshView
 from rigkit.validation.sentinel.judge import check_views
-from rigkit.validation.sentinel.telling import views_that_tell
-from rigkit.validation.sentinel.watch import watched_rig
+from rigkit.validation.sentinel.watch import monitored_rig
 from rigkit.workflows.calibration.next_pictures import next_frames
 from rigkit.workflows.checks.certify import certify_file
-from rigkit.workflows.checks.check import load_watched
+from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import import_pair
 
 BOARD = Board("near", 9, 6, 12.0, 12.0)
@@ -174,21 +174,21 @@ def test_a_certificate_is_of_cameras_with_their_pupils(rig: RigCalibration, save
 
 def test_fresh_boards_are_checked_with_them(rig: RigCalibration, saved: Path) -> None:
     fresh = [(c, frame, view) for c, own in enumerate(frames(4, 1).values()) for frame, view in own]
-    for watched in (load_watched(saved)[0], watched_rig(rig)):
+    for monitored in (load_monitored(saved)[0], monitored_rig(rig)):
         seen = [FreshView(f, c, view) for c, f, view in fresh]
-        assert check_views(watched, seen).rms_px < 0.06
-        for k, own in enumerate(watched.layout.cameras):
+        assert check_views(monitored, seen).rms_px < 0.06
+        for k, own in enumerate(monitored.layout.cameras):
             pupil = slice(own.stop - 2, own.stop)
-            known = rig.pupils[watched.names[k]].covariance
-            np.testing.assert_allclose(watched.covariance[pupil, pupil], known, rtol=0.05)
-    lenses = [camera.with_parameters([*camera.parameters[:-2], 0.0, 0.0]) for camera in watched.cameras]
-    assert check_views(replace(watched, cameras=tuple(lenses)), seen).rms_px > 0.1
+            known = rig.pupils[monitored.names[k]].covariance
+            np.testing.assert_allclose(monitored.covariance[pupil, pupil], known, rtol=0.05)
+    lenses = [camera.with_parameters([*camera.parameters[:-2], 0.0, 0.0]) for camera in monitored.cameras]
+    assert check_views(replace(monitored, cameras=tuple(lenses)), seen).rms_px > 0.1
 
 
 def test_frames_are_planned_with_them(saved: Path) -> None:
-    watched, boards = load_watched(saved)
-    assert all(isinstance(camera, NearCamera) for camera in watched.cameras)
-    plan, (told, powers) = next_frames(watched, boards, 2), views_that_tell(watched, boards, 2)
-    assert len(plan.views) == len(told.views) == 2
+    monitored, boards = load_monitored(saved)
+    assert all(isinstance(camera, NearCamera) for camera in monitored.cameras)
+    plan, (reported, powers) = next_frames(monitored, boards, 2), informative_views(monitored, boards, 2)
+    assert len(plan.views) == len(reported.views) == 2
     assert plan.views[1].error < plan.views[0].error < plan.error
     assert {power.kind for power in powers} >= {"focus", "rotation"}

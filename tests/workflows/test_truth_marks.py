@@ -20,7 +20,7 @@ from truth.marks import fit_similarity, lattice_affinities, mark_lattice
 ROWS, COLUMNS, STEP_PX, HALF_PX = 6, 5, 60.0, 9.0
 MAX_CENTRE_PX = 0.05
 """Corners are drawn at sixteenths of a pixel, in 8 bits: up to .044 px remain."""
-MAX_BENT = 1.5e-4
+MAX_CURVED = 1.5e-4
 """Of affinities of about one: differences of the nearest marks alone are off by five times that."""
 OVERSAMPLING = 16
 
@@ -73,7 +73,7 @@ def test_affinities_of_a_surface_that_bends() -> None:
         return out
 
     (found,), (exact,) = (lattice_affinities(marks(part, -0.5), marks(part, 0.4))[3] for part in (1.0, 1e-3))
-    assert np.abs(found - exact).max() < MAX_BENT
+    assert np.abs(found - exact).max() < MAX_CURVED
 
 
 def test_no_marks_are_said() -> None:

@@ -40,8 +40,8 @@ def test_corners_in_wrong_places_of_a_board_have_their_cause(
 ) -> None:
     """Its first rows have their markers where a board of one column more has them: some corners are found."""
     assert calibrate(folder, "8x8", tmp_path, "--model", "pinhole") != 0
-    said = "".join(capsys.readouterr())
-    assert "7 x 7 inner corners are seen, 8 x 8 are declared" in said
+    printed = "".join(capsys.readouterr())
+    assert "7 x 7 inner corners are seen, 8 x 8 are declared" in printed
 
 
 def test_few_corners_that_markers_place_make_no_board(folder: Path) -> None:
@@ -56,17 +56,17 @@ def test_mirrored_images_are_named(folder: Path, tmp_path: Path, capsys: pytest.
     for path in sorted(folder.glob("*.png"))[:2]:
         cv2.imwrite(str(mirrored / path.name), np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))[:, ::-1])
     assert calibrate(mirrored, "7x7", tmp_path, "--model", "pinhole") != 0
-    said = "".join(capsys.readouterr())
-    assert "the images are mirrored: '0.png' shows its board only when it is flipped" in said
+    printed = "".join(capsys.readouterr())
+    assert "the images are mirrored: '0.png' shows its board only when it is flipped" in printed
 
 
 def test_a_board_that_is_as_declared_needs_no_words_and_another_kind_some(folder: Path) -> None:
     assert explained([folder / "0.png"], [BOARD]) is None
     plain, larger = Board("plain", 7, 7, 30.0, 30.0), Board("c", 8, 8, 30.0, 30.0, pattern=BOARD.pattern)
-    said = explained([folder / "0.png"], [plain, larger])
-    assert said is not None and 'set type = "charuco"' in said
-    said = explained([folder / "0.png"], [larger])
-    assert said is not None and "8 x 8 are declared" in said
+    printed = explained([folder / "0.png"], [plain, larger])
+    assert printed is not None and 'set type = "charuco"' in printed
+    printed = explained([folder / "0.png"], [larger])
+    assert printed is not None and "8 x 8 are declared" in printed
 
 
 def test_boards_alike_are_named_where_a_rig_comes_to_nothing(

@@ -156,9 +156,9 @@ def _products(
         )
     residuals = corners.residuals_px[used]
     # Corners that do not project tell nothing.
-    told = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
+    usable = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
     rows = LensCorners.make(
-        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, (u, v), residuals, told, count, camera.size_px
+        d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, (u, v), residuals, usable, count, camera.size_px
     )
     with_pose, out = rows.products()
     coupling = with_pose[:, POSE:]

@@ -184,7 +184,7 @@ def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
     """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it, and those of
     its pupil with `near`."""
     far = FarProjection.of(calibration)
-    modes, followed = telling_modes(far), far.departures.followed
+    modes, followed = significant_modes(far), far.departures.followed
     if near:
         followed = np.concatenate([followed, far.departures.followed_by_pupil])
     return LensModes(modes, -followed @ modes, -far.hides_departures @ modes)
@@ -219,7 +219,7 @@ def with_modes(
     return tuple(out), whole
 
 
-def telling_modes(far: FarProjection) -> FloatArray:
+def significant_modes(far: FarProjection) -> FloatArray:
     """Return modes (J, M) of displacements, px, of one standard deviation each, independent of each other: those of
     what a lens may do beyond its model, its rivals too, that matter beside its parameters."""
     pixels = grid_pixels(far.camera.size_px, MODES_GRID).reshape(-1, 2)

@@ -132,8 +132,8 @@ def between_models(
         there = (turn.T @ one.state.rotation, one.state.translation_mm @ turn)
         moved = steps_between((here.rotation, here.translation_mm), there)
         motions = motion_of_world(here.translation_mm) @ moved[..., None]
-        way = np.concatenate([step, pupil, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
-        out += one.rival.likely * np.outer(way, way)
+        direction = np.concatenate([step, pupil, motions[chosen.kept.any(axis=1), :, 0].mean(axis=0)])
+        out += one.rival.likely * np.outer(direction, direction)
     return out
 
 

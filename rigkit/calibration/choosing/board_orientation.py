@@ -178,8 +178,8 @@ class _Patterns:
         views = len(self.left)
         prior = self.prior * np.eye(3)
         total = self.information.sum(axis=0) + prior
-        told = np.linalg.solve(total, self.pull[..., None])[..., 0].reshape(views, -1)
-        alike = told @ self.pull.reshape(views, -1).T
+        solved = np.linalg.solve(total, self.pull[..., None])[..., 0].reshape(views, -1)
+        alike = solved @ self.pull.reshape(views, -1).T
         others = _agreeing_without_each(alike - np.diag(np.diag(alike)))
         rest = total - self.information
         departure = np.linalg.solve(rest, np.tensordot(others, self.pull, axes=1)[..., None])[..., 0]

@@ -14,7 +14,7 @@ from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02
 """A model or a board shape with more numbers must lower the held-out error by this part to be chosen,"""
-SURELY = 1.0
+MIN_SIGMAS = 1.0
 """or, a model, by this many standard errors of the difference, as images have it: a lens that is not quite right hides
 in the poses, and 0.3 % of held-out error may be three times the error of the lens."""
 MORE_NUMBERS = 1
@@ -60,10 +60,11 @@ def settled(options: Sequence[FittedModel]) -> Sequence[FittedModel]:
     return [option for option in options if option.fit.convergence.converged] or options
 
 
-def choose(options: Sequence[FittedModel], surely: float | None = None) -> FittedModel:
+def choose(options: Sequence[FittedModel], min_sigmas: float | None = None) -> FittedModel:
     """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
-    (if given) `surely` standard errors of the difference; with too few images for that, the one with the smallest BIC.
-    One whose solver was stopped is taken only where all were; two images leave too much open to say that of it.
+    (if given) `min_sigmas` standard errors of the difference; with too few images for that, the one with the
+    smallest BIC. One whose solver was stopped is taken only where all were; two images leave too much open to say
+    that of it.
 
     Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
     rule, here paired over images.
@@ -73,18 +74,18 @@ def choose(options: Sequence[FittedModel], surely: float | None = None) -> Fitte
     judged = [o for o in settled(options) if o.heldout is not None]
     if not judged:
         return min(options, key=_bic)
-    good = _as_good(np.array([o.heldout for o in judged]), surely)
+    good = _as_good(np.array([o.heldout for o in judged]), min_sigmas)
     return min((o for o, fine in zip(judged, good, strict=True) if fine), key=lambda o: o.count)
 
 
-def _as_good(heldout: FloatArray, surely: float | None) -> BoolArray:
+def _as_good(heldout: FloatArray, min_sigmas: float | None) -> BoolArray:
     """Return which of M options are as good as the best, from their squared held-out residuals (M, N) of N images."""
     total = heldout.sum(axis=1)
     within = total <= float(total.min()) * (1.0 + MARGIN) ** 2
-    if surely is None:
+    if min_sigmas is None:
         return np.asarray(within)
     more, chance = _against(heldout, int(total.argmin()))
-    return np.asarray(within & (more <= surely * chance))
+    return np.asarray(within & (more <= min_sigmas * chance))
 
 
 def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
@@ -122,7 +123,7 @@ class HeldOut:
 
     def chosen(self) -> str:
         """Return the name that `choose` prefers."""
-        good = np.flatnonzero(_as_good(self.heldout, SURELY)).tolist()
+        good = np.flatnonzero(_as_good(self.heldout, MIN_SIGMAS)).tolist()
         return self.names[min(good, key=lambda k: self.counts[k])]
 
     def contradicts(self, name: str, own: str) -> bool:

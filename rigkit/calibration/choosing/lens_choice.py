@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rigkit.calibration.choosing.choice import SURELY, FittedModel, HeldOut, choose, models_of, settled
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, HeldOut, choose, models_of, settled
 from rigkit.calibration.choosing.heldout import heldout_squares
 from rigkit.calibration.choosing.models_tried import Request, agreeing, compared, fit_of_views, reweighted
 from rigkit.calibration.choosing.one_model import ModelOutcome
@@ -53,7 +53,7 @@ def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:
         if evidence.names:
             sizes.append(evidence.chosen())
         else:
-            sizes += {choose(options, SURELY).name for options in own if options}
+            sizes += {choose(options, MIN_SIGMAS).name for options in own if options}
     return sizes
 
 
@@ -88,7 +88,7 @@ def lenses_on_boards(
 def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:
     """Return the model of each of some cameras that are alike: what their images say is put together, and who clearly
     contradicts the others has a lens of its own."""
-    own = [choose(options, SURELY) for options in cameras]
+    own = [choose(options, MIN_SIGMAS) for options in cameras]
     each = [HeldOut.of([options]) for options in cameras]
     out = [ModelChoice(option.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
     together = [k for k, evidence in enumerate(each) if evidence.names]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.calibration.choosing.board_orientation import turned_views, with_views_turned
-from rigkit.calibration.choosing.choice import SURELY, FittedModel, choose, described
+from rigkit.calibration.choosing.choice import MIN_SIGMAS, FittedModel, choose, described
 from rigkit.calibration.choosing.models_tried import (
     ModelInQuestion,
     Request,
@@ -67,7 +67,7 @@ def solved(
         options, failed = fit_all(observations, size_px, wanted, progress)
     observations = reweighted(observations, options)
     options = compared(observations, options, folds, progress)
-    beyond = [] if request.degree is not None else larger_sizes(choose(options, SURELY))
+    beyond = [] if request.degree is not None else larger_sizes(choose(options, MIN_SIGMAS))
     if beyond:
         options, unfit = fit_all(observations, size_px, beyond, progress, options)
         options = compared(observations, options, folds, progress)
@@ -86,7 +86,7 @@ def chosen_of_sizes(
     beyond: Sequence[ModelInQuestion] = (),
 ) -> ModelOutcome:
     """Return a camera model with the best of its `sizes`, compared on flat boards, and then the best shape of those."""
-    chosen = choose(sizes, SURELY)
+    chosen = choose(sizes, MIN_SIGMAS)
     candidates = [*described(sizes, chosen, rivals=request.model == "auto"), *failed]
     observations, chosen, shapes, tried = with_board_shape(
         observations, chosen, request.board, request.folds, request.progress

@@ -19,7 +19,7 @@ of 50 amiss. A REAL board of 88 mm tags shows 0.001 at most, however it is decla
 off by 0.05."""
 
 
-def judge_boards(c: Calibration, provided: str, *, sure: bool) -> list[Finding]:
+def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> list[Finding]:
     """Return what is to be said of the boards whose shape was solved for.
 
     Squares longer one way than the other are told `provided` that something holds; a lens that is not `sure` does not

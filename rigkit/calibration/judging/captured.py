@@ -72,7 +72,7 @@ class Extent:
         )
 
 
-def judge_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
+def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
     """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
     views, those that repeat others as those."""
     images = [view.image for view in calibration.views]
@@ -136,7 +136,7 @@ def _parallel(c: Calibration) -> list[Finding]:
     ]
 
 
-def same_way_up(c: Calibration) -> list[Finding]:
+def boards_never_rotated(c: Calibration) -> list[Finding]:
     """Return a finding where no board was turned: pixels that are longer one way, and squares that are longer one way,
     look alike but for what tilted boards show."""
     # Half a turn changes nothing: angles are doubled.
@@ -202,14 +202,14 @@ def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Fin
     if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
         return []
     worst = worst_direction(far.covariance(extent.rays[~extent.covered]))
-    usual = float(np.sqrt(np.mean(worst**2)))
+    typical = float(np.sqrt(np.mean(worst**2)))
     error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
-    if usual <= MAX_TIMES_ERROR * max(error, SMALL_PX):
+    if typical <= MAX_TIMES_ERROR * max(error, SMALL_PX):
         return []
     return [
         Finding.look(
             f"in the {100 - round(100.0 * extent.share)} % of the image where no boards were the lens is extrapolated, "
-            f"and uncertain by {digits(usual)} px (one standard deviation, rms)",
+            f"and uncertain by {digits(typical)} px (one standard deviation, rms)",
             "hold the board there as well, up to the corners of the image",
         )
     ]

@@ -69,11 +69,11 @@ def _partners(
     starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
     # By how much each motion moves a frame that stands where boards usually were, as products of all ends and starts:
     # coordinates first, then start, end and point.
-    usual = frame + centre.mean(axis=0)
-    seen_from = (usual - centre[starts, None]) @ rotation[starts]
+    typical = frame + centre.mean(axis=0)
+    seen_from = (typical - centre[starts, None]) @ rotation[starts]
     moved = np.swapaxes(rotation, 0, 1).reshape(-1, 3) @ seen_from.reshape(-1, 3).T
     moved = moved.reshape(3, len(centre), len(starts), len(frame))
-    moved += centre.T[:, :, None, None] - usual.T[:, None, None]
+    moved += centre.T[:, :, None, None] - typical.T[:, None, None]
     chosen = (number[:, None] != number[starts]) & (boards[:, None] == boards[starts])
     chosen &= (moved * moved).sum(axis=0).max(axis=-1) > (0.5 * MIN_MOTION * reach) ** 2
     i, j = np.nonzero(chosen.T)

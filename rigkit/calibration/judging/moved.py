@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, UNTRUE, min_of_a_kind
+from rigkit.calibration.judging.two_kinds import RIDGE_OF_STEP, SIGMAS_DO_NOT_HOLD, min_of_a_kind
 from rigkit.calibration.solving.clustered import reduced_by_cluster
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.solving.solver import FROM_OPTIMUM, solve
@@ -51,12 +51,12 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
     number = np.array([place[name] for name in observations.images])
     # The shape of the boards stays as it was found: two shapes are not two lenses.
     state = fit.state.with_boards_held()
-    pulls, order = _Pulls.of(fit, number), np.arange(len(images))
-    first = pulls.parted_at(order)
+    scores, order = _ImageScores.of(fit, number), np.arange(len(images))
+    first = scores.split_at(order)
     later = order >= first
     named = _named_alike(images)
     if named is not None and not (named == later).all() and not (named != later).all():
-        distance = _surely_apart(observations, fit, state, number, named, pulls)
+        distance = _lens_difference_sigmas(observations, fit, state, number, named, scores)
         if distance is not None:
             other, one = images[int(np.argmax(named))], images[int(np.argmin(named))]
             message = (
@@ -64,13 +64,13 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
                 f"of different lenses ({distance:.0f} standard deviations)"
             )
             return (Finding.bad(message, "calibrate each camera from its own images"),)
-    distance = _surely_apart(observations, fit, state, number, later, pulls)
-    if distance is None or (chance := pulls.chance(observations.clusters(), number)) > CHANCE:
+    distance = _lens_difference_sigmas(observations, fit, state, number, later, scores)
+    if distance is None or (chance := scores.chance(observations.clusters(), number)) > CHANCE:
         return ()
     message = (
         f"the lens (or the board) was another one from '{images[first]}' on ({distance:.0f} standard deviations; the "
         f"chance that images in any order are parted so clearly is {chance:.2g} at most): another camera, or focus, "
-        f"zoom or mount moved; {UNTRUE}"
+        f"zoom or mount moved; {SIGMAS_DO_NOT_HOLD}"
     )
     return (Finding.bad(message, "calibrate the images before it and those from it on apart, or retake all"),)
 
@@ -84,7 +84,7 @@ def moment(order: Sequence[str], some: Collection[str]) -> str:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Pulls:
+class _ImageScores:
     """What each of N images says of the lens after its pose: information (N, P, P) and score (N, P), in units in which
     all together and the prior (P, P) have a unit diagonal; a part has `min_images` images at least."""
 
@@ -94,7 +94,7 @@ class _Pulls:
     min_images: int
 
     @classmethod
-    def of(cls, fit: Fit, number: IntArray) -> _Pulls:
+    def of(cls, fit: Fit, number: IntArray) -> _ImageScores:
         """Return those of the images that the views (V,) are of, all else that is solved for held."""
         p = fit.state.camera.parameters.size
         rows = np.r_[:p, -7:0] % fit.data.products[0].shape[-1]
@@ -111,7 +111,7 @@ class _Pulls:
         at = slice(self.min_images - 1, len(order) - self.min_images)
         return self._gain(self.information[order].cumsum(axis=0)[at], self.score[order].cumsum(axis=0)[at])
 
-    def parted_at(self, order: IntArray) -> int:
+    def split_at(self, order: IntArray) -> int:
         """Return how many of the images in this order (N,) come before the place where lenses differ most."""
         return self.min_images + int(np.argmax(self.gains(order)))
 
@@ -164,23 +164,23 @@ def _named_alike(images: Sequence[str]) -> BoolArray | None:
     return other if 2 * min(other.sum(), (~other).sum()) >= MIN_IMAGES_FOR_HALVES else None
 
 
-def _surely_apart(
-    observations: Observations, fit: Fit, state: State, number: IntArray, second: BoolArray, pulls: _Pulls
+def _lens_difference_sigmas(
+    observations: Observations, fit: Fit, state: State, number: IntArray, second: BoolArray, scores: _ImageScores
 ) -> float | None:
     """Return by how many standard deviations the lenses of the images (N,) that are `second` and of the others differ,
     if that says far more than how images parted by place do; `number` is that of the image of each view (V,)."""
-    distance = _apart(observations, fit, state, second[number])
+    distance = _cost_difference(observations, fit, state, second[number])
     if not distance > MIN_HALF_SIGMAS:
         return None
-    alone, place = pulls.gain_of(second), np.empty(len(second), np.int64)
+    alone, place = scores.gain_of(second), np.empty(len(second), np.int64)
     for values in (*_places(observations, state), number % 2):
         order = np.argsort(np.bincount(number, values) / np.bincount(number), kind="stable")
         place[order] = np.arange(len(order))
-        other = place >= pulls.parted_at(order)
+        other = place >= scores.split_at(order)
         if (other == second).all() or (other != second).all():
             continue
-        both = pulls.gain_of_both(second, other)
-        if both - pulls.gain_of(other) < AGAINST_PLACE**2 * (both - alone):
+        both = scores.gain_of_both(second, other)
+        if both - scores.gain_of(other) < AGAINST_PLACE**2 * (both - alone):
             return None
     return distance
 
@@ -196,7 +196,7 @@ def _places(observations: Observations, state: State) -> FloatArray:
     return np.stack([*pixels.T, off, np.linalg.norm(points, axis=1), *state.rotation[:, :2, 2].T])
 
 
-def _apart(observations: Observations, fit: Fit, state: State, second: BoolArray) -> float:
+def _cost_difference(observations: Observations, fit: Fit, state: State, second: BoolArray) -> float:
     """Return how far apart the intrinsics of the two sets of views are: by how much the cost falls when each has its
     own, which for one and the same lens is sigma^2 a parameter."""
     whole, split, count = 0.0, 0.0, 0

@@ -29,8 +29,8 @@ from rigkit.calibration.judging.changing import MIN_NEIGHBOUR_CORRELATION
 from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.view_evidence import (
     CHANGE_COLUMNS,
-    MIN_TELLING_CORNERS,
-    MIN_TELLING_VIEWS,
+    MIN_INFORMATIVE_CORNERS,
+    MIN_INFORMATIVE_VIEWS,
     columns_of,
     points_of,
     products_of,
@@ -96,13 +96,13 @@ class MovingPupil:
         if not left > MIN_PUPIL_PART:
             return None
         # How all of it moves with 1 mm rad^-2 of the pupil, and what is then left in each image.
-        way = np.append(-follow * scale[pupil] / scale[common], 1.0)
+        direction = np.append(-follow * scale[pupil] / scale[common], 1.0)
         information = left * scale[pupil] ** 2
         own, pull = products[:, :-1, :-1], products[:, :-1, -1]
-        amount = float((pull @ way).sum()) / information
+        amount = float((pull @ direction).sum()) / information
         step = _following(gram, np.arange(pupil + 1), -1) * scale[-1] / scale[:-1]
-        after = np.bincount(image, (pull - own @ step) @ way)
-        share = np.bincount(image, own @ way @ way) / information
+        after = np.bincount(image, (pull - own @ step) @ direction)
+        share = np.bincount(image, own @ direction @ direction) / information
         variance = float((after**2 / np.maximum(1.0 - share, MIN_LEFT)).sum()) / information**2
         # Images of much leverage count for several.
         freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
@@ -132,8 +132,8 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | No
     """Return products (V, K, K) of how the corners of V views move, their poses eliminated; which image (V,) each is
     of, and P. They move with what is common to all images (the camera's P parameters, displacements of the image and
     bows of the boards), with the pupil and with the residual. None where that is nothing."""
-    views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
-    if len(views) < MIN_TELLING_VIEWS:
+    views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS]
+    if len(views) < MIN_INFORMATIVE_VIEWS:
         return None
     products = products_of(views, lambda some: _rows(calibration, some))
     if not np.isfinite(products).all():

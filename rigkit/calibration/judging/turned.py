@@ -87,7 +87,7 @@ def flipped_pictures(
         boards=board_shapes(back.observations, back.state.shape, back.state.unknowns),
     )
     now = view_evidence(solved, clusters)
-    return None if now is None else _judged(back, before, now)
+    return None if now is None else _finding_of(back, before, now)
 
 
 def _first_guesses(
@@ -170,7 +170,7 @@ def _put_back(
     return with_views_turned(out, state, at & (turns == 2), 2)
 
 
-def _judged(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
+def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
     """Return the finding, where putting pictures back explains the residuals, and nothing like it is left in them."""
     at, changes = back.at, evidence.changes()
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())

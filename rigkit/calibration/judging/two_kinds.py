@@ -28,12 +28,12 @@ MIN_LEAD = 6.0
 """By so much the Bayesian information criterion of two kinds is below that of one, and of each other cause: strong
 evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995). Of amounts drawn normal, evenly or with
 Student's tails, one kind has shown -8 at 8 images and -9 at 20 in 400 draws each, in a hundredth of them 0 to -4."""
-APART = (
+KINDS_REMEDY = (
     "look for another camera, another zoom or focus, or images that a program has turned, mirrored, cropped, resized "
     "or undistorted, and calibrate each kind from its own images"
 )
 """What to do about images of two kinds."""
-UNTRUE = "the uncertainties that are stated do not hold"
+SIGMAS_DO_NOT_HOLD = "the uncertainties that are stated do not hold"
 """What follows for everything that was calculated."""
 SIDES_ROUNDS = 8
 """Images change sides in so many rounds at most."""
@@ -70,8 +70,13 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     by which they differ."""
     if len(evidence.views) < 2 * MIN_OF_A_KIND:
         return None
-    ways = columns_of(evidence.own.shape[1])
-    lenses = {"focus": ways["focus"], "shift": ways["shift"], "lens": ways["lens"], "camera": _camera_rows(evidence)}
+    columns = columns_of(evidence.own.shape[1])
+    lenses = {
+        "focus": columns["focus"],
+        "shift": columns["shift"],
+        "lens": columns["lens"],
+        "camera": _camera_rows(evidence),
+    }
     known = evidence.common_covariance()
     found = {name: kinds for name, rows in lenses.items() if (kinds := split_in_two(evidence, rows, known)) is not None}
     name = min(found, key=lambda name: found[name].cost, default=None)
@@ -84,8 +89,9 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
     sides = [[v.image for v, of in zip(views, best.second, strict=True) if of == kind] for kind in (False, True)]
     like = " and ".join(f"{len(set(images))} like '{images[0]}'" for images in sides)
     return Finding.bad(
-        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}; {UNTRUE}",
-        APART,
+        f"the images are of two kinds, as if two lenses had taken them, or one at two settings: {like}{how}; "
+        f"{SIGMAS_DO_NOT_HOLD}",
+        KINDS_REMEDY,
     )
 
 

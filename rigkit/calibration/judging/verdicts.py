@@ -14,28 +14,28 @@ import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.choosing.models_tried import DISAGREES_WITH_VIEWS
-from rigkit.calibration.judging.boards import judge_boards
+from rigkit.calibration.judging.boards import diagnose_boards
 from rigkit.calibration.judging.captured import (
     ASKED_DEG,
     SMALL_PX,
     Extent,
+    boards_never_rotated,
+    diagnose_capture,
     extrapolated,
     few_repeated,
     hardly_tilted,
-    judge_capture,
-    same_way_up,
 )
 from rigkit.calibration.judging.changing import CHANGES, changing
 from rigkit.calibration.judging.mixed import two_cameras
 from rigkit.calibration.judging.moved import moment
 from rigkit.calibration.judging.neighbours import neighbour_correlation
 from rigkit.calibration.judging.pupil import modelled_pupil, moving_pupil
-from rigkit.calibration.judging.two_kinds import APART, min_of_a_kind
+from rigkit.calibration.judging.two_kinds import KINDS_REMEDY, min_of_a_kind
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.solving.fit import Fit
 from rigkit.calibration.views.observations import Observations
 from rigkit.calibration.views.repeats import cluster_numbers
-from rigkit.calibration.views.usable import GRIDS_BESIDE
+from rigkit.calibration.views.usable import OTHER_GRIDS
 from rigkit.cameras.base import image_center
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
@@ -46,11 +46,11 @@ CELL_CORNERS = 5
 """A cell with fewer corners than this is empty."""
 MAX_RATIO_OF_MEDIANS = 2.5
 """A view whose median residual is this many times the usual one, there in the image."""
-UNLIKE = 3.5
+ODD_IMAGE_RATIO = 3.5
 """One with more is so unlike the others that nobody knows how good these are. Whose image that is it does not tell: in
 15 real captures images of the camera itself have up to 3.9 (bouguet's left08), one of another camera put among those
 of bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
-WHY_UNLIKE = (
+ODD_IMAGE_REMEDY = (
     "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
 )
 RINGS = 4
@@ -63,7 +63,7 @@ PATTERN = 0.35
 """Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
 OVERFIT = 1.25
 """Held-out over training RMS."""
-UNSURE_PX = 1.0
+UNCERTAIN_PX = 1.0
 """Worst-direction standard deviation of a projection, in the covered part of the image."""
 OUTLIER_SHARE = 0.03
 NAMES_U = ("left", "centre left", "centre right", "right")
@@ -101,13 +101,13 @@ def judge(
     """
     far = FarProjection.of(calibration) if far is None else far
     clusters = _clusters(calibration.views) if clusters is None else clusters
-    upright = same_way_up(calibration)
+    upright = boards_never_rotated(calibration)
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
     # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else _pattern(calibration, correlation, in_force, bool(change))
-    effects = _unsure(calibration, far)
+    effects = _uncertain(calibration, far)
     # Images that contradict each other make a lens unsure, however many there are.
     contradicting = worst(effects) is Severity.BAD
     # Pictures of two kinds are why later ones are of another lens than the first.
@@ -119,7 +119,7 @@ def judge(
         *_of_another_kind(calibration, order),
         *change,
         *unlike,
-        *judge_capture(calibration, clusters),
+        *diagnose_capture(calibration, clusters),
         *(pattern if contradicting else []),
         *upright,
         *extrapolated(calibration, extent, far),
@@ -136,7 +136,7 @@ def judge(
             *unclear,
             *([] if contradicting else pattern),
             *_overfit(calibration),
-            *judge_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),
+            *diagnose_boards(calibration, " if pixels are square" if upright else "", sure=not contradicting),
             *_outliers(calibration, [finding.image for finding in (*unlike, *unclear)]),
         ]
     return (*with_headline(calibration, causes, effects, extent.where), *modelled_pupil(calibration), *found)
@@ -167,7 +167,7 @@ def _residuals(
     return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
 
 
-def judge_session(
+def diagnose_session(
     calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[Finding] = ()
 ) -> tuple[Finding, ...]:
     """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
@@ -221,16 +221,16 @@ def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
     used = {view.image for view in c.views}
     what = f"{len(images)} of {len(used) + len(images)} images contradict the others and are left out, "
     at = moment([image for image in dict.fromkeys(order) if image in used or image in images], images)
-    return [Finding.look(what + (f"all {at}" if at else f"'{images[0]}' the first"), APART, images[0])]
+    return [Finding.look(what + (f"all {at}" if at else f"'{images[0]}' the first"), KINDS_REMEDY, images[0])]
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
     """Name the images left out, or how many for each reason. What lies beside a board in an image that is used is no
     cause to look."""
-    told = set(_contradicting(dropped, views))
-    dropped = [(image, reason) for image, reason in dropped if image not in told]
+    contradicted = set(_contradicting(dropped, views))
+    dropped = [(image, reason) for image, reason in dropped if image not in contradicted]
     used = {view.image for view in views}
-    parts = [(image, reason) for image, reason in dropped if image in used and reason != GRIDS_BESIDE]
+    parts = [(image, reason) for image, reason in dropped if image in used and reason != OTHER_GRIDS]
     found = [
         Finding.look(f"of image '{image}' something is left out: {reason}", image=image) for image, reason in parts
     ]
@@ -292,13 +292,13 @@ def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
     # Of all corners: a view that is bad throughout has its worst corners among the outliers.
     residual = np.hypot(*np.nan_to_num(c.corners.residuals_px).T)
     middle = _medians(residual, lengths)
-    usual = max(float(np.median(middle)), np.finfo(float).tiny)
-    times = middle / usual
+    typical = max(float(np.median(middle)), np.finfo(float).tiny)
+    times = middle / typical
     if times.max() > MAX_RATIO_OF_MEDIANS:
         away = c.corners.pixels - image_center(c.camera.size_px)
-        there = np.full(len(away), usual)
+        there = np.full(len(away), typical)
         for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
-            there[ring] = max(float(np.median(residual[ring])), usual)
+            there[ring] = max(float(np.median(residual[ring])), typical)
         times = _medians(residual / there, lengths)
     unlike, found = list[Finding](), list[Finding]()
     for i in np.flatnonzero((times > MAX_RATIO_OF_MEDIANS) | (out > MAX_OUTLIER_SHARE * lengths)).tolist():
@@ -310,8 +310,8 @@ def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
             what = f"has {far} outliers among its {lengths[i]} corners"
         else:
             continue
-        (unlike if times[i] > UNLIKE and middle[i] > SMALL_PX else found).append(
-            Finding.look(f"image '{view.image}' {what}", WHY_UNLIKE, view.image)
+        (unlike if times[i] > ODD_IMAGE_RATIO and middle[i] > SMALL_PX else found).append(
+            Finding.look(f"image '{view.image}' {what}", ODD_IMAGE_REMEDY, view.image)
         )
     return unlike, found
 
@@ -352,15 +352,15 @@ def _overfit(c: Calibration) -> list[Finding]:
     ]
 
 
-def _unsure(c: Calibration, far: FarProjection) -> list[Finding]:
-    usual, worst, inside = far.usual_px, far.worst_px, far.at_corners_px
-    if worst <= UNSURE_PX:
+def _uncertain(c: Calibration, far: FarProjection) -> list[Finding]:
+    typical, worst, inside = far.usual_px, far.worst_px, far.at_corners_px
+    if worst <= UNCERTAIN_PX:
         error = c.rms_px if c.heldout_rms_px is None else c.heldout_rms_px
-        if usual <= max(error, SMALL_PX):
+        if typical <= max(error, SMALL_PX):
             return []
         return [
             Finding.look(
-                f"the projection is uncertain by {usual:.2f} px (one standard deviation) where the boards were, more "
+                f"the projection is uncertain by {typical:.2f} px (one standard deviation) where the boards were, more "
                 f"than the error of {error:.2f} px that the images show",
                 "take more views, with the board tilted",
             )

@@ -13,9 +13,9 @@ import numpy as np
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import FloatArray, IntArray, Points
 
-MIN_TELLING_CORNERS = 20
+MIN_INFORMATIVE_CORNERS = 20
 """A view with fewer corners says too little of its own after its pose."""
-MIN_TELLING_VIEWS = 6
+MIN_INFORMATIVE_VIEWS = 6
 CORNERS_AT_ONCE = 20_000
 """Of which rows are held: 1.6 kB each, in `judging.pupil` as many again."""
 MIN_OWN_PART = 1e-6
@@ -126,20 +126,22 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
     `clusters` (V,) number the views' images, as `cluster_numbers` has it: those that repeat another one say nothing
     that it does not say, and are not asked.
     """
-    telling = [k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_TELLING_CORNERS]
+    informative = [
+        k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS
+    ]
     if clusters is not None:
         images = [view.image for view in calibration.views]
         first = dict(zip(clusters[::-1].tolist(), images[::-1], strict=True))
-        telling = [k for k in telling if images[k] == first[int(clusters[k])]]
-    if len(telling) < MIN_TELLING_VIEWS:
+        informative = [k for k in informative if images[k] == first[int(clusters[k])]]
+    if len(informative) < MIN_INFORMATIVE_VIEWS:
         return None
-    products = products_of([calibration.views[k] for k in telling], lambda views: rows_of(calibration, views))
+    products = products_of([calibration.views[k] for k in informative], lambda views: rows_of(calibration, views))
     # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
-    told = np.asarray(np.isfinite(products).all(axis=(1, 2)))
-    if np.count_nonzero(told) < MIN_TELLING_VIEWS:
+    finite = np.asarray(np.isfinite(products).all(axis=(1, 2)))
+    if np.count_nonzero(finite) < MIN_INFORMATIVE_VIEWS:
         return None
-    products = products[told]
-    count = np.array([np.count_nonzero(calibration.views[k].kept) for k in telling])
+    products = products[finite]
+    count = np.array([np.count_nonzero(calibration.views[k].kept) for k in informative])
     length = np.sqrt(np.maximum(np.diagonal(products, axis1=1, axis2=2), np.finfo(float).tiny))
     own = without_pose(products, length)
     residual = -1
@@ -153,14 +155,14 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
         # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
         return None
     return ViewEvidence(
-        views=[k for k, tells in zip(telling, told, strict=True) if tells],
+        views=[k for k, tells in zip(informative, finite, strict=True) if tells],
         own=own,
         length=length,
         along=own[:, :, residual] - own[:, :, COMMON] @ step,
         gram=scaled,
         scale=scale,
         total=total,
-        freedom=sum(2 * n - 6 for n in count[told].tolist()) - len(step),
+        freedom=sum(2 * n - 6 for n in count[finite].tolist()) - len(step),
     )
 
 

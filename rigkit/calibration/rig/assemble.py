@@ -53,7 +53,7 @@ def assemble_rig(
     shapes = {b.board_id: points[first_row[i] : first_row[i + 1]] for i, b in enumerate(boards)}
     cameras, squared = _cameras(joint, heldout[1], known, beside)
     everything = np.concatenate(squared)
-    told = _lenses_and_mounts(layout, state)
+    reported = _lenses_and_mounts(layout, state)
     # One ruler has measured all boards: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
     far = [FarProjection.of(camera.calibration) for camera in cameras]
@@ -61,8 +61,8 @@ def assemble_rig(
         cameras=tuple(cameras),
         rms_px=float(np.sqrt(everything.mean())),
         heldout_rms_px=heldout[0],
-        covariance=covariance[np.ix_(told, told)],
-        pupils=_pupils(joint, layout, covariance, told),
+        covariance=covariance[np.ix_(reported, reported)],
+        pupils=_pupils(joint, layout, covariance, reported),
         sigma_px=sigma,
         overdispersion=overdispersion,
         freedom=known.clustered.freedom,
@@ -72,7 +72,7 @@ def assemble_rig(
         shared_count=joint.shared_count,
         left_out=joint.left_out,
         scale_sigma=scale,
-        departures=lens_modes(observations, joint.solution, far, told),
+        departures=lens_modes(observations, joint.solution, far, reported),
         board_rigs=_board_rigs(joint, layout, boards, shapes, covariance, scale, known.clustered),
     )
     return replace(rig, lags=lags_of(joint.views.names, state, rig.widening**2 * covariance, layout.lags)), far
@@ -88,13 +88,13 @@ def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
     return np.concatenate([*lenses, *(np.arange(run.start, run.stop) for run in layout.mounts if run is not None)])
 
 
-def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, told: IntArray) -> dict[str, SolvedPupil]:
-    """Return the pupils that move, by name, with their covariance with the globals `told`."""
+def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, reported: IntArray) -> dict[str, SolvedPupil]:
+    """Return the pupils that move, by name, with their covariance with the globals `reported`."""
     out = {}
     for name, run, camera in zip(joint.views.names, layout.cameras, joint.solution.state.cameras, strict=True):
         if isinstance(camera, NearCamera):
             own = np.arange(run.stop - PUPIL_TERMS, run.stop)
-            out[name] = SolvedPupil(camera.pupil, covariance[np.ix_(own, own)], covariance[np.ix_(told, own)])
+            out[name] = SolvedPupil(camera.pupil, covariance[np.ix_(own, own)], covariance[np.ix_(reported, own)])
     return out
 
 

@@ -102,18 +102,18 @@ class BoardRig:
         i, j = self.index(a.board_id), self.index(b.board_id)
         end, by_end = self._point(i, a)
         other, by_other = self._point(j, Feature(b.board_id, centre=True) if b.is_plane else b)
-        apart = end - other
+        separation = end - other
         if b.is_plane:
             normal = self.boards[j].face
-            signed = float(normal @ apart)
+            signed = float(normal @ separation)
             sign = float(np.sign(signed)) or 1.0
             # d (n . (p - q)) = n . (dp - dq) + (w x n) . (p - q)
-            turn = np.concatenate([np.cross(normal, apart), np.zeros(3)])
+            turn = np.concatenate([np.cross(normal, separation), np.zeros(3)])
             row = self._row({i: sign * (normal @ by_end)}) + self._row({j: sign * (turn - normal @ by_other)})
             length = abs(signed)
         else:
-            length = float(np.linalg.norm(apart))
-            along = apart / max(length, np.finfo(float).tiny)
+            length = float(np.linalg.norm(separation))
+            along = separation / max(length, np.finfo(float).tiny)
             row = self._row({i: along @ by_end}) - self._row({j: along @ by_other})
         return length, float(np.hypot(self._sigma(row), length * self.scale_sigma))
 

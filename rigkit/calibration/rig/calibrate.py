@@ -22,11 +22,11 @@ from rigkit.calibration.rig.heldout import heldout_rms
 from rigkit.calibration.rig.joint import BAD, solve_jointly
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.calibration.rig.solving.known import KnownCameras
-from rigkit.calibration.rig.verdicts import judge_rig
+from rigkit.calibration.rig.verdicts import diagnose_rig
 from rigkit.calibration.rig.views.board_places import board_places
 from rigkit.calibration.rig.views.mispaired import put_together_wrongly, same_pictures, why_nothing_agrees
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews, frame_observations
-from rigkit.calibration.with_pupil import require_known, surely_moves
+from rigkit.calibration.with_pupil import pupil_moves_significantly, require_known
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -94,7 +94,7 @@ def calibrate_rig(
         joint = solve_jointly(every, progress, known)
     rig, far = assemble_rig(joint, heldout_rms(joint, folds))
     notes = (*same, *_mispaired(rig, every, joint.cost_sigmas), *notes, *joint.notes)
-    return replace(rig, verdicts=judge_rig(rig, far, notes, in_force=options.in_force))
+    return replace(rig, verdicts=diagnose_rig(rig, far, notes, in_force=options.in_force))
 
 
 def _on_rigid_boards(
@@ -248,7 +248,7 @@ def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]
             (moving,) = calibrate_together([(name, views, replace(request, pupil="moving"))])
         except DegenerateError:
             continue
-        if surely_moves(moving):
+        if pupil_moves_significantly(moving):
             out[name] = moving
     return out
 

@@ -151,15 +151,15 @@ def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int = 0)
     return parts[0] + parts[1], first - second
 
 
-def _difference(names: Sequence[str], apart: FloatArray, known: Known | None) -> RigDifference:
-    """Return the difference from the perturbations `apart` (6 n,) of what has the names."""
+def _difference(names: Sequence[str], separation: FloatArray, known: Known | None) -> RigDifference:
+    """Return the difference from the perturbations `separation` (6 n,) of what has the names."""
     mounts = []
     for k, name in enumerate(names):
         own = slice(6 * k, 6 * k + 6)
-        angle, shift = np.degrees(np.linalg.norm(apart[own][:3])), np.linalg.norm(apart[own][3:])
-        chance = None if known is None else _chance(apart[own], known[0][own, own], known[1][own])
+        angle, shift = np.degrees(np.linalg.norm(separation[own][:3])), np.linalg.norm(separation[own][3:])
+        chance = None if known is None else _chance(separation[own], known[0][own, own], known[1][own])
         mounts.append(MountDifference(name, float(angle), float(shift), chance))
-    return RigDifference(tuple(mounts), None if known is None else _chance(apart, *known))
+    return RigDifference(tuple(mounts), None if known is None else _chance(separation, *known))
 
 
 def _weights(rig: Mounted, k: int) -> FloatArray:

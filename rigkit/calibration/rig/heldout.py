@@ -30,7 +30,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
     for k in range(int(fold.max()) + 1):
         test = fold == k
         train = observations.subset(~test)
-        if not _hang_together(train):
+        if not _is_connected(train):
             return nothing
         solved = solve_rig(train, state, joint.sigma_px, FROM_OPTIMUM).state
         part = observations.subset(test)
@@ -42,7 +42,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
     return float(np.sqrt(squared.sum() / count.sum())), each
 
 
-def _hang_together(observations: RigObservations) -> bool:
+def _is_connected(observations: RigObservations) -> bool:
     """Say whether every camera shares a pose with the first, or with those that hang together with it."""
     poses = [set(own.tolist()) for own in observations.frame]
     linked, rest = poses[0], poses[1:]

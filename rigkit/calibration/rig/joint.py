@@ -14,7 +14,7 @@ from rigkit.calibration.rig.solving.lags import times_of, with_lags
 from rigkit.calibration.rig.solving.shape import common_shape
 from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import Key, RigObservations, RigState
-from rigkit.calibration.rig.views.board_sizes import sizes_apart
+from rigkit.calibration.rig.views.board_sizes import board_size_conflicts
 from rigkit.calibration.rig.views.disagree import (
     DISAGREES,
     MIN_PX,
@@ -24,11 +24,11 @@ from rigkit.calibration.rig.views.disagree import (
     part,
     part_far,
     shared_keys,
-    usual_cost,
-    usual_distance_px,
+    typical_cost,
+    typical_distance_px,
     why,
 )
-from rigkit.calibration.rig.views.frames import apart, first_frames, mounts_of, places_of, turned_alike
+from rigkit.calibration.rig.views.frames import first_frames, mounts_of, places_of, separation, turned_alike
 from rigkit.calibration.rig.views.observations import FrameObservations, RigViews
 from rigkit.calibration.solving.solver import Solution
 from rigkit.calibration.views.folds import folds_of
@@ -124,9 +124,9 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
     mounts = list(mounts) if known is None else known.mounts(views.names, mounts)
     views = turned_alike(views, mounts)
     seen, single = views.seen, views.single
-    sizes, also = sizes_apart(views), tuple[Finding, ...]()
+    sizes, also = board_size_conflicts(views), tuple[Finding, ...]()
     shared = len(shared_keys(seen))
-    left_out = part_far(seen, apart(views, mounts))
+    left_out = part_far(seen, separation(views, mounts))
     sigma = _sigma(single)
     for i in range(MAX_ROUNDS):
         progress("rig", i, MAX_ROUNDS)
@@ -134,8 +134,8 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
         observations, solution = _solved(views, mounts, sigma, known)
         solution = _with_lags(views, observations, solution, sigma)
         cost = cost_of_sharing(observations, solution, seen)
-        usual = usual_cost(cost, sigma)
-        worse = bad_ones(cost, usual)
+        typical = typical_cost(cost, sigma)
+        worse = bad_ones(cost, typical)
         if not worse and masked(cost, sigma):
             worse = _one_bad(views, mounts, sigma, cost, known)
         if not worse or i == MAX_ROUNDS - 1:
@@ -147,25 +147,25 @@ def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | Non
         state = solution.state
         mounts = [Rigid3(r, t) for r, t in zip(state.mount_rotation, state.mount_mm, strict=True)]
     progress("rig", MAX_ROUNDS, MAX_ROUNDS)
-    usual_sigmas = float(np.sqrt(usual) / max(sigma, MIN_PX))
-    usual_px, size_px = usual_distance_px(observations, cost), _boards_px(seen)
+    typical_sigmas = float(np.sqrt(typical) / max(sigma, MIN_PX))
+    usual_px, size_px = typical_distance_px(observations, cost), _boards_px(seen)
     if usual_px > NOTHING_IN_COMMON * size_px:
         raise DegenerateError(
             f"rig: views that should share their boards' poses disagree by {usual_px:.0f} px on where the boards are, "
             f"which are {size_px:.0f} px large; {_advice(seen)}"
         )
-    if usual_sigmas > DISAGREES:
-        observations = replace(observations, held=_held(single, sigma, usual_sigmas**2 - 1.0))
+    if typical_sigmas > DISAGREES:
+        observations = replace(observations, held=_held(single, sigma, typical_sigmas**2 - 1.0))
         if known is not None:
             observations = known.hold(observations, solution.state, views.names)
         solution = solve_rig(observations, solution.state, sigma)
-        also = (_disagreement(cost, sigma, (usual_px, usual_sigmas), several=len(seen) > 1),)
+        also = (_disagreement(cost, sigma, (usual_px, typical_sigmas), several=len(seen) > 1),)
     return JointRig(
         views=views,
         observations=observations,
         solution=solution,
         sigma_px=sigma,
-        cost_sigmas=usual_sigmas,
+        cost_sigmas=typical_sigmas,
         left_out=tuple(left_out),
         notes=(*(sizes or also), *notes),
         known=known,
@@ -213,9 +213,9 @@ def _boards_px(seen: Sequence[FrameObservations]) -> float:
     return float(np.median(2.0 * np.sqrt(np.add.reduceat((off**2).sum(axis=1), start) / count)))
 
 
-def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, float], *, several: bool) -> Finding:
-    """Return what to say where sharing poses usually costs more than chance: `usual` px a corner, and sigmas."""
-    usual_px, usual_sigmas = usual
+def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float, float], *, several: bool) -> Finding:
+    """Return what to say where sharing poses usually costs more than chance: `typical` px a corner, and sigmas."""
+    usual_px, typical_sigmas = typical
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
     times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
     frames = ", ".join(f"'{frame}' ({value:.0f})" for frame, value in times.items())
@@ -224,11 +224,11 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, usual: tuple[float, f
     if not several:
         what, remedy = "the boards give way against each other: that they keep their places", "fasten the boards"
     message = (
-        f"{what} costs {usual_sigmas:.1f} times the corners' noise ({usual_px:.2g} px a corner), most in the frames "
+        f"{what} costs {typical_sigmas:.1f} times the corners' noise ({usual_px:.2g} px a corner), most in the frames "
         f"{frames}; the lenses are held near what each camera says alone, and the sigmas of the rig rest on how "
         "far its frames disagree"
     )
-    return Finding(severity=Severity.BAD if usual_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
+    return Finding(severity=Severity.BAD if typical_sigmas > BAD else Severity.LOOK, message=message, remedy=remedy)
 
 
 def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
@@ -259,11 +259,11 @@ def _one_bad(
         except InputError:
             continue
         without = cost_of_sharing(*_solved(trial, mounts, sigma, known), trial.seen)
-        found.append((sum(without.values()), usual_cost(without, sigma, mean=True), key))
+        found.append((sum(without.values()), typical_cost(without, sigma, mean=True), key))
     if not found:
         return []
-    rest, usual, key = min(found)
-    return [key] if sum(cost.values()) - rest > DISAGREES**2 * usual else []
+    rest, typical, key = min(found)
+    return [key] if sum(cost.values()) - rest > DISAGREES**2 * typical else []
 
 
 def _sigma(single: Sequence[Calibration]) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.judging.pupil import modelled_pupil
-from rigkit.calibration.judging.verdicts import UNSURE_PX, with_headline
+from rigkit.calibration.judging.verdicts import UNCERTAIN_PX, with_headline
 from rigkit.calibration.rig.certainty.uncertainty import transfer_uncertainty
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.findings import Finding
@@ -24,7 +24,7 @@ WORSE = 1.5
 MANY_LEFT_OUT = 0.2
 
 
-def judge_rig(
+def diagnose_rig(
     rig: RigCalibration, far: Sequence[FarProjection], notes: Sequence[Finding] = (), *, in_force: Collection[str] = ()
 ) -> tuple[Finding, ...]:
     """Return the verdicts, the headline first; `far` are the cameras' projections, `notes` verdicts found elsewhere,
@@ -37,11 +37,11 @@ def judge_rig(
         *_overdispersed(rig, in_force),
         *_few_shared(rig),
     ]
-    headline, *others = with_headline(rig, causes, _unsure(rig, far))
+    headline, *others = with_headline(rig, causes, _uncertain(rig, far))
     pupils = [
-        replace(said, message=f"camera '{camera.name}': {said.message}")
+        replace(note, message=f"camera '{camera.name}': {note.message}")
         for camera in rig.cameras
-        for said in modelled_pupil(camera.calibration)
+        for note in modelled_pupil(camera.calibration)
     ]
     return (headline, *pupils, *_lags(rig), *others)
 
@@ -92,11 +92,11 @@ def _few_shared(rig: RigCalibration) -> list[Finding]:
     ]
 
 
-def _unsure(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
+def _uncertain(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
     out = []
     for camera, projection in zip(rig.cameras, far, strict=True):
         worst = projection.worst_px
-        if worst > UNSURE_PX:
+        if worst > UNCERTAIN_PX:
             out.append(
                 Finding.bad(
                     f"the projection of camera '{camera.name}' is uncertain by up to {worst:.1f} px where the boards "
@@ -106,7 +106,7 @@ def _unsure(rig: RigCalibration, far: Sequence[FarProjection]) -> list[Finding]:
             )
     for a, b in combinations([c.name for c in rig.cameras], 2):
         transfer = transfer_uncertainty(rig, a, b)
-        if transfer is not None and transfer.median_px > UNSURE_PX:
+        if transfer is not None and transfer.median_px > UNCERTAIN_PX:
             out.append(
                 Finding.bad(
                     f"where points of camera '{a}' must appear in camera '{b}' is uncertain by "
@@ -136,12 +136,12 @@ def _worse(rig: RigCalibration) -> list[Finding]:
     known = [a for a in alone if a is not None]
     if together is None or len(known) < len(alone):
         return []
-    usual = float(np.sqrt(np.mean(np.square(known))))
-    if together <= WORSE * usual:
+    typical = float(np.sqrt(np.mean(np.square(known))))
+    if together <= WORSE * typical:
         return []
     return [
         Finding.look(
-            f"frames that took no part are off by {together / usual:.1f} times as much as for the cameras alone: "
+            f"frames that took no part are off by {together / typical:.1f} times as much as for the cameras alone: "
             + (
                 "the cameras were not quite of one moment, or a mount gives way"
                 if len(rig.cameras) > 1

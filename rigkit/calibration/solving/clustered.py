@@ -79,9 +79,9 @@ def effective_freedom(
     (`common_freedom`).
     """
     beyond = max(0.0, 1.0 - 1.0 / overdispersion**2) if overdispersion > 0.0 else 0.0
-    unsure = beyond**2 * (1.0 / freedom + 1.0 / common_freedom)
-    unsure += (1.0 - beyond) ** 2 / (freedom * directions)
-    return min(1.0 / max(unsure, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
+    variance_of_ratio = beyond**2 * (1.0 / freedom + 1.0 / common_freedom)
+    variance_of_ratio += (1.0 - beyond) ** 2 / (freedom * directions)
+    return min(1.0 / max(variance_of_ratio, 1.0 / LARGE_FREEDOM), LARGE_FREEDOM)
 
 
 def widening(freedom: float) -> float:

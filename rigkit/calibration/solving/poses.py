@@ -60,7 +60,7 @@ def refine_each(
         normal = linearise(*poses)
         return BatchedProblem(normal.pp, normal.p, normal.costs)
 
-    stop = Stop(steps=MAX_POSE_ITERATIONS, promise=tolerance)
+    stop = Stop(steps=MAX_POSE_ITERATIONS, predicted_gain=tolerance)
     found, cost = minimise_each((rotation, translation_mm), around, stepped, VIEW_DAMPING, stop)
     return found[0], found[1], cost
 

@@ -148,7 +148,7 @@ def minimise(
         except (InputError, DegenerateError):
             return None
 
-    stop = Stop(steps=max_iterations, gain=tolerance, gain_ratio=MIN_GAIN_RATIO, promise=tolerance)
+    stop = Stop(steps=max_iterations, gain=tolerance, gain_ratio=MIN_GAIN_RATIO, predicted_gain=tolerance)
     end = levenberg_marquardt.minimise(state, linearise, attempt, SOLVER_DAMPING, stop, here=here)
     stopped = f"stopped after {max_iterations} iterations"
     reason = stopped if end.reason == StopReason.STEPS else str(end.reason)

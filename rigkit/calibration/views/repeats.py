@@ -15,7 +15,7 @@ MAX_ALONG_ONE_AXIS = 1024
 """So many points at most are sorted along one axis; more of them along two."""
 MIN_STRIP = 1e-6
 """No strip is narrower than this part of the whole: places along strips are then exact to 1e-10 of it."""
-SOUGHT_FURTHER = 1.001
+SEARCH_FACTOR = 1.001
 """Pairs are sought this far, for rounding, and kept by their own distances."""
 
 
@@ -63,10 +63,10 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     place = place[order]
     ends = np.zeros((len(points), 4), np.int64)
     ends[:, 0] = np.arange(1, len(points) + 1)
-    ends[:, 1] = np.searchsorted(place, place + SOUGHT_FURTHER * side, side="right")
+    ends[:, 1] = np.searchsorted(place, place + SEARCH_FACTOR * side, side="right")
     if many:
-        ends[:, 2] = np.searchsorted(place, place + length - SOUGHT_FURTHER * side)
-        ends[:, 3] = np.searchsorted(place, place + length + SOUGHT_FURTHER * side)
+        ends[:, 2] = np.searchsorted(place, place + length - SEARCH_FACTOR * side)
+        ends[:, 3] = np.searchsorted(place, place + length + SEARCH_FACTOR * side)
     # The widest axis but the one that they are sorted along tells the most of them apart.
     pairs = order[pairs_within(points[order][:, np.roll(axes[::-1], -1)], reach, ends)]
     pairs.sort(axis=1)

@@ -33,7 +33,7 @@ MAX_SHARE_COPIES = 0.25
 """Images that show more whole boards than are listed, as a part of those with any: from here on there are copies."""
 MIN_TIMES_LARGER = 2.0
 """The board is seen so many times as long as a picture of one in the background, or they may be two boards alike."""
-GRIDS_BESIDE = "grids beside the whole board, which may be parts of another or something else"
+OTHER_GRIDS = "grids beside the whole board, which may be parts of another or something else"
 """Why a grid in an image that is used gives no view."""
 MIN_SPREAD = 1e-6
 """Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the

@@ -76,7 +76,7 @@ class Pattern(ABC):
     """What a board's points are called."""
     count_word: ClassVar[str] = "inner corners"
     """What columns and rows count in board files."""
-    one_way_up: ClassVar[str] = "one with an odd and an even number of corners"
+    unambiguous: ClassVar[str] = "one with an odd and an even number of corners"
     """A board of this pattern that looks otherwise when it is turned by 180 degrees."""
     identified: ClassVar[bool] = False
     """Marks in the image tell which board and which point it is: detections come named and on the board's own grid."""

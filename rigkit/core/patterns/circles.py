@@ -17,7 +17,7 @@ ROW_STEPS = {"regular": 1.0, "asymmetric": 0.5, "hexagonal": float(np.sqrt(0.75)
 NEIGHBOUR_DISTANCES = {"regular": 1.0, "asymmetric": float(np.sqrt(0.5)), "hexagonal": 1.0}
 """Distance of two neighbours, likewise."""
 STAGGERS = ("right", "left")
-USUAL_DIAMETER = 0.6
+TYPICAL_DIAMETER = 0.6
 """Of a board to print that does not say, in distances of neighbours."""
 
 
@@ -40,7 +40,7 @@ class Circles(Pattern):
     type: ClassVar[str] = "circles"
     size_word: ClassVar[str] = "distance"
     size_meaning: ClassVar[str] = "the distance of two circles in a row"
-    one_way_up: ClassVar[str] = "an asymmetric or hexagonal one with an odd number of rows"
+    unambiguous: ClassVar[str] = "an asymmetric or hexagonal one with an odd number of rows"
     point_word: ClassVar[str] = "circles"
     count_word: ClassVar[str] = "circles"
     keys: ClassVar[tuple[Key, ...]] = (
@@ -57,8 +57,8 @@ class Circles(Pattern):
 
     @classmethod
     def from_keys(cls, values: Mapping[str, Value]) -> Self:
-        for key, usual, known in (("layout", "regular", tuple(ROW_STEPS)), ("stagger", "right", STAGGERS)):
-            if values.get(key, usual) not in known:
+        for key, typical, known in (("layout", "regular", tuple(ROW_STEPS)), ("stagger", "right", STAGGERS)):
+            if values.get(key, typical) not in known:
                 raise InputError(f"{key} '{values[key]}' is unknown; known: {', '.join(known)}")
         return super(Circles, cls).from_keys(values)
 
@@ -111,7 +111,7 @@ class Circles(Pattern):
 
     def printed_diameter_mm(self, squares_mm: tuple[float, float]) -> float:
         """Return the diameter of the circles, the usual one where it is not given."""
-        return USUAL_DIAMETER * self.nearest_mm(squares_mm) if self.diameter_mm is None else self.diameter_mm
+        return TYPICAL_DIAMETER * self.nearest_mm(squares_mm) if self.diameter_mm is None else self.diameter_mm
 
     def nearest_mm(self, squares_mm: tuple[float, float]) -> float:
         """Return the distance of a circle's nearest neighbours."""

@@ -243,20 +243,20 @@ class _Squares:
         shape = fit_cells(wide.pixels, cells, degree=3, ridge=(1e-3, 1e-2))
         return cls(bright, known[:-1] | known[1:], shape)
 
-    def at(self, up: FloatArray, aside: FloatArray) -> FloatArray:
-        """Return (M, K, 2) pixels `up` (K,) squares beyond the row and `aside` (K,) from the squares' middles."""
+    def at(self, up: FloatArray, lateral: FloatArray) -> FloatArray:
+        """Return (M, K, 2) pixels `up` (K,) squares beyond the row and `lateral` (K,) from the squares' middles."""
         count = len(self.bright)
         far = up >= 0.5
         out = np.zeros((count, len(up), 2))
         for first, rows, which in ((0, 1.0 - up, far), (count + 1, -up, ~far)):
-            for shift, share in ((0, 0.5 - aside), (1, 0.5 + aside)):
+            for shift, share in ((0, 0.5 - lateral), (1, 0.5 + lateral)):
                 part = slice(first + shift, first + shift + count)
-                along = (0.5 + aside - shift)[:, None]
+                along = (0.5 + lateral - shift)[:, None]
                 down = rows[:, None]
                 place = self.shape.pixels[part, None] + along * self.shape.along_column[part, None]
                 place = place + down * self.shape.along_row[part, None]
-                place = place + 0.5 * along**2 * self.shape.bend_column[part, None]
-                place = place + 0.5 * down**2 * self.shape.bend_row[part, None]
+                place = place + 0.5 * along**2 * self.shape.curvature_column[part, None]
+                place = place + 0.5 * down**2 * self.shape.curvature_row[part, None]
                 out += np.where(which, share, 0.0)[:, None] * place
         return out
 
@@ -269,10 +269,10 @@ class _Squares:
         inside = self.inside(image, 1.0, 0.5) & self.inside(image, float(BEYOND[-1]), 0.5)
         return np.asarray(inside & self.near & self.supported(MIN_SUPPORT) & self._of_squares(sound))
 
-    def inside(self, image: GreyImage, up: float, aside: float) -> BoolArray:
-        """Return which squares (M,) lie in the image at `up` squares beyond the row, to `aside` on both sides."""
+    def inside(self, image: GreyImage, up: float, lateral: float) -> BoolArray:
+        """Return which squares (M,) lie in the image at `up` squares beyond the row, to `lateral` on both sides."""
         height, width = image.shape
-        places = self.at(np.array([up, up]), np.array([-aside, aside]))
+        places = self.at(np.array([up, up]), np.array([-lateral, lateral]))
         return np.asarray(((places >= 0.0) & (places <= np.array([width, height]) - 1.0)).all(axis=(1, 2)))
 
     def supported(self, min_support: int) -> BoolArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, upper_median
 from rigkit.detection.checks.validate import stray_row
-from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
+from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF, fit_cells
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.kernels import lattice as native
 
@@ -36,7 +36,7 @@ IN_PLACE = 3.0
 MIN_SUSPECT_RESIDUAL = 0.02
 """Residual relative to the contrast below which nothing is suspect: rounding and compression are uneven, too."""
 
-MIN_JUDGES = 8
+MIN_NEIGHBOURS_FIT = 8
 """Corners behind a prediction that convicts."""
 
 UNUSUAL, MIN_UNUSUAL = 1.3, 3
@@ -89,7 +89,7 @@ def without_outliers(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedL
     What these, and the fit, leave of a row that has strayed into it goes with them. `size_px` is the (width, height) of
     the image.
     """
-    return _tidied(_without_astray(item), size_px)
+    return _tidied(_without_displaced(item), size_px)
 
 
 def _tidied(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
@@ -101,30 +101,30 @@ def _tidied(item: RefinedLattice, size_px: tuple[int, int]) -> RefinedLattice:
     return item
 
 
-def _without_astray(item: RefinedLattice) -> RefinedLattice:
+def _without_displaced(item: RefinedLattice) -> RefinedLattice:
     known = item.lattice.known
     relative = np.zeros(known.shape)
     relative[known] = item.residual[known] / item.lattice.contrast[known]
     typical = upper_median(relative[known])
     suspect = relative > max(SUSPECT_FACTOR * typical, MIN_SUSPECT_RESIDUAL)
     judges = known & ~suspect
-    if not suspect.any() or np.count_nonzero(judges) < MIN_JUDGES:
+    if not suspect.any() or np.count_nonzero(judges) < MIN_NEIGHBOURS_FIT:
         return item
     pixels = item.lattice.without(suspect).pixels
-    usual = fit_cells(pixels, judges, leave_out=True)
-    expected = upper_median(np.hypot(*(usual.pixels - pixels[judges]).T) / usual.cell_px())
-    outlying, in_place = _judged(item, suspect, expected)
+    predicted_fit = fit_cells(pixels, judges, leave_out=True)
+    expected = upper_median(np.hypot(*(predicted_fit.pixels - pixels[judges]).T) / predicted_fit.cell_px())
+    outlying, in_place = _tested(item, suspect, expected)
     # Under the edge of a shadow whole rows are suspect: those that are in place say where the rows beyond them are.
     while outlying.any() and in_place.any():
         suspect = suspect & ~in_place
-        outlying, in_place = _judged(item, suspect, expected)
+        outlying, in_place = _tested(item, suspect, expected)
     if not outlying.any():
         return item
     item = item.without(outlying)
     return item.cut(*item.lattice.extent)
 
 
-def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[BoolArray, BoolArray]:
+def _tested(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[BoolArray, BoolArray]:
     """Return which of the `suspect` corners (R, C) are not where the others have them, and which clearly are.
 
     The others are mostly as good as `expected`, in cells.
@@ -133,11 +133,11 @@ def _judged(item: RefinedLattice, suspect: BoolArray, expected: float) -> tuple[
     outlying, in_place = np.zeros((2, *suspect.shape), np.bool_)
     outlying[suspect] = True
     # Both must agree.
-    for degree, ridge in (STIFF, PLIANT):
+    for degree, ridge in (STIFF, FLEXIBLE):
         shape = fit_cells(pixels, suspect, degree=degree, ridge=ridge)
         off = np.hypot(*(shape.pixels - item.lattice.pixels[suspect]).T)
         good = expected * np.hypot(1.0, shape.gain) * shape.cell_px()
-        judged = shape.support >= MIN_JUDGES
+        judged = shape.support >= MIN_NEIGHBOURS_FIT
         outlying[suspect] &= judged & (
             off > np.maximum(OUTLIER_FACTOR * good, MIN_OUTLIER_SIGMAS * item.sigma_px[suspect])
         )

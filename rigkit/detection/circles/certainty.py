@@ -44,17 +44,17 @@ def centre_sigmas(fit: CircleFit, label: IntArray, slope_gain: FloatArray | floa
     """
     size_px = np.sqrt(np.abs(np.linalg.det(fit.maps)))
     relative = fit.sigma_px / size_px
-    usual = fit.growth_variance + (MODEL_SIGMA_PX / size_px)[:, None] ** 2
-    usual = usual + 0.5 * (slope_gain * radius * relative)[:, None] ** 2
-    odd = _beside_smooth(fit.growth, label) ** 2
-    more = _beside_white((odd / usual)[:, 1:])
-    misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * usual.sum(axis=1), 0.0)
-    wavy = (_beside_smooth(fit.harmonics.reshape(len(label), -1), label) ** 2).mean(axis=1)
+    typical = fit.growth_variance + (MODEL_SIGMA_PX / size_px)[:, None] ** 2
+    typical = typical + 0.5 * (slope_gain * radius * relative)[:, None] ** 2
+    odd = _without_smooth_part(fit.growth, label) ** 2
+    more = _variance_over_white((odd / typical)[:, 1:])
+    misshapen = np.maximum(odd.sum(axis=1) - ODD_BY_NOISE * more * typical.sum(axis=1), 0.0)
+    wavy = (_without_smooth_part(fit.harmonics.reshape(len(label), -1), label) ** 2).mean(axis=1)
     uneven = np.maximum(wavy - WAVY_BY_NOISE * more * relative**2, 0.0)
     return np.asarray(np.sqrt(more * fit.sigma_px**2 + ((MAP_ERROR * radius) ** 2 * misshapen + uneven) * size_px**2))
 
 
-def _beside_white(slants: FloatArray) -> float:
+def _variance_over_white(slants: FloatArray) -> float:
     """Return the variance of the centres over that by white noise, from the squares (N, 2) of how circles are slanted,
     each over its variance by white noise: 1 as far as chance may have made them differ."""
     free = len(slants) - SMOOTH_TERMS if len(slants) >= MIN_SMOOTH else len(slants) - 1
@@ -65,7 +65,7 @@ def _beside_white(slants: FloatArray) -> float:
     return 1.0 + max(sure, 0.0) * (times - 1.0)
 
 
-def _beside_smooth(values: FloatArray, label: IntArray) -> FloatArray:
+def _without_smooth_part(values: FloatArray, label: IntArray) -> FloatArray:
     """Return what `values` (N, K) are beside a quadratic surface over the places: what all have, and what lens and blur
     change evenly, is no scatter. Beside their medians where there are few circles."""
     off = values - np.median(values, axis=0)

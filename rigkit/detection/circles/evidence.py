@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-UNEXPLAINED, MISSHAPEN, DISPLACED, CORNERED, MAX_STRANGE = 0.17, 0.08, 0.04, 0.03, 1.6
+UNEXPLAINED, MISSHAPEN, DISPLACED, CORNERED, MAX_IMPLAUSIBILITY = 0.17, 0.08, 0.04, 0.03, 1.6
 """Scales of `GridEvidence`, and how large the sum of squares in these may be for a grid. Those of two REAL boards reach
 0.150 (sharpened), 0.055, 0.029 (motion of 6 px), 0.023 (ink that spreads by 2 px) and a sum of 1.2, in eleven kinds of
 worse images. Of 625 pictures without one (REAL photographs, RENDERED patterns; sharp, sharpened, blurred, moved) the
@@ -30,11 +30,11 @@ class GridEvidence:
     corners: float
 
     @property
-    def strange(self) -> float:
+    def implausibility(self) -> float:
         """Return how little this is like a grid of circles: what speaks against one, weighed together."""
         off = (self.unexplained / UNEXPLAINED, self.misshapen / MISSHAPEN, self.displaced / DISPLACED)
         return sum(part * part for part in (*off, self.corners / CORNERED))
 
     @property
     def convincing(self) -> bool:
-        return self.strange < MAX_STRANGE
+        return self.implausibility < MAX_IMPLAUSIBILITY

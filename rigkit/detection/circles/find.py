@@ -48,7 +48,7 @@ blur 3 px); the third, where that changed by how much the blur differs with the 
 neighbours' light leaves, and circles that this light had hidden."""
 MIXED_ROUNDS = 2
 """The second has the neighbours' sizes, and how much the blur differs with the direction, from the first."""
-FIRST_LENIENCE = 2.0
+FIRST_TOLERANCE = 2.0
 """Before circles are fitted, maps at the rim of a grid, from the middles of blobs, are not good."""
 MIN_UNEVEN, MAX_UNEVEN = 0.1, 0.9
 """Of the variance of the blur. A change below the first leaves centres where they are (REAL, hexagonal: within
@@ -167,7 +167,7 @@ def _first(grey: GreyImage, blobs: Blobs, found: LabelledBlobs, *, beside: bool 
     fit = _fitted(grey, own.pixels, around, radius, corner, blur, np.zeros(2), others)
     bright = bool(own.sign[0] > 0)
     draft = _Draft(label=label, fit=fit, around=around, radius=radius, hexagonal=hexagonal, bright=bright, mixed=beside)
-    return _judged(draft, FIRST_LENIENCE)
+    return _tested(draft, FIRST_TOLERANCE)
 
 
 def _mixed(grey: GreyImage, draft: _Draft) -> _Draft:
@@ -218,7 +218,7 @@ def _fitted(
 
 
 def like_contrast(fit: CircleFit, contrast: float, share: float) -> BoolArray:
-    """Return which circles (N,) have about the usual `contrast`, or the usual `share` of the brightness."""
+    """Return which circles (N,) have about the usual `contrast`, or the typical `share` of the brightness."""
     parts = np.stack([np.abs(fit.contrast) / contrast, fit.share / share])
     return np.asarray(((parts > MIN_CIRCLE_CONTRAST) & (parts < MAX_CIRCLE_CONTRAST)).any(axis=0))
 
@@ -227,18 +227,18 @@ def _sigma(fit: CircleFit) -> float:
     return float(np.median(fit.sigma_px)) if len(fit.sigma_px) else FIRST_SIGMA_PX
 
 
-def _judged(draft: _Draft, lenience: float = 1.0) -> _Draft:
-    """Return the draft without what is no circle of it; `lenience` multiplies the limits of shape and residual."""
+def _tested(draft: _Draft, tolerance: float = 1.0) -> _Draft:
+    """Return the draft without what is no circle of it; `tolerance` multiplies the limits of shape and residual."""
     fit = draft.fit
     good = fit.valid & ((fit.contrast > 0.0) == draft.bright)
-    good &= (np.abs(_own_growth(fit, good)) < lenience * MAX_CIRCLE_GROWTH).all(axis=1)
+    good &= (np.abs(_own_growth(fit, good)) < tolerance * MAX_CIRCLE_GROWTH).all(axis=1)
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     contrast = np.abs(fit.contrast)
     relative = fit.residual / np.maximum(contrast, 1e-9)
-    usual = max(float(np.median(relative[good])), MIN_TYPICAL_CIRCLE)
+    typical = max(float(np.median(relative[good])), MIN_TYPICAL_CIRCLE)
     good &= like_contrast(fit, float(np.median(contrast[good])), float(np.median(fit.share[good])))
-    good &= relative < lenience * MAX_CIRCLE_RESIDUAL * usual
+    good &= relative < tolerance * MAX_CIRCLE_RESIDUAL * typical
     if good.sum() < MIN_CIRCLES:
         return draft.chosen(good)
     expected = local_maps(
@@ -277,7 +277,7 @@ def _again(grey: GreyImage, draft: _Draft, *, beside: bool = False) -> _Draft:
     radius = _radius(fit.maps, around.first)
     others = beside_each(draft.label, draft.hexagonal) if beside else None
     fresh = _fitted(grey, fit.pixels, around, radius, draft.corner, fit.blur_px, draft.uneven_px2, others)
-    return _judged(replace(draft, fit=fresh, around=around, radius=radius))
+    return _tested(replace(draft, fit=fresh, around=around, radius=radius))
 
 
 def _uneven(draft: _Draft) -> FloatArray:
@@ -333,7 +333,7 @@ def _larger(grey: GreyImage, draft: _Draft, *, beside: bool) -> _Draft | None:
         fit=joined(fit, rows_of(tried, near)),
         around=joined(draft.around, rows_of(around, near)),
     )
-    judged = _judged(grown)
+    judged = _tested(grown)
     return judged if len(judged.label) > len(draft.label) else None
 
 

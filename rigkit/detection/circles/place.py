@@ -18,7 +18,7 @@ from rigkit.core.detections import BoardDetection, grid_turned
 from rigkit.core.patterns.circles import Circles
 from rigkit.detection.circles.find import CircleGrid
 
-TELLING = 2
+MAX_EMPTY_DIFFERENCE = 2
 """A place in a board is preferred to another in it that leaves more than so many more places empty."""
 MAX_EMPTY = 0.2
 """Part of a board's circles that may be covered where the others show their place."""
@@ -55,7 +55,7 @@ def boards_meant(found: CircleGrid, boards: Sequence[Board]) -> list[tuple[Board
 
 def may_be_part(found: CircleGrid, board: Board) -> bool:
     """Return whether the lattice can be a part of the board, of which the image's border cuts off the rest."""
-    return _open_place(found, board, TELLING) is not None
+    return _open_place(found, board, MAX_EMPTY_DIFFERENCE) is not None
 
 
 def _open_place(found: CircleGrid, board: Board, max_empty: int) -> _Place | None:
@@ -78,7 +78,7 @@ def _place_on(found: CircleGrid, board: Board) -> _Place | None:
     least = min(place.empty for place in places)
     if least > MAX_EMPTY * board.corner_count:
         return None
-    good = [place for place in places if place.empty <= least + TELLING]
+    good = [place for place in places if place.empty <= least + MAX_EMPTY_DIFFERENCE]
     if len({_key(place.grid, board) for place in good}) > 1:
         return None
     return max(good, key=lambda place: _upright(place.grid, found.pixels))

@@ -63,8 +63,8 @@ def seen_through(
     whole = ((pixels > extent) & (pixels < np.array([grey.shape[1], grey.shape[0]]) - 1.0 - extent)).all(axis=1)
     tried = valid & (known | whole)
     blur = np.full(int(tried.sum()), found.blur_px)
-    apart = np.linalg.norm(points[tried][:, None] - points[tried], axis=2)
-    near = (apart < NEXT * nearest_mm) & (apart > 0.0) & known[tried]
+    separation = np.linalg.norm(points[tried][:, None] - points[tried], axis=2)
+    near = (separation < NEXT * nearest_mm) & (separation > 0.0) & known[tried]
     surrounded = near.sum(axis=1) >= (6 if found.hexagonal else 4)
     reach = edge_reach(maps[tried], 0.5 * nearest_mm / radius_mm, blur, surrounded)
     first = np.argsort(~near, axis=1, kind="stable")[:, :BESIDE]
@@ -109,7 +109,7 @@ def _maps(
 def _sound(fit: CircleFit, found: CircleGrid) -> BoolArray:
     """Return which circles look like those of the grid."""
     contrast = np.abs(fit.contrast)
-    usual = max(found.evidence.unexplained, MIN_TYPICAL_CIRCLE)
+    typical = max(found.evidence.unexplained, MIN_TYPICAL_CIRCLE)
     good = fit.valid & ((fit.contrast > 0.0) == found.bright) & (np.abs(fit.growth) < MAX_CIRCLE_GROWTH).all(axis=1)
     good &= like_contrast(fit, found.contrast, found.share)
-    return np.asarray(good & (fit.residual < MAX_CIRCLE_RESIDUAL * usual * np.maximum(contrast, 1e-9)))
+    return np.asarray(good & (fit.residual < MAX_CIRCLE_RESIDUAL * typical * np.maximum(contrast, 1e-9)))

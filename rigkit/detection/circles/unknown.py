@@ -19,7 +19,7 @@ MIN_SIDE_CIRCLES = 3
 
 
 @dataclass(eq=False, slots=True)
-class CircleSightings:
+class CircleObservations:
     """The grids of circles of all images.
 
     Attributes
@@ -83,7 +83,7 @@ def _goes_on(grid: CircleGrid, kind: tuple[str, int, int, str, bool]) -> bool:
     return any(may_be_part(grid, _board((layout, *size, stagger, bright))) for size in larger for stagger in staggers)
 
 
-def guessed_circles(seen: CircleSightings) -> tuple[Board, tuple[int, ...]] | None:
+def guessed_circles(seen: CircleObservations) -> tuple[Board, tuple[int, ...]] | None:
     """Return the grid that most images show whole, with circles 1 mm apart in a row, and which images; None for none.
 
     Images that show paper all around count first: what the border of an image cuts looks like a whole grid of fewer

@@ -34,7 +34,7 @@ MAX_GUIDE_GAIN = 4.0
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 """Without a camera a ring of corners is predicted at a time: the cells beside known ones."""
 
-JUDGES = 8
+NEIGHBOURS_USED = 8
 """Corners by which one beside them is judged."""
 
 POSE_CELLS = 0.06
@@ -48,7 +48,7 @@ POSE_STEPS, POSE_SCALE = 5, 3.0
 FITTED = ("pixels", "contrast", "residual", "noise", "sigma_px", "blur")
 """What `BoardState` holds of a fit, in its order."""
 
-UNSOUND = 3.0
+MAX_RESIDUAL_RATIO = 3.0
 """Corners with more than this times the usual standard deviation, which other things in their windows raise, say
 nothing of their neighbours; nor does so much more excuse them."""
 
@@ -81,16 +81,16 @@ class BoardState:
         return np.isfinite(self.pixels[..., 0])
 
     @property
-    def usual_sigma(self) -> float:
+    def typical_sigma(self) -> float:
         return known_median(self.sigma_px[self.known])
 
-    def usual_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
+    def typical_near(self, cells: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return contrast and residual that are usual around each of the `cells` (R, C), (M,) each: light, blur and the
         squares' size differ over a board, in a shadow by as much as from one board to another."""
         row, column = np.nonzero(cells)
         known_row, known_column = np.nonzero(self.known & np.isfinite(self.residual))
-        apart = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
-        nearest = np.argsort(apart, axis=1, kind="stable")[:, :JUDGES]
+        separation = (row[:, None] - known_row) ** 2 + (column[:, None] - known_column) ** 2
+        nearest = np.argsort(separation, axis=1, kind="stable")[:, :NEIGHBOURS_USED]
         around = known_row[nearest], known_column[nearest]
         return np.median(self.contrast[around], axis=1), np.median(self.residual[around], axis=1)
 
@@ -143,7 +143,7 @@ class Guide:
             beside = cv2.dilate(state.known.astype(np.uint8), CROSS)[cells] > 0
             return shape, np.asarray(beside & (shape.support >= 6) & (shape.gain < MAX_GUIDE_GAIN))
         shape, valid = self._projected(self.camera, self.cam_from_board, cells)
-        sound = state.known & (state.sigma_px < UNSOUND * state.usual_sigma)
+        sound = state.known & (state.sigma_px < MAX_RESIDUAL_RATIO * state.typical_sigma)
         if sound.any():
             # What the lens model, or a board that is not flat, leaves over changes slowly from corner to corner.
             every = self._projected(self.camera, self.cam_from_board, sound)[0].pixels

@@ -21,7 +21,7 @@ from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
-from rigkit.detection.guided.board_guide import MIN_GUIDE_CORNERS, UNSOUND, BoardState, Guide
+from rigkit.detection.guided.board_guide import MAX_RESIDUAL_RATIO, MIN_GUIDE_CORNERS, BoardState, Guide
 from rigkit.detection.guided.corner_fit import RADIUS_PX, fit_corners
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.local_fit import LocalFit, fit_cells
@@ -31,7 +31,7 @@ from rigkit.detection.subpixel.edge_curvature import line_curvatures_to_fit
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
-from rigkit.detection.subpixel.unsure import strays
+from rigkit.detection.subpixel.uncertain_corners import strays
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
@@ -128,7 +128,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     state = opened
     guide = Guide.of(board, camera, state)
     if guide.camera is not None:
-        state = _judged(image, guide, state)
+        state = _tested(image, guide, state)
     before = state
     for _ in range(MAX_GUIDE_ROUNDS):
         guide = guide.by(state)
@@ -139,7 +139,7 @@ def _completed(image: GreyImage, found: BoardDetection, board: Board, camera: Ca
     if guide.camera is None:
         return found if state is before else _with_added(image, guide, found, opened, state)
     if state is not before:
-        state = _judged(image, guide, state)
+        state = _tested(image, guide, state)
     state = state.without(~np.isfinite(state.sigma_px))
     row, column = np.nonzero(state.known)
     if len(row) < MIN_GUIDE_CORNERS:
@@ -194,8 +194,8 @@ def _settled(image: GreyImage, board: Board, state: BoardState, cells: BoolArray
 
 
 def _with_uneven(fit: EdgeFit, sides: FloatArray, board: Board) -> EdgeFit:
-    usual = shared_noise(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
-    return with_uneven(fit, sides, RADIUS_PX, usual)
+    typical = shared_noise(fit, sides, RADIUS_PX, marked=isinstance(board.pattern, Charuco))
+    return with_uneven(fit, sides, RADIUS_PX, typical)
 
 
 def _known_factor(found: BoardDetection, state: BoardState) -> float:
@@ -276,9 +276,9 @@ def _confirmed(
     moved = np.linalg.norm(fit.pixels - shape.pixels, axis=1)
     limit = MOVED_CELLS * side
     if guide.camera is not None:
-        usual = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
-        limit = np.minimum(limit, np.maximum(MOVED_FACTOR * usual * shape.gain, MOVED_PX))
-    contrast, residual = state.usual_near(cells)
+        typical = float(np.median(np.linalg.norm(state.pixels[known] - guide.at(state, known)[0].pixels, axis=1)))
+        limit = np.minimum(limit, np.maximum(MOVED_FACTOR * typical * shape.gain, MOVED_PX))
+    contrast, residual = state.typical_near(cells)
     good = fit.valid & (moved < limit) & (fit.contrast > MIN_ADDED_CONTRAST * contrast)
     # Noise is the same at any contrast; what the model gets wrong grows with it.
     most = MAX_ADDED_RESIDUAL if guide.camera is not None else MAX_ADDED_RESIDUAL_ALONE
@@ -319,7 +319,7 @@ def _together(image: GreyImage, board: Board, state: BoardState) -> BoardState:
     return replace(state, pixels=placed.lattice.pixels, sigma_px=placed.sigma_px, together=True)
 
 
-def _judged(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
+def _tested(image: GreyImage, guide: Guide, state: BoardState) -> BoardState:
     """Return the state with every corner fitted anew, without those that contradict the camera and the others."""
     again = _again(image, guide, state)
     state = _together(image, guide.board, again)
@@ -353,7 +353,7 @@ def _contradiction(guide: Guide, state: BoardState, judges: BoardState) -> Float
     shape, _ = guide.at(judges, cells)
     # Where the lens model ends nothing is said.
     off[cells] = np.nan_to_num(np.linalg.norm(state.pixels[cells] - shape.pixels, axis=1) / np.maximum(shape.gain, 1.0))
-    usual = max(float(np.median(off[own])), SCATTER_FLOOR_PX) if own.any() else SCATTER_FLOOR_PX
-    sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), UNSOUND * state.usual_sigma)
-    allowed = OUTLIER_GUIDE_FACTOR * np.hypot(usual, sigma)
+    typical = max(float(np.median(off[own])), SCATTER_FLOOR_PX) if own.any() else SCATTER_FLOOR_PX
+    sigma = np.minimum(np.where(cells, state.sigma_px, 1.0), MAX_RESIDUAL_RATIO * state.typical_sigma)
+    allowed = OUTLIER_GUIDE_FACTOR * np.hypot(typical, sigma)
     return np.where(cells, off / allowed, 0.0)

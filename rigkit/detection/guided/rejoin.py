@@ -111,8 +111,8 @@ def _shift(lattice: Lattice, on_grid: FloatArray) -> IntArray | None:
     if 2 * len(off) < lattice.count:
         return None
     shift = np.round(np.median(off, axis=0))
-    apart = float(np.median(np.linalg.norm(off - shift, axis=1)))
-    return shift.astype(np.int64) if apart < OFF_GRID else None
+    separation = float(np.median(np.linalg.norm(off - shift, axis=1)))
+    return shift.astype(np.int64) if separation < OFF_GRID else None
 
 
 def _united(
@@ -131,8 +131,8 @@ def _united(
         return None
     known = first.lattice.known
     twice = known & second.lattice.known
-    apart = np.linalg.norm(first.lattice.pixels - second.lattice.pixels, axis=-1)[twice]
-    if (apart > SAME_REJOINED_PX).any():
+    separation = np.linalg.norm(first.lattice.pixels - second.lattice.pixels, axis=-1)[twice]
+    if (separation > SAME_REJOINED_PX).any():
         return None
     return first.filled(second)
 

@@ -25,16 +25,16 @@ MIN_EVEN, MAX_EVEN = 9, 32
 MIN_SHADED = 3
 """The edge of a shadow that crosses a board passes by several corners; one or two are dirt, or where the board ends."""
 
-USUAL_WITHIN_CELLS = 3
+TYPICAL_WITHIN_CELLS = 3
 """Corners so near, in cells, say what is usual there."""
 
 MAX_RELIT_GAIN = 3.0
 """Corners are foretold up to this standard deviation, for corners of standard deviation 1."""
 
-FORETOLD: dict[str, Any] = {"degree": 3, "ridge": (1e-3, 1e-2)}
+PREDICTION_FIT: dict[str, Any] = {"degree": 3, "ridge": (1e-3, 1e-2)}
 """Polynomials that foretell corners, as without a camera in `board_guide`."""
 
-MIN_FORETELLERS = 6
+MIN_PREDICTORS = 6
 """Corners by which one is foretold."""
 
 MIN_SHADED_CELL_PX = 10.0
@@ -55,7 +55,7 @@ most so many times what is usual on the board. One that left not so many times w
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Usual:
+class _Typical:
     """What corners in even light are like.
 
     Attributes
@@ -99,20 +99,20 @@ def relit(
     even = known & ~suspect
     if np.count_nonzero(suspect) < MIN_SHADED or np.count_nonzero(even) < MIN_EVEN:
         return found
-    told = board or Board("found", found.columns, found.rows, 1.0, 1.0)
+    assumed = board or Board("found", found.columns, found.rows, 1.0, 1.0)
     fits = refined if board is None else _as_it_is(image, board, found, refined, _near(even, suspect))
-    told_by = _near(even & np.isfinite(fits.blur_px), suspect)
-    if np.count_nonzero(told_by) < MIN_EVEN:
+    reference = _near(even & np.isfinite(fits.blur_px), suspect)
+    if np.count_nonzero(reference) < MIN_EVEN:
         return found
-    usual = _usual(pixels, fits, told_by)
-    shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **FORETOLD)
-    was = _left(image, told, suspect, shape, fits.relative_residual, usual)
-    tried = (shape.support >= MIN_FORETELLERS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * usual.relative)
+    typical = _typical(pixels, fits, reference)
+    shape = fit_cells(np.where(even[..., None], pixels, np.nan), suspect, **PREDICTION_FIT)
+    was = _left(image, assumed, suspect, shape, fits.relative_residual, typical)
+    tried = (shape.support >= MIN_PREDICTORS) & (shape.gain < MAX_RELIT_GAIN) & (was > TIMES_BETTER * typical.relative)
     tried &= np.linalg.norm(shape.sides, axis=2).min(axis=1) > MIN_SHADED_CELL_PX
     if np.count_nonzero(tried) < MIN_SHADED:
         return found
     suspect[suspect] = tried
-    placed, sigma, good = _in_even_light(image, told, suspect, shape.of(tried), was[tried], usual)
+    placed, sigma, good = _in_even_light(image, assumed, suspect, shape.of(tried), was[tried], typical)
     suspect[suspect] = good
     pixels[suspect], own[suspect] = placed[good], sigma[good]
     row, column = np.nonzero(np.isfinite(pixels[..., 0]))
@@ -121,7 +121,7 @@ def relit(
 
 
 def _left(
-    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, relative: FloatArray, usual: _Usual
+    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, relative: FloatArray, typical: _Typical
 ) -> FloatArray:
     """Return what fits of the corners at `cells` leave (M,), in parts of their contrast: `relative` (R, C) where that
     is known, else of corners where `shape` has them."""
@@ -129,30 +129,30 @@ def _left(
     unknown = missed[cells]
     if unknown.any():
         part = shape.of(unknown)
-        fit = fit_corners(image, board, missed, part, part.pixels, usual.signs[missed], usual.blur)
+        fit = fit_corners(image, board, missed, part, part.pixels, typical.signs[missed], typical.blur)
         left[unknown] = fit.residual / np.maximum(fit.contrast, 1e-6)
     return left
 
 
 def _in_even_light(
-    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, was: FloatArray, usual: _Usual
+    image: GreyImage, board: Board, cells: BoolArray, shape: LocalFit, was: FloatArray, typical: _Typical
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return pixels (M, 2) and sigmas (M,) of the corners at `cells` of `shape` in even light, and which are good.
 
     `was` (M,) is the residual in the light as it is, relative to the contrast.
     """
-    side, signs = np.linalg.norm(shape.sides, axis=2).min(axis=1), usual.signs[cells]
-    aside = _aside(board, shape.sides)
-    steps, seen = light_steps(image, shape.pixels, shape.sides, shape.curvature(), usual.blur, aside)
+    side, signs = np.linalg.norm(shape.sides, axis=2).min(axis=1), typical.signs[cells]
+    lateral = _plain_distance(board, shape.sides)
+    steps, seen = light_steps(image, shape.pixels, shape.sides, shape.curvature(), typical.blur, lateral)
     picture, moved = in_even_light(image, steps)
     start = np.where(np.abs(steps.pixels - shape.pixels) < 1.0, steps.pixels, shape.pixels)
-    fit = fit_corners(picture, board, cells, shape, start + moved, signs, usual.blur, paper=False)
-    pixels, sigma = fit.pixels - moved, np.hypot(usual.factor * fit.sigma_px, steps.sigma_px)
+    fit = fit_corners(picture, board, cells, shape, start + moved, signs, typical.blur, paper=False)
+    pixels, sigma = fit.pixels - moved, np.hypot(typical.factor * fit.sigma_px, steps.sigma_px)
     relative = fit.residual / np.maximum(fit.contrast, 1e-6)
     good = seen & fit.valid & (fit.contrast > 0.0) & (sigma < MAX_SIGMA_CELLS * side)
-    allowed = MOVED_SIGMAS * np.hypot(sigma, usual.off_px * np.maximum(shape.gain, 1.0))
+    allowed = MOVED_SIGMAS * np.hypot(sigma, typical.off_px * np.maximum(shape.gain, 1.0))
     good &= np.linalg.norm(pixels - shape.pixels, axis=1) < allowed
-    good &= (relative < MAX_RELIT_RESIDUAL * usual.relative) & (was > TIMES_BETTER * relative)
+    good &= (relative < MAX_RELIT_RESIDUAL * typical.relative) & (was > TIMES_BETTER * relative)
     return pixels, sigma, np.asarray(good)
 
 
@@ -163,11 +163,11 @@ def _suspect(image: GreyImage, board: Board | None, pixels: FloatArray, cells: B
     ends[1:-1, 1:-1] = False
     at = np.where(np.isfinite(pixels[cells]), pixels[cells], shape.pixels)
     out = cells.copy()
-    out[cells] = beside_shadows(image, at, shape.sides, _aside(board, shape.sides), ends[cells])
+    out[cells] = beside_shadows(image, at, shape.sides, _plain_distance(board, shape.sides), ends[cells])
     return out
 
 
-def _aside(board: Board | None, sides: FloatArray) -> FloatArray:
+def _plain_distance(board: Board | None, sides: FloatArray) -> FloatArray:
     """Return how far from the lines of a board its squares are sure to be plain (N,), px."""
     if board is None or not isinstance(board.pattern, Charuco):
         return np.full(len(sides), RADIUS_PX)
@@ -176,7 +176,7 @@ def _aside(board: Board | None, sides: FloatArray) -> FloatArray:
 
 def _near(even: BoolArray, suspect: BoolArray) -> BoolArray:
     """Return those of the cells `even` (R, C) that are near the `suspect` ones, all of them where few are."""
-    reach = np.ones((2 * USUAL_WITHIN_CELLS + 1, 2 * USUAL_WITHIN_CELLS + 1), np.uint8)
+    reach = np.ones((2 * TYPICAL_WITHIN_CELLS + 1, 2 * TYPICAL_WITHIN_CELLS + 1), np.uint8)
     near = even & (cv2.dilate(suspect.astype(np.uint8), reach) > 0)
     return near if np.count_nonzero(near) >= MIN_EVEN else even
 
@@ -211,10 +211,10 @@ def _as_it_is(
     return replace(part, scatter=max(factor, 1.0), correlated=1.0)
 
 
-def _usual(pixels: FloatArray, refined: RefinedLattice, even: BoolArray) -> _Usual:
+def _typical(pixels: FloatArray, refined: RefinedLattice, even: BoolArray) -> _Typical:
     """Return what the corners `even` (R, C) of `pixels` (R, C, 2) are like."""
     blur, relative = upper_median(refined.blur_px[even]), upper_median(refined.relative_residual[even])
-    ahead = fit_cells(pixels, even, **FORETOLD, leave_out=True)
+    ahead = fit_cells(pixels, even, **PREDICTION_FIT, leave_out=True)
     off = np.linalg.norm(pixels[even] - ahead.pixels, axis=1) / np.hypot(1.0, ahead.gain)
     factor = refined.scatter * refined.correlated
-    return _Usual(refined.lattice.signs(), blur, relative, factor, upper_median(off))
+    return _Typical(refined.lattice.signs(), blur, relative, factor, upper_median(off))

@@ -14,14 +14,14 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 from rigkit.detection.lattice.lattice import MANY, Lattice
 from rigkit.detection.lattice.links import (
-    ASIDE_LENGTHS,
     CONTRAST_RATIO,
     EDGE_PLACES,
-    MAX_ASIDE_PX,
-    MIN_ASIDE_PX,
+    LATERAL_LENGTHS,
+    MAX_LATERAL_PX,
     MIN_EDGE_PLACES,
+    MIN_LATERAL_PX,
 )
-from rigkit.detection.lattice.local_fit import PLIANT, STIFF
+from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF
 from rigkit.detection.saddles.response import Level
 from rigkit.detection.saddles.ring import ring_rules
 from rigkit.detection.saddles.saddle import Saddles
@@ -37,10 +37,10 @@ ROOM = 6
 FIT_WIDTH, FIT_RADIUS = 1.3, 3
 """Standard deviation of the weight and reach of the predictions, cells."""
 
-MIN_FORETELLING = 3
+MIN_PREDICTING = 3
 """Known corners that foretell another."""
 
-MAX_GROWN, MAX_FRUITLESS = 96, 16
+MAX_GROWN, MAX_FAILED_GROWTHS = 96, 16
 """So many lattices are grown, or so many in a row without a board: those of boards come first, being larger, and
 clutter can make hundreds, of one square each."""
 
@@ -70,26 +70,26 @@ GROWN_AGAIN_PX = 1.4
 
 
 def grow_all(
-    lattices: Iterable[Lattice], saddles: Saddles, level: Level, promising: Callable[[Lattice], bool]
+    lattices: Iterable[Lattice], saddles: Saddles, level: Level, plausible: Callable[[Lattice], bool]
 ) -> list[Lattice]:
     """Return the lattices grown from `lattices` one by one to `saddles`, without what others have grown over.
 
-    Those that are not `promising`, as soon as there is enough of them to tell, are left out.
+    Those that are not `plausible`, as soon as there is enough of them to tell, are left out.
     """
     out: list[Lattice] = []
     taken = np.zeros((0, 2))
-    tried = fruitless = 0
+    tried = failed = 0
     squares: GridBuckets | None = None
     for lattice in lattices:
-        if tried == MAX_GROWN or fruitless == MAX_FRUITLESS:
+        if tried == MAX_GROWN or failed == MAX_FAILED_GROWTHS:
             break
         if _covered(lattice, taken):
             continue
         squares = squares or GridBuckets.sorted(saddles.pixels)
-        lattice, good = _grown(lattice, squares, level, promising)
+        lattice, good = _grown(lattice, squares, level, plausible)
         tried += 1
         taken = np.concatenate([taken, lattice.pixels[lattice.known]])
-        fruitless = 0 if good and lattice.solid else fruitless + 1
+        failed = 0 if good and lattice.solid else failed + 1
         if good:
             out.append(lattice)
     return out
@@ -104,23 +104,23 @@ def _covered(lattice: Lattice, corners: FloatArray) -> bool:
 
 
 def _grown(
-    lattice: Lattice, saddles: GridBuckets, level: Level, promising: Callable[[Lattice], bool]
+    lattice: Lattice, saddles: GridBuckets, level: Level, plausible: Callable[[Lattice], bool]
 ) -> tuple[Lattice, bool]:
-    """Return `lattice` with all corners that can be added one after the other, and whether it is `promising`.
+    """Return `lattice` with all corners that can be added one after the other, and whether it is `plausible`.
 
     Brightness is read from `level`. A lattice that is not promising may not be fully grown.
     """
     rings, judged = MAX_RINGS, False
     while rings > 0:
         if not judged and lattice.count >= MANY:
-            if not promising(lattice):
+            if not plausible(lattice):
                 return lattice, False
             judged = True
         wide = lattice.padded((ROOM, ROOM), (ROOM, ROOM))
         rings = _grow(wide, saddles, level, rings)
         if wide.count > lattice.count:
             lattice = wide.trimmed()
-    return lattice, judged or promising(lattice)
+    return lattice, judged or plausible(lattice)
 
 
 def _grow(lattice: Lattice, saddles: GridBuckets, level: Level, rings: int) -> int:
@@ -137,17 +137,17 @@ def _rules() -> GrowthRules:
     numbers: dict[str, float] = {
         "min_places": MIN_EDGE_PLACES,
         "tried": MAX_SADDLES_TRIED,
-        "min_foretelling": MIN_FORETELLING,
+        "min_predicting": MIN_PREDICTING,
         "reach": GROWTH_REACH,
         "ring_part": RING,
         "min_ring": MIN_RING_PX,
         "max_ring": MAX_RING_PX,
         "line_sine": LINE_SINE,
         "contrast_ratio": CONTRAST_RATIO,
-        "aside": ASIDE_LENGTHS,
-        "min_aside": MIN_ASIDE_PX,
-        "max_aside": MAX_ASIDE_PX,
+        "lateral": LATERAL_LENGTHS,
+        "min_aside": MIN_LATERAL_PX,
+        "max_lateral": MAX_LATERAL_PX,
         "min_area": MIN_AREA_PX2,
     }
-    predictions = [FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge) for degree, ridge in (STIFF, PLIANT)]
+    predictions = [FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge) for degree, ridge in (STIFF, FLEXIBLE)]
     return GrowthRules.make(predictions, ring_rules(ODD, CENTRE), EDGE_PLACES, **numbers)

@@ -35,7 +35,7 @@ EDGE_PLACES = np.array([0.5, 0.35, 0.65, 0.2, 0.8])
 MIN_EDGE_PLACES = 4
 """An edge shows the right side dark at this many of these parts of its length. Their order rejects clutter soonest."""
 
-ASIDE_LENGTHS, MIN_ASIDE_PX, MAX_ASIDE_PX = 0.12, 1.0, 4.0
+LATERAL_LENGTHS, MIN_LATERAL_PX, MAX_LATERAL_PX = 0.12, 1.0, 4.0
 """How far to the sides of an edge the brightness is read: a part of its length, within bounds."""
 
 
@@ -74,7 +74,7 @@ def find_links(corners: Corners, level: Level, length_ratio: float = LENGTH_RATI
         line_vectors(corners.angles),
         corners.contrast,
         _bounds(corners.contrast),
-        MAX_ASIDE_PX * corners.scale / level.scale,
+        MAX_LATERAL_PX * corners.scale / level.scale,
         level.smooth,
         level.scale,
         level.offset,
@@ -92,8 +92,8 @@ def _link_rules(length_ratio: float) -> front.LinkRules:
         arm_cosine=ARM_COSINE,
         contrast_ratio=CONTRAST_RATIO,
         length_ratio=length_ratio,
-        aside=ASIDE_LENGTHS,
-        min_aside=MIN_ASIDE_PX,
+        lateral=LATERAL_LENGTHS,
+        min_aside=MIN_LATERAL_PX,
     )
 
 

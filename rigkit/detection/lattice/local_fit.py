@@ -26,7 +26,7 @@ class Prediction(NamedTuple):
     ridge: tuple[float, float]
 
 
-STIFF, PLIANT = Prediction(2, (0.02, 1.0)), Prediction(3, (1e-3, 1e-2))
+STIFF, FLEXIBLE = Prediction(2, (0.02, 1.0)), Prediction(3, (1e-3, 1e-2))
 """One is steady with few neighbours, the other follows the rim of a fisheye."""
 
 
@@ -58,11 +58,11 @@ class LocalFit:
         return self.sides[:, 1]
 
     @property
-    def bend_column(self) -> FloatArray:
+    def curvature_column(self) -> FloatArray:
         return self.curvatures[:, 0]
 
     @property
-    def bend_row(self) -> FloatArray:
+    def curvature_row(self) -> FloatArray:
         return self.curvatures[:, 1]
 
     def of(self, chosen: BoolArray) -> LocalFit:
@@ -142,7 +142,7 @@ def _local_fit(rows: FloatArray) -> LocalFit:
     return LocalFit(rows[:, :2], sides, curvatures, rows[:, 10], rows[:, 11])
 
 
-def foretold(lattice: FloatArray, cells: BoolArray) -> LocalFit:
+def predicted(lattice: FloatArray, cells: BoolArray) -> LocalFit:
     """Return the fit that says where unknown corners (`cells`) are: of second degree and so damped that a few corners
     on one side are enough."""
     return fit_cells(lattice, cells, degree=2, ridge=(1e-3, 1.0))

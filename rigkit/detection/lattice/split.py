@@ -17,7 +17,7 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.detections import grid_turned
 from rigkit.detection.lattice.lattice import Lattice, margins
-from rigkit.detection.lattice.local_fit import PLIANT, STIFF, fit_cells
+from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF, fit_cells
 from rigkit.detection.lattice.spacing import SpacingChange, spacing_changes
 
 MIN_TURN = 0.16
@@ -247,10 +247,10 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     """Return both lattices in one, None if `two` does not continue `one`."""
     squared = _squared_gaps(one, two)
     nearest = divmod(int(squared.argmin()), len(two.pixels))
-    apart = math.sqrt(squared[nearest])
+    separation = math.sqrt(squared[nearest])
     cell = one.cells[nearest[0]].tolist()
     longest = max(math.hypot(*side) for side in cell)
-    if not apart < JOIN_REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
+    if not separation < JOIN_REACH * longest or not _alike(cell, two.cells[nearest[1]].tolist()):
         return None
     near, place = _carried_over(one, two, squared)
     whole = np.rint(place)
@@ -262,7 +262,7 @@ def _joined(one: _LatticePart, two: _LatticePart) -> Lattice | None:
     for quarter in range(4):
         shift = whole.astype(np.int64) - grid_turned(two.grid[near], two.lattice.size, quarter)
         if (shift == shift[0]).all():
-            close = apart < DIAGONAL * GAP * longest
+            close = separation < DIAGONAL * GAP * longest
             far = far_off < FAR_MEETS_CELLS
             united = _united(one.lattice, two.lattice.turned(quarter), shift[0], close, far)
             if united is None or off < MEETS_CELLS:
@@ -282,7 +282,7 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
     """
     reach = np.ones((2 * GAP + 1, 2 * GAP + 1), np.uint8)
     between = (cv2.dilate(one.astype(np.uint8), reach) > 0) & (cv2.dilate(two.astype(np.uint8), reach) > 0)
-    for degree, ridge in (STIFF, PLIANT):
+    for degree, ridge in (STIFF, FLEXIBLE):
         mine, theirs = (
             fit_cells(np.where(part[..., None], pixels, np.nan), between, degree=degree, width=1.3, ridge=ridge)
             for part in (one, two)
@@ -290,8 +290,8 @@ def _agree(pixels: FloatArray, one: BoolArray, two: BoolArray) -> bool:
         gain = np.where((mine.support > 3) & (theirs.support > 3), np.maximum(mine.gain, theirs.gain), np.inf)
         best = np.argsort(gain)[: min(BETWEEN, int(np.isfinite(gain).sum()))]
         side = np.minimum(np.hypot(*mine.along_column[best].T), np.hypot(*mine.along_row[best].T))
-        apart = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
-        if len(best) and np.median(apart) < AGREES_CELLS:
+        separation = np.hypot(*(mine.pixels - theirs.pixels)[best].T) / np.maximum(side, 1e-9)
+        if len(best) and np.median(separation) < AGREES_CELLS:
             return True
     return False
 

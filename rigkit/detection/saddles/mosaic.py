@@ -68,5 +68,5 @@ def _middle(own: FloatArray, mean: FloatArray) -> tuple[float, float]:
     """Return the means of both over the squares whose ratio of them is usual."""
     ratio = own / np.maximum(mean, 1.0)
     low, high = np.quantile(ratio, (0.25, 0.75))
-    usual = (ratio >= low) & (ratio <= high)
-    return float(own[usual].mean()), float(mean[usual].mean())
+    typical = (ratio >= low) & (ratio <= high)
+    return float(own[typical].mean()), float(mean[typical].mean())

@@ -40,7 +40,7 @@ class Surroundings:
     def read(outer: FloatArray, pixels: FloatArray, blur: float, holes: BoolArray) -> Surroundings:
         """Return those of a lattice (R, C, 2) beside whose corners `outer` (R, C, 4) squares were read (NaN: none).
 
-        As `edge_model.LINES_BESIDE` has them: above, below, right, left.
+        As `edge_model.NEIGHBOUR_LINES` has them: above, below, right, left.
         """
         sides = outer[:, 0, 3], outer[:, -1, 2], outer[0, :, 0], outer[-1, :, 1]
         steps = np.diff(pixels[:, :2], axis=1), np.diff(pixels[:, -2:], axis=1), np.diff(pixels[:2], axis=0)

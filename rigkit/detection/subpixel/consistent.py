@@ -10,15 +10,15 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, upper_median
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.lattice.local_fit import fit_cells, foretold
+from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.unsure import strays
+from rigkit.detection.subpixel.uncertain_corners import strays
 
 MIN_NEIGHBOURS = 3
 """An empty cell is tried if so many of its eight neighbours are known."""
 
 MIN_CHECKED = 12
-MIN_JUDGED = 9
+MIN_TESTED = 9
 """A board of fewer corners, or of fewer that so many others predict, is not checked against itself."""
 
 HOLE_MOVE = 0.12
@@ -50,7 +50,7 @@ def with_holes(lattice: Lattice, inside: BoolArray) -> tuple[Lattice, BoolArray]
         holes &= around >= MIN_NEIGHBOURS
     if not holes.any():
         return lattice, holes
-    shape = foretold(lattice.pixels, holes)
+    shape = predicted(lattice.pixels, holes)
     pixels = lattice.pixels.copy()
     pixels[holes] = shape.pixels
     return Lattice(pixels, lattice.contrast, lattice.rising), holes
@@ -106,11 +106,11 @@ def checked(item: RefinedLattice, parts: Sequence[tuple[slice, slice]]) -> Refin
         if here.sum() < MIN_CHECKED:
             continue
         drop[part] = strays(item.sigma_px[part], cells[part], gain[part])
-        if sure.sum() < MIN_JUDGED:
+        if sure.sum() < MIN_TESTED:
             continue
         typical = upper_median(cells[part][sure])
-        usual = upper_median(relative[part][here])
+        typical_residual = upper_median(relative[part][here])
         outlying = (cells[part] > max(DISPLACED_CELLS, DISPLACED_SIGMAS * typical)) & (excess[part] > DISPLACED_SIGMAS)
-        covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * usual)
+        covered = relative[part] > max(COVERED_NOISE, COVERED_FACTOR * typical_residual)
         drop[part] |= sure & (outlying | (covered & (cells[part] > COVERED_OFF * typical)))
     return item.without(drop) if drop.any() else item

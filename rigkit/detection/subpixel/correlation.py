@@ -60,15 +60,15 @@ def sigma_factors(
 
 
 def uneven_factors(
-    fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, usual: FloatArray, radius_px: float
+    fit: EdgeFit, good: BoolArray, sides: FloatArray, owner: IntArray, typical: FloatArray, radius_px: float
 ) -> FloatArray:
-    """Return the factor (N,) for the sigmas of corners beside those of their boards, `usual` (P,): 1 but for corners
+    """Return the factor (N,) for the sigmas of corners beside those of their boards, `typical` (P,): 1 but for corners
     beside which there is more than noise.
 
     The edge of a shadow, glare or a finger in the window leaves what is the same over many pixels, and what of it looks
     like a shift of the corner is in none of the residuals. Arguments else as of `sigma_factors`.
     """
-    return edges.uneven_factors(_noise_of(fit, good, sides, owner), usual, factor_rules(radius_px))
+    return edges.uneven_factors(_noise_of(fit, good, sides, owner), typical, factor_rules(radius_px))
 
 
 def board_factors(
@@ -98,11 +98,11 @@ def shared_noise(fit: EdgeFit, sides: FloatArray, radius_px: float, *, marked: b
     return 1.0 if marked else float(sigma_factors(fit, good, sides, owner, 1, radius_px)[0])
 
 
-def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, usual: float) -> EdgeFit:
+def with_uneven(fit: EdgeFit, sides: FloatArray, radius_px: float, typical: float) -> EdgeFit:
     """Return the `fit` of a board's N corners, whose cells have `sides` (N, 2, 2), with `uneven_factors` beside the
-    board's `usual` one."""
+    board's `typical` one."""
     good, owner = fit.valid & (fit.contrast > 0.0), np.zeros(len(sides), np.int64)
-    return fit.less_sure(uneven_factors(fit, good, sides, owner, np.array([usual]), radius_px))
+    return fit.less_sure(uneven_factors(fit, good, sides, owner, np.array([typical]), radius_px))
 
 
 @functools.cache

@@ -20,7 +20,7 @@ from rigkit.kernels.edges import CurvatureRules, line_curvatures
 DECAY = 0.1
 """Boards under strong perspective and in fisheyes have coefficients up to this^k, in sides of the cell."""
 
-BENT_RAD = 0.06
+CURVED_RAD = 0.06
 """Where this phi is seen, DECAY would be too strict: the third coefficient, phi^2 / 2, then exceeds DECAY^3."""
 
 LINE_REACH = LatticeStack.GAP
@@ -51,7 +51,7 @@ def line_curvature(
     cells : (R, C) bool, row by row.
     sides_px : (M, 2) lengths of the cell's sides along row and column.
     """
-    rules = CurvatureRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, BENT_RAD, LINE_REACH)
+    rules = CurvatureRules(DECAY, MIN_CORNER_SIGMA_PX, FREE, CURVED_RAD, LINE_REACH)
     return line_curvatures(pixels, sigma_px, cells, sides_px, rules)
 
 

@@ -47,7 +47,7 @@ PAPER_SIGMAS = 0.0
 """The same where it is known how bright it is beyond: the model holds as far as the line."""
 
 
-LINES_BESIDE = ((-1, 0), (1, 0), (0, 1), (0, -1))
+NEIGHBOUR_LINES = ((-1, 0), (1, 0), (0, 1), (0, -1))
 """Where, in rows and columns, the lines before and after line 1 and line 2 have their corners."""
 
 
@@ -104,7 +104,7 @@ def tilted(geometry: Geometry, cells: BoolArray) -> Geometry:
     own = geometry.sides / np.where(length > 0.0, length, np.nan)
     sides[1:-1, 1:-1][cells] = own
     tilts = np.empty(geometry.gaps.shape)
-    for k, ((down, right), line) in enumerate(zip(LINES_BESIDE, (0, 0, 1, 1), strict=True)):
+    for k, ((down, right), line) in enumerate(zip(NEIGHBOUR_LINES, (0, 0, 1, 1), strict=True)):
         there, here = sides[row + 1 + down, column + 1 + right, line], own[:, line]
         tilts[:, line, k % 2] = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
     tilts = np.where(np.isnan(tilts), -tilts[:, :, ::-1], tilts)

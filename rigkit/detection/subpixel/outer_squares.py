@@ -31,7 +31,7 @@ chance makes 1.15."""
 STEPS_SQUARES = np.arange(0.1, 1.6001, 0.05)
 """Where brightness is read, in squares outwards."""
 
-ASIDE_SQUARES = 0.4
+LATERAL_SQUARES = 0.4
 """And so far to both sides of the edge, in squares: near the middles of the squares, where blur leaves most of their
 difference, but still inside where the edge is bent."""
 
@@ -42,7 +42,7 @@ GOES_ON, CUT = -0.4, 0.8
 """Where the difference comes back the other way round, by this part of the contrast, the board goes on; but squares
 that end so early, in squares, are cut, and what differs beyond is something else."""
 
-NEAR_WITNESS = 2.5
+MAX_REFERENCE_RATIO = 2.5
 """A corner that tells what lies beyond another one lies so near to it, in sides of its cell: paper is alike there."""
 
 SEEN = 0.8413
@@ -95,13 +95,13 @@ def beside_paper(geometry: Geometry, fit: EdgeFit, owner: IntArray) -> BoolArray
     blurred = TAIL_SIGMAS * fit.blur[:, None] > (1.0 - WINDOW_REACH) * geometry.gaps.reshape(-1, 4)
     ends = geometry.ends.reshape(-1, 4)
     relative = fit.residual / np.where(good, fit.contrast, np.inf)
-    usual = np.full(len(soft), np.inf)
+    typical = np.full(len(soft), np.inf)
     # Those that have corners on all sides; of a board that has none, all.
     inner = good & ~ends.any(axis=1)
     for k in np.flatnonzero(soft).tolist():
         mine = owner == k
-        usual[k] = upper_median(relative[mine & (inner if (inner & mine).any() else good)])
-    suspect = relative > SUSPECT_RESIDUAL * usual[owner]
+        typical[k] = upper_median(relative[mine & (inner if (inner & mine).any() else good)])
+    suspect = relative > SUSPECT_RESIDUAL * typical[owner]
     return good & np.asarray((ends & (blurred | suspect[:, None])).any(axis=1))
 
 
@@ -136,12 +136,12 @@ def outer_squares(
 def _rules() -> PaperRules:
     return PaperRules.of(
         steps=STEPS_SQUARES,
-        aside=ASIDE_SQUARES,
+        lateral=LATERAL_SQUARES,
         first=FIRST,
         last=LAST,
         goes_on=GOES_ON,
         cut=CUT,
-        near_witness=NEAR_WITNESS,
+        near_witness=MAX_REFERENCE_RATIO,
         seen=SEEN,
         max_paper=MAX_PAPER,
     )

@@ -20,7 +20,7 @@ MIN_SCATTER_CORNERS, MIN_DIFFERENCES = 12, 16
 UNEXPLAINED = 1.25
 """A scatter about the lattice less than this times the expected one is what chance makes of fifty corners."""
 
-STRONG_BEND = 0.25
+STRONG_CURVATURE = 0.25
 """Neighbouring steps that differ by more than this, relative to the shorter, are a lens's: a difference of order 6 of
 what turns, or grows, by that much a cell is some hundredths of a pixel in cells of 50 px, as much as good corners
 scatter."""
@@ -61,7 +61,7 @@ def scatter_factors(pixels: FloatArray, sigma_px: FloatArray, parts: Sequence[tu
     factors = excess_scatter(pixels, sigma_px, parts)
     for k in np.flatnonzero(factors > UNEXPLAINED).tolist():
         part = parts[k]
-        if any(change.every > STRONG_BEND for change in spacing_changes(pixels[part])):
+        if any(change.every > STRONG_CURVATURE for change in spacing_changes(pixels[part])):
             calmest = np.fmin.reduce([_mixed_roughness(pixels[part], sigma_px[part], *orders) for orders in MIXED])
             factors[k] = max(np.fmin(factors[k], calmest), 1.0)
     return factors

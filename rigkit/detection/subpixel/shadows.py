@@ -17,11 +17,11 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.saddles.response import FloatImage, GreyImage
 from rigkit.kernels.light import LightRules, fit_light_steps, lit_unevenly
 
-SEEN_ALONG, SEEN_ASIDE = np.array([0.15, 0.35]), 0.12
+SAMPLED_ALONG, SAMPLED_LATERAL = np.array([0.15, 0.35]), 0.12
 """Where the light on opposite arms is compared: so far along them and aside, in sides of the cell. Beside the end of a
 board, where squares may be cut, only the nearer ones are looked at."""
 
-MIN_SHADOW_ASIDE_PX = 1.0
+MIN_SHADOW_LATERAL_PX = 1.0
 """Nearer to a line its blur is seen, and nothing else."""
 
 UNEVEN_LIGHT = 0.4
@@ -89,24 +89,26 @@ class LightSteps:
 
 
 def beside_shadows(
-    image: GreyImage, pixels: FloatArray, sides: FloatArray, aside: FloatArray, ends: BoolArray
+    image: GreyImage, pixels: FloatArray, sides: FloatArray, lateral: FloatArray, ends: BoolArray
 ) -> BoolArray:
     """Return which of the corners `pixels` (N, 2) of cells with `sides` (N, 2, 2) are lit unevenly.
 
-    `aside` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
+    `lateral` (N,) : how far from the lines brightness may be read, px, at most; `ends` (N,) : where the board may end.
     """
-    return lit_unevenly(image, pixels, sides, aside, ends, SEEN_ALONG, SEEN_ASIDE, MIN_SHADOW_ASIDE_PX, UNEVEN_LIGHT)
+    return lit_unevenly(
+        image, pixels, sides, lateral, ends, SAMPLED_ALONG, SAMPLED_LATERAL, MIN_SHADOW_LATERAL_PX, UNEVEN_LIGHT
+    )
 
 
 def light_steps(
-    image: GreyImage, start: FloatArray, sides: FloatArray, curvature: FloatArray, blur: float, aside: FloatArray
+    image: GreyImage, start: FloatArray, sides: FloatArray, curvature: FloatArray, blur: float, lateral: FloatArray
 ) -> tuple[LightSteps, BoolArray]:
     """Return the steps of the light in the windows of corners near `start` (N, 2), and which were found.
 
     `sides` (N, 2, 2) and `curvature` (N, 2) of the lines as in `Geometry`, `blur` about that of their edges, px; pixels
-    further than `aside` (N,) px from both lines are not used.
+    further than `lateral` (N,) px from both lines are not used.
     """
-    fitted = fit_light_steps(image, start, sides, curvature, aside, blur, MAX_LIGHT_STEP, LIGHT_RULES)
+    fitted = fit_light_steps(image, start, sides, curvature, lateral, blur, MAX_LIGHT_STEP, LIGHT_RULES)
     _, _, sigma_px, towards, place, width, left, found = fitted.T
     step = LightSteps(
         centre=np.rint(start),

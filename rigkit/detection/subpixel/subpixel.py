@@ -25,7 +25,7 @@ from rigkit.detection.subpixel.refined import RefinedLattice
 from rigkit.detection.subpixel.scatter import scatter_factors
 
 Part = tuple[slice, slice]
-Promise = Callable[[RefinedLattice, Sequence[tuple[Lattice, RefinedLattice]]], float]
+EvidenceScore = Callable[[RefinedLattice, Sequence[tuple[Lattice, RefinedLattice]]], float]
 """How much of the evidence that a lattice is a board one fit of it shows, beside others that are placed (as they were
 found, and as they are): above 0 it may be one."""
 
@@ -51,15 +51,15 @@ more; one sample of a board that is found whole besides has -4.6."""
 def refine(
     image: GreyImage,
     lattices: Sequence[Lattice],
-    promise: Promise = lambda *_: np.inf,
+    evidence_score: EvidenceScore = lambda *_: np.inf,
     *,
     radius_px: float = LAST_PASS[0],
 ) -> list[RefinedLattice]:
     """Return `lattices` with their corners placed by the edge model on the full-resolution grey `image`.
 
     Corners whose fit fails or that contradict their neighbours are dropped; corners in empty cells that the fit
-    confirms are added. Lattices with small squares that the `promise` of one fit is too bad of are left as that has
-    them. Pixels further from a corner than `radius_px` are not used.
+    confirms are added. Lattices with small squares that the `evidence_score` of one fit is too bad of are left as
+    that has them. Pixels further from a corner than `radius_px` are not used.
     """
     if not lattices:
         return []
@@ -80,15 +80,15 @@ def refine(
         radius_px=radius_px,
     )
     reached = _reached_by_others(start.known, gaps, blur, stack.parts)
-    apart = np.flatnonzero(~reached).tolist()
-    if len(apart) == len(lattices):
-        return sheet.placed(before, (shape.sides, gaps), blur, apart, aslant=False)
+    unreached = np.flatnonzero(~reached).tolist()
+    if len(unreached) == len(lattices):
+        return sheet.placed(before, (shape.sides, gaps), blur, unreached, aslant=False)
     out = list[RefinedLattice | None](None for _ in lattices)
-    if apart:
-        mine = sheet.corners_of(apart)
+    if unreached:
+        mine = sheet.corners_of(unreached)
         own = mine[start.known]
-        settled = sheet.placed(before.without(~mine), (shape.sides[own], gaps[own]), blur, apart, aslant=False)
-        for number, item in zip(apart, settled, strict=True):
+        settled = sheet.placed(before.without(~mine), (shape.sides[own], gaps[own]), blur, unreached, aslant=False)
+        for number, item in zip(unreached, settled, strict=True):
             out[number] = item
     # Of the others it matters where exactly the neighbouring lines are, whose edges reach into the windows.
     close = np.flatnonzero(reached).tolist()
@@ -96,16 +96,16 @@ def refine(
     their = theirs[start.known]
     windows = sheet.windows(before.without(~theirs), (shape.sides[their], gaps[their]), blur, aslant=True)
     placed = [(lattices[k], item) for k, item in enumerate(out) if item is not None]
-    nearer, promising = _nearer_pass(sheet, windows, close, lambda item: promise(item, placed))
+    nearer, plausible = _nearer_pass(sheet, windows, close, lambda item: evidence_score(item, placed))
     for number in close:
         # Clutter in the background is small, and would cost as much as the board.
         out[number] = sheet.cut(nearer, number)
-    if promising:
-        before = nearer.without(~sheet.corners_of(promising))
-        blur = _typical_blur(before, [stack.parts[k] for k in promising])
+    if plausible:
+        before = nearer.without(~sheet.corners_of(plausible))
+        blur = _typical_blur(before, [stack.parts[k] for k in plausible])
         shape = fit_cells(before.lattice.pixels, before.lattice.known)
-        again = sheet.placed(before, (shape.sides, shape.gaps()), blur, promising, aslant=True)
-        for number, item in zip(promising, again, strict=True):
+        again = sheet.placed(before, (shape.sides, shape.gaps()), blur, plausible, aslant=True)
+        for number, item in zip(plausible, again, strict=True):
             out[number] = item
     return [item for item in out if item is not None]
 
@@ -270,25 +270,25 @@ def _beside_paper(
 
 
 def _nearer_pass(
-    sheet: _Stacked, windows: _Windows, numbers: Sequence[int], promise: Callable[[RefinedLattice], float]
+    sheet: _Stacked, windows: _Windows, numbers: Sequence[int], evidence_score: Callable[[RefinedLattice], float]
 ) -> tuple[RefinedLattice, list[int]]:
     """Return where the corners are, in the windows of the last pass, and the numbers of the lattices (of `numbers`)
-    with a good `promise`; corners that fail are left out. Only beside these it is asked what lies beyond."""
+    with a good `evidence_score`; corners that fail are left out. Only beside these it is asked what lies beyond."""
 
-    def promising(item: RefinedLattice, numbers: Sequence[int], more: float) -> list[int]:
+    def plausible(item: RefinedLattice, numbers: Sequence[int], more: float) -> list[int]:
         parts = ((k, item.cut(*sheet.parts[k])) for k in numbers)
-        return [k for k, mine in parts if mine.lattice.count > 0 and promise(mine) > -more]
+        return [k for k, mine in parts if mine.lattice.count > 0 and evidence_score(mine) > -more]
 
     fit = windows.fit(sheet.image, sheet.signs, slice(None), windows.geometry, LAST_PASS[1:])
     nearer = _spread(windows.lattice, fit, fit.sigma_px)
-    good = promising(nearer, numbers, BESIDE_PAPER)
+    good = plausible(nearer, numbers, BESIDE_PAPER)
     if not good:
         return nearer, []
     known = windows.lattice.known
     mine = _owners(known, [sheet.parts[k] for k in numbers])
     after = _beside_paper(sheet, windows, fit, mine, sheet.corners_of(good)[known])
     nearer = nearer if after is fit else _spread(windows.lattice, after, after.sigma_px)
-    return nearer, promising(nearer, good, MORE_EVIDENCE)
+    return nearer, plausible(nearer, good, MORE_EVIDENCE)
 
 
 def _last_pass(sheet: _Stacked, windows: _Windows, parts: Sequence[Part]) -> tuple[RefinedLattice, FloatArray]:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
-from rigkit.detection.lattice.local_fit import fit_cells, foretold
+from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import BoardWindow, Surroundings, extended
 from rigkit.detection.subpixel.edge_fit import BLUR_RANGE, MAX_BLUR_CHANGE, MAX_MOVE_PX, ROUNDING_VARIANCE
@@ -54,7 +54,7 @@ AROUND = 0.25
 LIGHT_SQUARES = 2.0
 """Light and blur are interpolated between values so far apart, squares."""
 
-TOLD_SQUARES = 1.5
+MAX_EXTRAPOLATION_SQUARES = 1.5
 """What is told by corners goes on so far beyond them, squares."""
 
 END_SIGMA, PAPER_SIGMA, BLUR_SIGMA = 0.1, 1.0, 0.1
@@ -112,7 +112,7 @@ class WholeBoard:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Sought:
+class _SheetParameters:
     """What is sought: corners (R, C, 2), ends (2, 2), paper (4,), blur s, and light, contrast and by how much the blur
     is wider, relative, (3, r, c) at nodes LIGHT_SQUARES apart."""
 
@@ -140,7 +140,7 @@ def placed_together(image: GreyImage, item: RefinedLattice) -> RefinedLattice:
     outer[known] = outer_squares(image, geometry, *fitted).reshape(-1, 4)
     if not known.all():
         start = start.copy()
-        start[~known] = foretold(start, ~known).pixels
+        start[~known] = predicted(start, ~known).pixels
     around = Surroundings.read(outer, start, blur, ~known)
     alone, noise = (float(np.sqrt(np.mean(part[known] ** 2))) for part in (item.residual, item.noise))
     pixels, sigma_px = lattice.pixels.copy(), item.sigma_px / item.scatter
@@ -176,7 +176,7 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     start = (pixels - window.first) / scale
     rows, columns = pixels.shape[:2]
     light = [int(np.ceil((count - 1) / LIGHT_SQUARES)) + 1 for count in (rows, columns)]
-    state, there = _Sought(start, window.ends, np.zeros(4), blur / scale, np.zeros((3, *light))), ~around.holes
+    state, there = _SheetParameters(start, window.ends, np.zeros(4), blur / scale, np.zeros((3, *light))), ~around.holes
     for turn in range(MAX_STEPS):
         step = _step(window, state, start=turn == 0)
         if step is None:
@@ -190,7 +190,9 @@ def fit_whole_board(image: GreyImage, pixels: FloatArray, blur: float, around: S
     return None
 
 
-def _step(window: BoardWindow, state: _Sought, *, start: bool) -> tuple[_Sought, FloatArray, FloatArray, float] | None:
+def _step(
+    window: BoardWindow, state: _SheetParameters, *, start: bool
+) -> tuple[_SheetParameters, FloatArray, FloatArray, float] | None:
     """Return the state after a Gauss-Newton step, how far each corner moved, its spread, and the residual before it."""
     size = state.pixels.shape[0], state.pixels.shape[1]
     coefficients = spline_coefficients(extended(state.pixels, MAP_RINGS))
@@ -215,7 +217,7 @@ def _step(window: BoardWindow, state: _Sought, *, start: bool) -> tuple[_Sought,
     spread = state.blur**2 * cv2.Laplacian(pattern, cv2.CV_32F)
     seen, on = pattern + wider * spread, used.astype(np.float32)
     rest, weight = on * (window.grey - base - contrast * seen), on * contrast
-    corners = Shares.at(places, size, spacing=1.0, beyond=TOLD_SQUARES, cubic=True, margin=len(short) // 2)
+    corners = Shares.at(places, size, spacing=1.0, beyond=MAX_EXTRAPOLATION_SQUARES, cubic=True, margin=len(short) // 2)
     whole = np.stack([weight * plane for plane in (*beyond, spread)])
     everywhere = np.array([[0, 0, rest.shape[1] - 1, rest.shape[0] - 1]])
     blocks = (
@@ -227,8 +229,8 @@ def _step(window: BoardWindow, state: _Sought, *, start: bool) -> tuple[_Sought,
 
 
 def _solved(
-    window: BoardWindow, state: _Sought, products: FloatArray, right: FloatArray, rest: Picture, count: int
-) -> tuple[_Sought, FloatArray, FloatArray, float] | None:
+    window: BoardWindow, state: _SheetParameters, products: FloatArray, right: FloatArray, rest: Picture, count: int
+) -> tuple[_SheetParameters, FloatArray, FloatArray, float] | None:
     """Return what `_step` does, from the normal equations without what is known beforehand."""
     shape, unknowns, corners = state.pixels.shape, len(right), state.pixels.size
     variance = float((rest.astype(np.float64) ** 2).sum()) / max(count - unknowns, 1)
@@ -249,7 +251,7 @@ def _solved(
     spread = np.sqrt(np.maximum(np.diag(inverse)[:corners].reshape(shape).mean(axis=2), 0.0))
     moves = step[:corners].reshape(shape).clip(-MAX_MOVE_PX, MAX_MOVE_PX)
     blur = state.blur * (1.0 + float(np.clip(step[-1], -MAX_BLUR_CHANGE, MAX_BLUR_CHANGE)))
-    after = _Sought(
+    after = _SheetParameters(
         state.pixels + moves,
         state.ends + (OUTWARDS * step[ends].clip(-END_SIGMA, END_SIGMA)).reshape(2, 2),
         (state.paper + step[paper]).clip(-MAX_PAPER, MAX_PAPER),
@@ -259,7 +261,9 @@ def _solved(
     return after, np.hypot(moves[..., 0], moves[..., 1]), spread, float(np.sqrt(variance))
 
 
-def _with_light(grey: Picture, pattern: Picture, used: BoolArray, state: _Sought, beyond: Sequence[Picture]) -> _Sought:
+def _with_light(
+    grey: Picture, pattern: Picture, used: BoolArray, state: _SheetParameters, beyond: Sequence[Picture]
+) -> _SheetParameters:
     """Return the state with the light, contrast and paper that fit best if they are everywhere the same."""
     columns = np.stack([np.ones(np.count_nonzero(used)), *(part[used] for part in (pattern, *beyond))], axis=1)
     normal = columns.T @ columns + np.diag([0.0, FREE, 1.0, 1.0, 1.0, 1.0])

@@ -21,7 +21,7 @@ MIN_LIKENESS = 0.7
 """Correlation of a tag with its code at least. Of a code of 36 bits, bits at random reach 0.7 with one of 600 tags once
 in some thousand squares; blur as wide as a module still leaves 0.8."""
 
-MIN_FORETOLD_LIKENESS = 0.6
+MIN_PREDICTED_LIKENESS = 0.6
 """The same where one tag is foretold and no other, nor this one turned, is more like what is seen: tags of 1.2 px a
 module at the rim of a fisheye, blurred by 0.7 px, have 0.63 and others 0.5 there (RENDERED)."""
 

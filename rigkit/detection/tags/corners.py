@@ -36,7 +36,7 @@ from rigkit.detection.subpixel.correlation import factor_rules
 from rigkit.detection.subpixel.edge_fit import edge_rules
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
-from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_FORETOLD_LIKENESS
+from rigkit.detection.tags.codes import MIN_CODE_CONTRAST, MIN_PREDICTED_LIKENESS
 from rigkit.detection.tags.placing import TagBoard
 from rigkit.detection.tags.surface import MAX_LEVERAGE, NEAREST_DEPTH, POINTS_A_TERM, SmoothMap, seen_surface
 from rigkit.detection.tags.whole import NARROW_BLURS, WHOLE_ROUNDS, with_whole_tags
@@ -48,7 +48,7 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 MIN_TAG_CORNERS = 4
 """One tag."""
 
-MIN_FORETELLING_CORNERS = 8
+MIN_PREDICTING_CORNERS = 8
 """Corners that a missing one can be foretold from: those of two tags."""
 
 MAX_PREDICTED_GAIN = 4.0
@@ -72,11 +72,11 @@ BETTER_KNOWN, ROUGH_PX = 0.5, 0.25
 else what differs is as wrong now. And all are fitted again where those scattered by more: saddles never do, only
 corners of outlines, which lie in whole pixels."""
 
-BENT_SIGMAS = 0.3
+CURVED_SIGMAS = 0.3
 """Corners are fitted again where their lines bend otherwise by this part of their sigmas: left alone it would add a
 twentieth to their errors."""
 
-TAG_OUTLIER, JUDGING_GAIN = 6.0, 1.5
+TAG_OUTLIER, OUTLIER_TEST_GAIN = 6.0, 1.5
 """A corner that lies off where those around have it by more than this, times what is usual and its own standard
 deviation together, is covered in part; where their prediction has no larger gain: at the ends of a board it errs."""
 
@@ -122,7 +122,7 @@ def _rules(border: float, mirrored: bool, rounded: bool) -> TagCornerRules:
         min_contrast=MIN_EDGE_CONTRAST,
         rough_px=ROUGH_PX,
         better_known=BETTER_KNOWN,
-        bent_sigmas=BENT_SIGMAS,
+        bent_sigmas=CURVED_SIGMAS,
         wide_blur=WIDE_BLUR,
         max_gain=MAX_PREDICTED_GAIN,
         margin_px=MARGIN_PX,
@@ -132,12 +132,12 @@ def _rules(border: float, mirrored: bool, rounded: bool) -> TagCornerRules:
         max_sigma_cells=MAX_SIGMA_CELLS,
         narrow_blurs=NARROW_BLURS,
         code_contrast=MIN_CODE_CONTRAST,
-        likeness=MIN_FORETOLD_LIKENESS,
+        likeness=MIN_PREDICTED_LIKENESS,
         scatter_floor=SCATTER_FLOOR_PX,
         outlier=TAG_OUTLIER,
-        judging_gain=JUDGING_GAIN,
+        judging_gain=OUTLIER_TEST_GAIN,
         displaced_cells=DISPLACED_CELLS,
-        min_foretelling=MIN_FORETELLING_CORNERS,
+        min_predicting=MIN_PREDICTING_CORNERS,
         min_guiding=MIN_GUIDE_CORNERS,
     )
 
@@ -149,7 +149,7 @@ class _Fitter:
         self.image, self.tags, self.camera = image, tags, camera
         joined = tags.pattern.corner_squares
         rules = _rules(tags.pattern.border / tags.codes.modules, joined, image.dtype == np.uint8)
-        self.fit = TagBoardFit(image, tags.told, rules, pixels)
+        self.fit = TagBoardFit(image, tags.packed, rules, pixels)
         # A camera's map is that of one state; what the corners tell alone needs nobody between the rounds.
         self.rounds = MAX_TAG_ROUNDS if camera is None else 1
 

@@ -16,7 +16,7 @@ from rigkit.core.detections import grid_turned
 from rigkit.core.patterns.aprilgrid import AprilGrid
 from rigkit.core.patterns.charuco import Charuco
 from rigkit.detection.lattice.lattice import Lattice
-from rigkit.detection.lattice.local_fit import foretold
+from rigkit.detection.lattice.local_fit import predicted
 from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.tags.codes import Codes, TagCode, excess_likeness, read_tags, transferred
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
@@ -31,10 +31,10 @@ LIKE_BETTER_ROWS = 0.5
 """A row of markers agrees with a place if they are like their codes by so much, at least, of what those of the better
 half of the rows are: of a board of the other pattern, every second row is by 0."""
 
-MAX_FORETOLD_GAIN = 8.0
+MAX_PREDICTION_GAIN = 8.0
 """Corners beyond those known are foretold up to this standard deviation, for corners of standard deviation 1."""
 
-MARKERS_BESIDE = 2
+ADJACENT_MARKERS = 2
 """Markers that touch a corner within the board."""
 
 
@@ -88,7 +88,7 @@ def _place_together(image: GreyImage, lattice: Lattice, board: Board) -> tuple[i
     return (turns, shift - 1) if agreeing.mean() >= AGREEING_MARKERS else None
 
 
-def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
+def between_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatArray:
     """Return rough corners (R, C, 2) of a ChArUco board, NaN where unknown, with those between two markers that are
     read where the known corners foretell them: what covers a corner covers one of the two."""
     places = _places(board)
@@ -102,8 +102,8 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
         wanted = np.zeros_like(missing)
         wanted[rows[beside], columns[beside]] = True
         wanted &= missing
-        guess, ahead = grown.copy(), foretold(grown, wanted)
-        guess[wanted] = np.where(ahead.gain[:, None] < MAX_FORETOLD_GAIN, ahead.pixels, np.nan)
+        guess, ahead = grown.copy(), predicted(grown, wanted)
+        guess[wanted] = np.where(ahead.gain[:, None] < MAX_PREDICTION_GAIN, ahead.pixels, np.nan)
         quads = guess[rows[beside], columns[beside]]
         usable = np.isfinite(quads).all(axis=(1, 2))
         beside, quads = beside[usable], quads[usable]
@@ -119,7 +119,7 @@ def beside_markers(image: GreyImage, pixels: FloatArray, board: Board) -> FloatA
         grown[rows[own], columns[own]] = guess[rows[own], columns[own]]
     markers = np.zeros(grown.shape[:2], np.int64)
     np.add.at(markers, (rows[read], columns[read]), 1)
-    grown[(markers < MARKERS_BESIDE) & np.isnan(np.pad(pixels[..., 0], 1, constant_values=np.nan))] = np.nan
+    grown[(markers < ADJACENT_MARKERS) & np.isnan(np.pad(pixels[..., 0], 1, constant_values=np.nan))] = np.nan
     return grown[1:-1, 1:-1]
 
 
@@ -162,8 +162,8 @@ def _outlines(image: GreyImage, pixels: FloatArray, squares: IntArray, board: Bo
     rows, columns = (squares[:, k, None] + 1 + np.array(step) for k, step in ((1, (0, 0, 1, 1)), (0, (0, 1, 1, 0))))
     wanted[rows, columns] = True
     wanted &= np.isnan(grown[..., 0])
-    ahead = foretold(grown, wanted)
-    grown[wanted] = np.where(ahead.gain[:, None] < MAX_FORETOLD_GAIN, ahead.pixels, np.nan)
+    ahead = predicted(grown, wanted)
+    grown[wanted] = np.where(ahead.gain[:, None] < MAX_PREDICTION_GAIN, ahead.pixels, np.nan)
     quads = grown[rows, columns]
     inside = ((quads >= 0.0) & (quads <= np.array(image.shape[::-1]) - 1.0)).all(axis=(1, 2))
     out = np.full(quads.shape, np.nan)

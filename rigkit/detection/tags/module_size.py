@@ -123,8 +123,8 @@ def _edges(image: GreyImage, maps: FloatArray, outline: float, count: int, pitch
     out = np.arange(0.5 * count, 0.5 * pitch + 0.5 / SAMPLES, 1.0 / SAMPLES)
     line = np.arange(count) - 0.5 * (count - 1)
     right = np.stack(np.broadcast_arrays(out[:, None], line), axis=-1)
-    ways = np.stack([right, -right, right[..., ::-1], -right[..., ::-1]])
-    seen = sample(image, transferred(maps, 0.5 + ways.reshape(-1, 2) / outline))
+    neighbours = np.stack([right, -right, right[..., ::-1], -right[..., ::-1]])
+    seen = sample(image, transferred(maps, 0.5 + neighbours.reshape(-1, 2) / outline))
     levels = np.median(seen.reshape(len(maps), 4, len(out), count), axis=(0, 1, 3))
     half = 0.5 * (levels.min() + levels[-1])
     # The border is darkest; from there on it is sought where the gap begins.

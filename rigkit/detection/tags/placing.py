@@ -51,7 +51,7 @@ class TagBoard:
     places : (R, C, 2) of its corners, in sides of a tag.
     steps : (R, C, 2, 2) how far it is to the corners above and below, right and left, within the tag or across the gap.
     signs : (R, C) +1 where brightness grows with the angle across the line along the row, else -1.
-    told : the same as kernels take it.
+    packed : the same as kernels take it.
     """
 
     board: Board
@@ -62,7 +62,7 @@ class TagBoard:
     places: FloatArray
     steps: FloatArray
     signs: FloatArray
-    told: TagsOfBoard
+    packed: TagsOfBoard
 
     @staticmethod
     def of(board: Board) -> TagBoard:
@@ -94,7 +94,7 @@ def _tag_board(board: Board) -> TagBoard:
         places=places,
         steps=steps,
         signs=signs,
-        told=TagsOfBoard.of(
+        packed=TagsOfBoard.of(
             places=places.reshape(-1, 2),
             steps=steps.reshape(-1, 2, 2),
             signs=signs.ravel(),

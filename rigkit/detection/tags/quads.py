@@ -100,7 +100,7 @@ def _proper(quads: FloatArray, lengths: IntArray, shape: tuple[int, ...]) -> Flo
 def _outwards(quads: FloatArray) -> FloatArray:
     """Return the quads (N, 4, 2) with edges where the picture has them: outlines run through the middles of the
     outermost dark pixels, half a pixel inside."""
-    away = [quads - np.roll(quads, way, axis=1) for way in (1, -1)]
+    away = [quads - np.roll(quads, sign, axis=1) for sign in (1, -1)]
     lengths = [np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-9) for side in away]
     return np.asarray(quads + 0.5 * (away[0] / lengths[0] + away[1] / lengths[1]))
 
@@ -116,7 +116,7 @@ def _agreeing(corners: FloatArray, place: IntArray, step: float) -> BoolArray:
     # Where each tag (first index) has the others, in its own sides from its own first corner, and where it should.
     has = np.stack([transferred(inverse[k : k + 1], middle)[0] for k in range(len(middle))])
     should = tag - tag[:, None] + 0.5
-    way = np.linalg.norm(tag - tag[:, None], axis=2)
-    near = np.linalg.norm(has - should, axis=2) < NEAR_PLACE * np.maximum(way, step)
+    sign = np.linalg.norm(tag - tag[:, None], axis=2)
+    near = np.linalg.norm(has - should, axis=2) < NEAR_PLACE * np.maximum(sign, step)
     others = max(len(tag) - 1, 1)
     return np.asarray((np.count_nonzero(near, axis=0) - 1 >= AGREEING_OTHERS * others) | (len(tag) == 1))

@@ -28,7 +28,7 @@ NEAREST_DEPTH = 0.1
 """A perspective in which a point of the board is nearer than this part of the mean distance is no camera's: the lens is
 a wide fisheye."""
 
-BENDS = (0.0, 0.15, 0.3, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
+CURVATURES = (0.0, 0.15, 0.3, 0.45, 0.55, 0.65, 0.75, 0.85, 0.92)
 """Of half a space, what the outermost point may lie off the axis of a fisheye."""
 
 SMALL_ANGLE, DIFFERENCE = 1e-4, 0.02
@@ -64,11 +64,11 @@ class SmoothMap:
 
     def at(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), NaN where the base has none."""
-        return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=False)
+        return self._polynomial.added_to(self._base and self._base(wanted), wanted, most_certain=False)
 
     def beyond(self, wanted: FloatArray) -> TagSurface:
         """Return the map at `wanted` (M, 2), which may lie outside the points."""
-        return self._polynomial.added_to(self._base and self._base(wanted), wanted, surest=True)
+        return self._polynomial.added_to(self._base and self._base(wanted), wanted, most_certain=True)
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Return how far (N,) the points lie off where the others have them, px, and the gain (N,) of those."""
@@ -88,26 +88,26 @@ def wide_perspective(
     """Return the perspective that fits the points best through a lens that may be a fisheye; None where none does.
 
     Rays of a fisheye make angles with its axis, here through `centre` (2,), as pixels have distances from that, r = f
-    theta. Of BENDS for 1 / f, in parts of what would see half a space, the best leaves a smooth rest.
+    theta. Of CURVATURES for 1 / f, in parts of what would see half a space, the best leaves a smooth rest.
     """
     away = pixels - centre
     radius = np.hypot(away[:, 0], away[:, 1])
     best: tuple[float, Callable[[FloatArray], TagSurface]] | None = None
-    for part in BENDS:
+    for part in CURVATURES:
         bend = part * 0.5 * np.pi / max(float(radius.max()), 1.0)
         angle = bend * radius
         straight = away * np.where(angle > SMALL_ANGLE, np.tan(angle) / np.maximum(angle, SMALL_ANGLE), 1.0)[:, None]
         matrix, nearest = perspective(places, straight)
         if not nearest > NEAREST_DEPTH:
             continue
-        seen = partial(_bent, matrix, bend, centre)
+        seen = partial(_curved, matrix, bend, centre)
         off = float(np.mean((seen(places) - pixels) ** 2))
         if best is None or off < best[0]:
             best = off, partial(_surface_of, seen)
     return None if best is None else best[1]
 
 
-def _bent(homography: FloatArray, bend: float, centre: FloatArray, places: FloatArray) -> FloatArray:
+def _curved(homography: FloatArray, bend: float, centre: FloatArray, places: FloatArray) -> FloatArray:
     """Return where a lens of 1 / f `bend` shows what a homography does of places (M, 2)."""
     straight = projected(homography, places).pixels
     length = bend * np.hypot(straight[:, 0], straight[:, 1])

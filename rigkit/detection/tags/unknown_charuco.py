@@ -40,7 +40,7 @@ SURE_OF_KIND = 2
 OFF_SQUARE = 0.2
 """A marker's middle lies within so many squares of that of its square, as another marker beside it has it."""
 
-MAX_SQUARES_APART = 2
+MAX_SQUARE_DISTANCE = 2
 """Squares, along rows and columns, over which one marker says where another is."""
 
 WITHIN_MARKER = 0.25
@@ -52,7 +52,7 @@ Markers: TypeAlias = tuple[IntArray, IntArray, float]
 
 
 @dataclass(eq=False, slots=True)
-class MarkerSightings:
+class MarkerObservations:
     """The markers of all images, by the squares they lie in.
 
     Attributes
@@ -98,9 +98,9 @@ def _read_best(seen: dict[str, ReadMarkers]) -> dict[str, ReadMarkers]:
     for name, markers in seen.items():
         middle, best = markers.corners.mean(axis=1), np.ones(len(markers.numbers), np.bool_)
         for other in (others for key, others in seen.items() if key != name):
-            apart = np.linalg.norm(middle[:, None] - other.corners.mean(axis=1), axis=2)
+            separation = np.linalg.norm(middle[:, None] - other.corners.mean(axis=1), axis=2)
             reach = WITHIN_MARKER * np.linalg.norm(other.corners[:, 2] - other.corners[:, 0], axis=1)
-            best &= ~((apart < reach) & (other.likeness > markers.likeness[:, None])).any(axis=1)
+            best &= ~((separation < reach) & (other.likeness > markers.likeness[:, None])).any(axis=1)
         if best.any():
             own[name] = ReadMarkers(markers.corners[best], markers.numbers[best], markers.likeness[best])
     return own
@@ -123,7 +123,7 @@ def _in_squares(quads: FloatArray, numbers: IntArray) -> Markers | None:
         return None
     squares = np.rint(offset / step).astype(np.int64)
     near = (np.abs(offset / step - squares) < OFF_SQUARE).all(axis=2) & (
-        np.abs(squares).max(axis=2) <= MAX_SQUARES_APART
+        np.abs(squares).max(axis=2) <= MAX_SQUARE_DISTANCE
     )
     # White squares touch at corners.
     near &= (squares.sum(axis=2) % 2 == 0) & (squares != 0).any(axis=2)
@@ -149,7 +149,7 @@ def laid_out(near: BoolArray, steps: IntArray) -> Iterator[tuple[IntArray, IntAr
         yield np.array(list(places)), np.array(list(places.values()))
 
 
-def guessed_charuco(seen: MarkerSightings, exactly: int | None = None) -> list[Board]:
+def guessed_charuco(seen: MarkerObservations, exactly: int | None = None) -> list[Board]:
     """Return the ChArUco board that most markers are of, with squares of 1 mm: one of either pattern where the markers
     fit both, none where no board is told. It has `exactly` so many rows, or those that were read."""
     if not seen.markers:

@@ -108,7 +108,7 @@ Counted: TypeAlias = tuple[_SeenTags, int, int, IntArray]
 
 
 @dataclass(eq=False, slots=True)
-class TagSightings:
+class TagObservations:
     """The tags of all images, as `seen`; `kinds` has the sum of likenesses of each kind. Inverted tags are white on
     black."""
 
@@ -177,7 +177,7 @@ class TagSightings:
         own = order[np.unique(codes.number[order], return_index=True)[1]]
         upright = quads[own[:, None], (codes.turns[own, None] + np.arange(4)) % 4]
         shown = False
-        for members, places in _beside_each_other(upright):
+        for members, places in _adjacent_tags(upright):
             seen = _SeenTags(
                 image=index,
                 kind=(*family, True),
@@ -252,7 +252,7 @@ def _steps(upright: FloatArray, places: IntArray) -> FloatArray:
     return np.sqrt(ratio / (ratio - 1.0))
 
 
-def _beside_each_other(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+def _adjacent_tags(quads: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield groups of upright tags with corners (N, 4, 2) that stand in rows and columns: which (M,), and their places
     (M, 2) in steps."""
     inverse = np.asarray(np.linalg.inv(maps_of_quads(quads)), np.float64)
@@ -287,7 +287,7 @@ class GuessedGrid:
     either: Board | None = None
 
 
-def guessed_grids(seen: TagSightings) -> list[GuessedGrid]:
+def guessed_grids(seen: TagObservations) -> list[GuessedGrid]:
     """Return the AprilGrids of the kind that most tags are of, those first that most tags are of."""
     if not seen.seen:
         return []

@@ -41,11 +41,11 @@ smaller and blurred until borders were 3.3 s wide, held-out errors fall from 0.0
 px either way. Wider ones are better alone (0.19 px; 0.24 px whole): printed modules and saturated paper are no model to
 a pixel."""
 
-BEND_SIGMAS = 0.3
+CURVATURE_SIGMAS = 0.3
 """The middles of a tag's sides are known beside its corners to this part of what corners are: the bend comes from those
 of three tags or more, and a second difference of theirs has sqrt(6) of their sigma, the sagitta an eighth of that."""
 
-FELT_SIGMAS = 4.0
+EDGE_REACH_SIGMAS = 4.0
 """Edges further from a pixel than this, s, are nothing to it."""
 
 ROUGH_STEP_PX = 0.1
@@ -58,7 +58,7 @@ is not known beforehand, and one fitted a step later than the corners made sigma
 
 def _rules(converged_px: float) -> TagRules:
     return TagRules.of(
-        tail_sigmas=FELT_SIGMAS,
+        tail_sigmas=EDGE_REACH_SIGMAS,
         pixel_kurtosis=PIXEL_KURTOSIS,
         sharp_blur=SHARP_BLUR_PX,
         min_blur=BLUR_RANGE[0],
@@ -104,7 +104,7 @@ def with_whole_tags(
     if not (tag_heights(state.pixels)[1] < narrowest).any():
         return state
     smooth = map_of_state()
-    filled, partly = _foretold(state, smooth.at(places.reshape(-1, 2)).pixels.reshape(places.shape), image.shape)
+    filled, partly = _predicted(state, smooth.at(places.reshape(-1, 2)).pixels.reshape(places.shape), image.shape)
     longer, height = tag_heights(filled)
     narrow = height < narrowest
     row, column = (2 * part for part in np.nonzero(narrow))
@@ -116,7 +116,7 @@ def with_whole_tags(
     found = fit_tags(
         *(image, maps, centres, scales, ink[row // 2, column // 2], breaks, 0.5 * tags.pattern.spacing),
         *(np.full(len(row), blur), step * np.nanmean(state.contrast[mine], axis=1)),
-        *(BEND_SIGMAS * np.maximum(np.nanmedian(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
+        *(CURVATURE_SIGMAS * np.maximum(np.nanmedian(state.sigma_px[mine], axis=1), smooth.scatter()), rules),
     )
     moves = found[:, :8].reshape(-1, 4, 2)
     furthest = np.sqrt((moves**2).sum(axis=2)).max(axis=1)
@@ -137,10 +137,10 @@ def with_whole_tags(
     return replace(state, pixels=pixels, sigma_px=sigma_px, blur=blurs, contrast=contrast)
 
 
-def _foretold(state: BoardState, foretold: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, BoolArray]:
-    """Return the corners (R, C, 2) with those `foretold` of tags of which some are known, if the image has all four,
+def _predicted(state: BoardState, predicted: FloatArray, shape: tuple[int, ...]) -> tuple[FloatArray, BoolArray]:
+    """Return the corners (R, C, 2) with those `predicted` of tags of which some are known, if the image has all four,
     and which tags (R / 2, C / 2) these are."""
-    inside = ((foretold > MARGIN_PX) & (foretold < np.array(shape[::-1]) - 1.0 - MARGIN_PX)).all(axis=2)
+    inside = ((predicted > MARGIN_PX) & (predicted < np.array(shape[::-1]) - 1.0 - MARGIN_PX)).all(axis=2)
     known = state.known
     some, every, fits = (
         how(part.reshape(known.shape[0] // 2, 2, -1, 2), axis=(1, 3))
@@ -148,7 +148,7 @@ def _foretold(state: BoardState, foretold: FloatArray, shape: tuple[int, ...]) -
     )
     partly = some & ~every & fits
     wanted = ~known & np.repeat(np.repeat(partly, 2, axis=0), 2, axis=1)
-    return np.where(wanted[..., None], foretold, state.pixels), partly
+    return np.where(wanted[..., None], predicted, state.pixels), partly
 
 
 def _maps(first: FloatArray, corners: FloatArray, smooth: SmoothMap) -> tuple[FloatArray, FloatArray, FloatArray]:

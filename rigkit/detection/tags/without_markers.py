@@ -16,12 +16,12 @@ import numpy as np
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.boards import Board
 from rigkit.core.patterns.charuco import Charuco
-from rigkit.detection.lattice.local_fit import fit_cells, foretold
+from rigkit.detection.lattice.local_fit import fit_cells, predicted
 from rigkit.detection.saddles.response import GreyImage
 from rigkit.detection.subpixel.board_window import extended
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.refined import RefinedLattice
-from rigkit.detection.subpixel.unsure import unsure
+from rigkit.detection.subpixel.uncertain_corners import uncertain
 from rigkit.detection.subpixel.whole_board import (
     AROUND,
     MAP_RINGS,
@@ -73,7 +73,7 @@ def without_markers(
     light : how much ink takes, from corners hardly elsewhere; without, it is asked of the image.
     """
     # What is half covered is foretold by the others rather than believed.
-    seen = _seen(np.where(unsure(refined.sigma_px)[..., None], np.nan, refined.lattice.pixels))
+    seen = _seen(np.where(uncertain(refined.sigma_px)[..., None], np.nan, refined.lattice.pixels))
     if seen is None:
         return None
     pixels, known, (row, column) = seen
@@ -90,7 +90,7 @@ def without_markers(
     each = int(np.clip(np.ceil(DRAWN_PX * square_px), 8, MAX_SQUARE))
     around_known = cv2.dilate(known.astype(np.uint8), AROUND_CORNER) > 0
     corners, reach = np.stack([known, around_known]), np.array([WINDOW_REACH, 1.0])
-    on_sheet, (used, told) = sheet_places(places, -1.0 - first, each, corners, reach)
+    on_sheet, (used, on_board) = sheet_places(places, -1.0 - first, each, corners, reach)
     marks = _blurred(_ink(board, on_sheet, each, square_px), rest_blur)
     out, here = image.astype(np.float32), (slice(top, top + height), slice(left, left + width))
     if light is None:
@@ -98,7 +98,7 @@ def without_markers(
         squares = white * _blurred(squares, rest_blur) - 2.0 * marks
         light = np.zeros(out.shape, np.float32)
         light[here] = 2.0 * _contrast(out[here], squares, used, SHADE_SQUARES * square_px)
-    out[here] += marks * light[here] * told
+    out[here] += marks * light[here] * on_board
     return WithoutMarkers(out, light)
 
 
@@ -117,7 +117,7 @@ def _seen(pixels: FloatArray) -> tuple[FloatArray, BoolArray, tuple[int, int]] |
         # Ring by ring: far from all that are known polynomials run wild.
         missing = np.isnan(part[..., 0])
         beside = missing & (cv2.dilate((~missing).astype(np.uint8), AROUND_CORNER) > 0)
-        part[beside] = foretold(part, beside).pixels
+        part[beside] = predicted(part, beside).pixels
         if np.isnan(part[beside]).any():
             return None
     areas = fit_cells(part, np.ones_like(known), degree=1).areas()

@@ -34,7 +34,7 @@ from rigkit.detection.subpixel.scatter import scatter_factors
 from rigkit.detection.subpixel.subpixel import refine
 from rigkit.detection.subpixel.whole_board import placed_together
 from rigkit.detection.tags.codes import transferred
-from rigkit.detection.tags.in_squares import beside_markers, place_by_markers
+from rigkit.detection.tags.in_squares import between_markers, place_by_markers
 from rigkit.detection.tags.without_markers import without_markers
 from rigkit.detection.targets.base import Finder, Search
 from rigkit.kernels.boards import Picture
@@ -46,7 +46,7 @@ SAME_CELLS = 0.2
 MIN_VOTES, AGREEING_VOTES = 3, 0.7
 """Corners, and which part of them, that must give a lattice the same place in the board."""
 
-WIPES = 2
+MASKING_ROUNDS = 2
 """Times that markers are wiped out and corners fitted anew: the second time from corners without their ink."""
 
 MOVED_PX, MIN_MOVED, MIN_DRAWN = 0.05, 12, -0.5
@@ -86,8 +86,8 @@ def _with_more(refined: RefinedLattice, detection: BoardDetection, board: Board)
     sigma[detection.grid[:, 1], detection.grid[:, 0]] = detection.sigma_px
     if not (more.known & ~refined.lattice.known).any():
         return refined
-    usual = np.full(sigma.shape, known_median(refined.blur_px))
-    return refined.filled(replace(refined, lattice=more, sigma_px=sigma, blur_px=usual))
+    typical = np.full(sigma.shape, known_median(refined.blur_px))
+    return refined.filled(replace(refined, lattice=more, sigma_px=sigma, blur_px=typical))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -143,7 +143,7 @@ def _by_squares(
             whole = whole.filled(part)
     if not whole.count:
         return whole, left
-    pixels = beside_markers(image, whole.pixels, board)
+    pixels = between_markers(image, whole.pixels, board)
     seeds = np.where(np.isfinite(pixels[..., 0]), SEED_CONTRAST, np.nan)
     return whole.filled(Lattice(pixels, seeds, whole.rising)), left
 
@@ -200,14 +200,14 @@ def _between_markers(quads: FloatArray, markers: IntArray, board: Board) -> tupl
     pixels = transferred(maps_of_quads(quads[own]), np.where(unit > 0, 1.0 + beyond, -beyond))
     grid = places[number[own]][:, None] - 1 + unit
     inside = ((grid >= 0) & (grid < board.size)).all(axis=2)
-    place, told = board.index(grid[inside]), pixels[inside]
+    place, given = board.index(grid[inside]), pixels[inside]
     side = np.repeat(np.linalg.norm(pixels[:, 1] - pixels[:, 0], axis=1)[:, None], 4, axis=1)[inside]
     order = np.argsort(place, kind="stable")
-    place, told, side = place[order], told[order], side[order]
+    place, given, side = place[order], given[order], side[order]
     both = np.flatnonzero(place[1:] == place[:-1])
-    off = np.linalg.norm(told[both] - told[both + 1], axis=1)
+    off = np.linalg.norm(given[both] - given[both + 1], axis=1)
     both = both[off < SAME_CELLS * side[both]]
-    return board.grid()[place[both]], 0.5 * (told[both] + told[both + 1])
+    return board.grid()[place[both]], 0.5 * (given[both] + given[both + 1])
 
 
 def _empty(board: Board) -> Lattice:
@@ -278,40 +278,44 @@ def _beside_markers(image: GreyImage, refined: RefinedLattice, board: Board, cam
     if float(np.median(gap_to_markers(board, shape.sides))) > (NEAR_SIGMAS + MARKER_BLURS) * blur + NEAR_PX:
         return _MarkedBoard(narrow, board, image, board)
     # Their ink reaches into any window.
-    told = narrow
+    given = narrow
     if not narrow.lattice.known.all():
         # Markers are wiped out around all that is seen, so that their ink is no reason to leave corners out.
         seen = completed(image, _detection(_MarkedBoard(narrow, board, image, board)), [board], camera)
-        told = _with_more(narrow, seen, board)
-    return _wiped(image, told, narrow.lattice.known, board, blur) or _MarkedBoard(narrow, board, image, board)
+        given = _with_more(narrow, seen, board)
+    return _with_markers_masked(image, given, narrow.lattice.known, board, blur) or _MarkedBoard(
+        narrow, board, image, board
+    )
 
 
-def _wiped(image: GreyImage, told: RefinedLattice, sure: BoolArray, board: Board, blur: float) -> _MarkedBoard | None:
-    """Return the corners `told` fitted anew in the picture without the markers, but for those that are not `sure` (R,
+def _with_markers_masked(
+    image: GreyImage, given: RefinedLattice, sure: BoolArray, board: Board, blur: float
+) -> _MarkedBoard | None:
+    """Return the corners `given` fitted anew in the picture without the markers, but for those that are not `sure` (R,
     C) and fit badly there; None where markers cannot be wiped out."""
-    empty, some_more = replace(board, pattern=Chessboard()), bool((told.lattice.known & ~sure).any())
-    picture, before, after, narrow, light = image, blur, blur, told, None
+    empty, some_more = replace(board, pattern=Chessboard()), bool((given.lattice.known & ~sure).any())
+    picture, before, after, narrow, light = image, blur, blur, given, None
     # The places of those that were added are rough.
-    for turn in range(WIPES + some_more):
+    for turn in range(MASKING_ROUNDS + some_more):
         # Of corners without ink it is known how much light that takes.
-        wiped = without_markers(image, narrow, board, after, light if turn >= WIPES else None)
-        if wiped is None:
+        masked = without_markers(image, narrow, board, after, light if turn >= MASKING_ROUNDS else None)
+        if masked is None:
             return None
-        (picture, light), told, before = wiped, narrow, after
-        fitted = _fitted(picture, told, empty, before)
+        (picture, light), given, before = masked, narrow, after
+        fitted = _fitted(picture, given, empty, before)
         if turn > 0 and some_more:
             fitted = fitted.without(_too_unlike(fitted, sure))
         narrow = placed_together(picture, fitted)
         after = float(np.median(narrow.blur_px[narrow.lattice.known]))
     # Wide windows see how crookedly the squares are printed, as those of plain chessboards do.
-    alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, light, told, narrow, board, before))
+    alone = narrow.sigma_px / narrow.scatter / (1.0 + _drawn_by_markers(image, light, given, narrow, board, before))
     every = (slice(0, sure.shape[0]), slice(0, sure.shape[1]))
     scatter = float(scatter_factors(narrow.lattice.pixels, alone, [every])[0])
     return _MarkedBoard(replace(narrow, sigma_px=scatter * alone, scatter=scatter), board, picture, empty)
 
 
 def _drawn_by_markers(
-    image: GreyImage, light: Picture | None, told: RefinedLattice, found: RefinedLattice, board: Board, blur: float
+    image: GreyImage, light: Picture | None, given: RefinedLattice, found: RefinedLattice, board: Board, blur: float
 ) -> float:
     """Return how far corners go back, in parts of the shift, where their markers are wiped out a little beside.
 
@@ -319,16 +323,17 @@ def _drawn_by_markers(
     leave corners off by P n - c e: n is the noise, P n what it does on a chessboard, and c what is returned. Done over
     and over that ends at e = P n / (1 + c): markers, too, say where corners are.
 
-    told, found : the corners around which markers were wiped out, and where they were then found.
+    given, found : the corners around which markers were wiped out, and where they were then found.
     """
     off = MOVED_PX * np.random.default_rng(0).choice([-1.0, 1.0], found.lattice.pixels.shape)
-    aside = replace(told, lattice=replace(told.lattice, pixels=told.lattice.pixels + off))
-    wiped = without_markers(image, aside, board, blur, light)
-    if wiped is None:
+    lateral = replace(given, lattice=replace(given.lattice, pixels=given.lattice.pixels + off))
+    masked = without_markers(image, lateral, board, blur, light)
+    if masked is None:
         return 0.0
     empty = replace(board, pattern=Chessboard())
     moved = (
-        placed_together(wiped.picture, _fitted(wiped.picture, told, empty, blur)).lattice.pixels - found.lattice.pixels
+        placed_together(masked.picture, _fitted(masked.picture, given, empty, blur)).lattice.pixels
+        - found.lattice.pixels
     )
     back = -(moved / off)[np.isfinite(moved)]
     return max(float(np.median(back)), MIN_DRAWN) if len(back) >= MIN_MOVED else 0.0

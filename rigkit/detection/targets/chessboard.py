@@ -75,7 +75,7 @@ def _placed(
 ) -> list[RefinedLattice]:
     """Return the grids with those that are parts of a board in their place, where that is known."""
     sizes = tuple(dict.fromkeys(board.size for board in boards))
-    tried = [(item, place_part(grey, item, sizes) or _beside_missed_line(grey, item, boards)) for item in lattices]
+    tried = [(item, place_part(grey, item, sizes) or _with_missed_line(grey, item, boards)) for item in lattices]
     placed = [item for _, item in tried if item is not None]
     parts = [item for item, known in tried if known is None]
     if camera is None or len(parts) < 2:
@@ -83,12 +83,12 @@ def _placed(
     return [*placed, *(place_part(grey, item, sizes) or item for item in rejoined(parts, boards, camera))]
 
 
-def _beside_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[Board]) -> RefinedLattice | None:
+def _with_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[Board]) -> RefinedLattice | None:
     """Return a lattice that lacks one row or column of a board on the board's grid; None where that place is open.
 
     Blur and motion hide how a board ends (`place_part`), but the corners missed are seen on one side of the two.
     """
-    ways = []
+    options = []
     for board in boards:
         for size in {board.size, board.size[::-1]}:
             across, down = (whole - seen for whole, seen in zip(size, item.lattice.size, strict=True))
@@ -99,11 +99,11 @@ def _beside_missed_line(grey: GreyImage, item: RefinedLattice, boards: Sequence[
                 placed = item.padded(rows, columns)
                 start = _detection(placed.turned(quarter_turns(placed.lattice, [board.size])))
                 added = len(completed(grey, start, [board], None).grid) - len(start.grid)
-                ways.append((added / (size[1] if across else size[0]), placed))
-    shares = sorted(share for share, _ in ways)
-    if len(ways) < 2 or shares[-1] - shares[-2] < SEEN_OF_LINE:
+                options.append((added / (size[1] if across else size[0]), placed))
+    shares = sorted(share for share, _ in options)
+    if len(options) < 2 or shares[-1] - shares[-2] < SEEN_OF_LINE:
         return None
-    return max(ways, key=lambda way: way[0])[1]
+    return max(options, key=lambda option: option[0])[1]
 
 
 def _detection(found: RefinedLattice) -> BoardDetection:

@@ -25,7 +25,7 @@ FINDERS: dict[str, Finder] = {
 """In this order: what is known by its marks first, chessboards, which are what is left, last."""
 
 
-def check_sought(boards: Sequence[Board]) -> None:
+def check_searchable(boards: Sequence[Board]) -> None:
     """Raise InputError where no finder looks for the pattern of one of `boards`: it would be missing in every image."""
     for board in boards:
         if board.pattern.type not in FINDERS:

@@ -25,7 +25,18 @@ from rigkit.core.patterns.charuco import Charuco
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.registry import PATTERNS
 from rigkit.io.boards.foreign_boards import foreign_board
-from rigkit.io.disk.schema_words import COUNT, NAME, PLAIN_KINDS, POSITIVE, Schema, choice, file, obj, optional, said
+from rigkit.io.disk.schema_words import (
+    COUNT,
+    NAME,
+    PLAIN_KINDS,
+    POSITIVE,
+    Schema,
+    choice,
+    described,
+    file,
+    obj,
+    optional,
+)
 from rigkit.io.disk.toml_reader import TomlTable, read_toml, toml_text
 
 BOARD_SCHEMA = "rigkit.board/1"
@@ -43,7 +54,7 @@ def _pattern_keys() -> dict[str, Schema]:
         for key in pattern.keys:
             kind = POSITIVE if key.kind is float else PLAIN_KINDS[key.kind]
             known = out.get(key.name, {}).get("description", "")
-            out[key.name] = said(kind, f"{known}{'; ' if known else ''}{name}: {key.hint}")
+            out[key.name] = described(kind, f"{known}{'; ' if known else ''}{name}: {key.hint}")
     return out
 
 
@@ -52,28 +63,28 @@ def _sizes() -> dict[str, Schema]:
     out: dict[str, Schema] = {}
     for word in dict.fromkeys(pattern.size_word for pattern in PATTERNS.values()):
         side = what.get(word, f"{word} between the centres of two circles")
-        out[f"{word}_mm?"] = said(POSITIVE, f"{side}, as measured over many of them", 30.0)
-        out[f"{word}_x_mm?"] = said(POSITIVE, f"{side} along x, where the two differ", 30.0)
-        out[f"{word}_y_mm?"] = said(POSITIVE, f"{side} along y", 30.0)
-        out[f"{word}_sigma_mm?"] = said(POSITIVE, "how well it was measured: goes into every length", 0.05)
+        out[f"{word}_mm?"] = described(POSITIVE, f"{side}, as measured over many of them", 30.0)
+        out[f"{word}_x_mm?"] = described(POSITIVE, f"{side} along x, where the two differ", 30.0)
+        out[f"{word}_y_mm?"] = described(POSITIVE, f"{side} along y", 30.0)
+        out[f"{word}_sigma_mm?"] = described(POSITIVE, "how well it was measured: goes into every length", 0.05)
     return out
 
 
 BOARD_KEYS: Mapping[str, Schema] = {
-    "type?": said(choice(*PATTERNS), "what is printed; by default chessboard, with a dictionary charuco"),
-    "columns": said(COUNT, "inner corners along x; of an AprilGrid tags, of a circle grid circles", 9),
-    "rows": said(COUNT, "the same along y", 6),
+    "type?": described(choice(*PATTERNS), "what is printed; by default chessboard, with a dictionary charuco"),
+    "columns": described(COUNT, "inner corners along x; of an AprilGrid tags, of a circle grid circles", 9),
+    "rows": described(COUNT, "the same along y", 6),
     **_sizes(),
-    "printed_x_mm?": said(
+    "printed_x_mm?": described(
         POSITIVE, "squares as laid out for printing, which rigkit board notes; with printed_y_mm", 30.0
     ),
-    "printed_y_mm?": said(POSITIVE, "the same along y", 30.0),
+    "printed_y_mm?": described(POSITIVE, "the same along y", 30.0),
     **optional(_pattern_keys()),
 }
 BOARD_FILE = file(
     BOARD_SCHEMA,
     "A board as a person measured it",
-    {"id?": said(NAME, "its name; by default the file's"), **BOARD_KEYS},
+    {"id?": described(NAME, "its name; by default the file's"), **BOARD_KEYS},
 )
 DECLARED_BOARD = obj(BOARD_KEYS, "the board as declared, by the keys of board files")
 

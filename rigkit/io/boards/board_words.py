@@ -73,11 +73,11 @@ def board_files(words: Iterable[str]) -> list[Path]:
 def words_of_board(board: Board) -> str:
     """Return a board whose scale is not known in words, with MM for the length that is to be put in."""
     pattern, per = board.pattern, board.pattern.points_per_count
-    usual = {f.name: f.default for f in fields(pattern)}
+    typical = {f.name: f.default for f in fields(pattern)}
     keys = [
         f"{key.name}={_written(getattr(pattern, key.field))}"
         for key in pattern.keys
-        if key.required or getattr(pattern, key.field) != usual[key.field]
+        if key.required or getattr(pattern, key.field) != typical[key.field]
     ]
     kind = "" if isinstance(pattern, Chessboard) else f"{pattern.type}:"
     words = ",".join([f"{kind}{board.columns // per}x{board.rows // per}xMM", *keys])

@@ -53,13 +53,17 @@ def _kalibr(values: Mapping[str, Any]) -> Values:
     # https://github.com/ethz-asl/kalibr/wiki/calibration-targets: lengths in m, tagSpacing a ratio.
     kind = values["target_type"]
     if kind == "aprilgrid":
-        rows, columns = (_either(values, f"tag{way}", f"tag_{way.lower()}") for way in ("Rows", "Cols"))
+        rows, columns = (
+            _either(values, f"tag{axis_name}", f"tag_{axis_name.lower()}") for axis_name in ("Rows", "Cols")
+        )
         size, spacing = _either(values, "tagSize", "tag_size"), _either(values, "tagSpacing", "tag_spacing")
         return {"type": "aprilgrid", "columns": columns, "rows": rows, "tag_mm": _mm(size), "spacing": float(spacing)}
     # Kalibr counts corners of checkerboards as we do.
     size = {"columns": values["targetCols"], "rows": values["targetRows"]}
     if kind == "checkerboard":
-        sides = {f"square_{a}_mm": _mm(values[f"{way}SpacingMeters"]) for a, way in (("x", "col"), ("y", "row"))}
+        sides = {
+            f"square_{a}_mm": _mm(values[f"{axis_name}SpacingMeters"]) for a, axis_name in (("x", "col"), ("y", "row"))
+        }
         return {**size, **sides}
     if kind == "circlegrid":
         if values.get("asymmetricGrid"):

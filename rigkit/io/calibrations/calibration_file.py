@@ -127,8 +127,8 @@ def _calibration_in(data: dict[str, Any], path: str | Path) -> Calibration:
         size = camera.parameters.size
         boards = tuple(_shape_in(v) for v in data["boards"])
         sizes = {board.board_id: board.declared.size for board in boards if board.declared is not None}
-        if strangers := {str(view["board_id"]) for view in data["views"]} - {board.board_id for board in boards}:
-            raise ValueError(f"a view of board '{min(strangers)}', which is not among 'boards'")
+        if unknown_boards := {str(view["board_id"]) for view in data["views"]} - {board.board_id for board in boards}:
+            raise ValueError(f"a view of board '{min(unknown_boards)}', which is not among 'boards'")
         return Calibration(
             camera=camera,
             rms_px=real(data["rms_px"]),
@@ -160,8 +160,10 @@ def damage_named(path: str | Path) -> Iterator[None]:
         words = " ".join(str(error).split()) if isinstance(error, InputError) else damage(error)
         if str(path) not in words:
             # What a value's own reader says to do is said once.
-            told = f"damaged: {words}" if words.endswith("calibrate again") else f"damaged ({words}); calibrate again"
-            words = f"'{path}': {told}"
+            damage_words = (
+                f"damaged: {words}" if words.endswith("calibrate again") else f"damaged ({words}); calibrate again"
+            )
+            words = f"'{path}': {damage_words}"
         raise InputError(words) from error
 
 

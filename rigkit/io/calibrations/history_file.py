@@ -71,7 +71,7 @@ class HistoryEntry:
         return self.reference or self.source
 
     @property
-    def told_of(self) -> str:
+    def report_of(self) -> str:
         """What the amounts are changes of: the file, or that as pictures of before correct it."""
         return f"{self.watched} since pictures {self.baseline[:8]}" if self.baseline else self.watched
 
@@ -148,7 +148,7 @@ def editions(entries: Iterable[HistoryEntry]) -> tuple[Edition, ...]:
     found: dict[tuple[str, str], list[HistoryEntry]] = {}
     latest: dict[str, str] = {}
     for entry in entries:
-        whose = entry.told_of
+        whose = entry.report_of
         before = latest.get(whose, "")
         now = latest[whose] = entry.digest or before
         if before == "" and (whose, "") in found:

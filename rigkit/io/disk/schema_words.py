@@ -22,7 +22,7 @@ COUNT: Schema = {"type": "integer", "minimum": 1}
 PLAIN_KINDS: Mapping[type, Schema] = {str: TEXT, float: NUMBER, int: INTEGER, bool: BOOLEAN}
 
 
-def said(schema: Schema, words: str, *examples: object) -> Schema:
+def described(schema: Schema, words: str, *examples: object) -> Schema:
     """Return the schema with its meaning and, for people who write it, an example."""
     return {**schema, "description": words, **({"examples": list(examples)} if examples else {})}
 
@@ -65,7 +65,7 @@ def obj(keys: Mapping[str, Schema], words: str = "") -> Schema:
     out: Schema = {"type": "object", "properties": properties, "additionalProperties": False}
     if required:
         out["required"] = required
-    return said(out, words) if words else out
+    return described(out, words) if words else out
 
 
 def optional(keys: Mapping[str, Schema], *names: str) -> dict[str, Schema]:
@@ -76,7 +76,7 @@ def optional(keys: Mapping[str, Schema], *names: str) -> dict[str, Schema]:
 def rows(keys: Mapping[str, Schema], words: str = "", *, min_items: int = 0) -> Schema:
     """Return the schema of a list of at least so many objects."""
     out = array(obj(keys), min_items)
-    return said(out, words) if words else out
+    return described(out, words) if words else out
 
 
 def table(values: Schema) -> Schema:
@@ -98,7 +98,7 @@ def of_dataclass(cls: type, *, only: Sequence[str] = (), without: Sequence[str] 
     for field in dataclasses.fields(cls):
         if field.name not in without and (not only or field.name in only):
             one = _of_type(hints[field.name])
-            properties[field.name] = said(one, words[field.name]) if field.name in words else one
+            properties[field.name] = described(one, words[field.name]) if field.name in words else one
     return obj(properties)
 
 

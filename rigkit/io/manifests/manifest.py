@@ -22,12 +22,12 @@ from rigkit.io.disk.schema_words import (
     TEXT,
     Schema,
     choice,
+    described,
     file,
     obj,
     optional,
     row,
     rows,
-    said,
     table,
     texts,
 )
@@ -42,9 +42,9 @@ _DOWN = [0.0, 0.98, 0.17]
 _LEVEL: Schema = {
     **obj(
         {
-            "sigma_deg?": said({**NUMBER, "minimum": 0}, "how well it held; 0 means exactly level", 0.2),
-            "down1?": said(row(3), "which way is down in camera 1, for planar motion", _DOWN),
-            "down2?": said(row(3), "the same in camera 2", _DOWN),
+            "sigma_deg?": described({**NUMBER, "minimum": 0}, "how well it held; 0 means exactly level", 0.2),
+            "down1?": described(row(3), "which way is down in camera 1, for planar motion", _DOWN),
+            "down2?": described(row(3), "the same in camera 2", _DOWN),
         },
         "the spirit level; by default a carefully set one",
     ),
@@ -52,24 +52,24 @@ _LEVEL: Schema = {
     "dependentRequired": {"down1": ["down2"], "down2": ["down1"]},
 }
 _PAIR_KEYS: Mapping[str, Schema] = {
-    "id": said(NAME, "its name", "left-right"),
-    "camera1": said(TEXT, "that took image1", "left"),
-    "camera2": said(TEXT, "that took image2", "right"),
-    "image1": said(TEXT, "file", "images/view1.jpg"),
-    "image2": said(TEXT, "file", "images/view2.jpg"),
-    "boards": said(texts(1), "those that stand there", ["plane1", "plane2"]),
-    "pose_type": said(
+    "id": described(NAME, "its name", "left-right"),
+    "camera1": described(TEXT, "that took image1", "left"),
+    "camera2": described(TEXT, "that took image2", "right"),
+    "image1": described(TEXT, "file", "images/view1.jpg"),
+    "image2": described(TEXT, "file", "images/view2.jpg"),
+    "boards": described(texts(1), "those that stand there", ["plane1", "plane2"]),
+    "pose_type": described(
         choice(*map(str, PoseType)),
         "general; planar: turned about the vertical, moved in the horizontal plane; standard: moved along x; forward: "
         "along z; auto: the images say",
     ),
     "level?": _LEVEL,
-    "layout?": said(
+    "layout?": described(
         table(choice(*BOARD_SIDES)),
         "where boards that look alike stand, from camera 1",
         {"plane1": "left", "plane2": "floor", "plane3": "right"},
     ),
-    "planes?": said(choice(*PLANE_CHOICES), "of this pair, where it differs"),
+    "planes?": described(choice(*PLANE_CHOICES), "of this pair, where it differs"),
     "truth?": obj(
         {"baseline?": obj(measured("mm"), "distance of the two lenses"), **TRUTH_KEYS}, "what a person measured"
     ),
@@ -78,11 +78,11 @@ DATASET_FILE = file(
     DATASET_SCHEMA,
     "Pairs of images, and what a person measured of them",
     {
-        "name": said(NAME, "of the data set", "my-lab"),
+        "name": described(NAME, "of the data set", "my-lab"),
         "boards": rows(
             {
-                "id": said(NAME, "its name", "plane1"),
-                "file?": said(TEXT, "of the board, or its keys here", "board.toml"),
+                "id": described(NAME, "its name", "plane1"),
+                "file?": described(TEXT, "of the board, or its keys here", "board.toml"),
                 **optional(BOARD_KEYS),
             },
             "the boards that stand there",
@@ -90,9 +90,9 @@ DATASET_FILE = file(
         ),
         "cameras": rows(
             {
-                "id": said(NAME, "its name", "left"),
-                "calibration": said(TEXT, "its file", "calibration.json"),
-                "session?": said(
+                "id": described(NAME, "its name", "left"),
+                "calibration": described(TEXT, "its file", "calibration.json"),
+                "session?": described(
                     TEXT, "to calibrate it from; by default session.toml beside the calibration", SESSION_NAME
                 ),
             },
@@ -100,13 +100,13 @@ DATASET_FILE = file(
             min_items=1,
         ),
         "pairs": rows(_PAIR_KEYS, "two images of the same boards each", min_items=1),
-        "images?": said(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
-        "planes?": said(
+        "images?": described(choice("real", "rendered"), "what they are: stands beside ratios to the paper's results"),
+        "planes?": described(
             choice(*PLANE_CHOICES),
             "what planes, angles and clouds are built on: each point by itself (free, the default), the points of a "
             "board in one plane, or on its known lattice",
         ),
-        "truth_table?": said(TEXT, "a CSV file with what was measured, kept in a spreadsheet", "truth.csv"),
+        "truth_table?": described(TEXT, "a CSV file with what was measured, kept in a spreadsheet", "truth.csv"),
     },
 )
 

@@ -50,7 +50,7 @@ class ImageBoards:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ToldBoard:
+class DeclaredBoard:
     """A board that somebody declared: in a file, or in words that make its keys."""
 
     board: Board
@@ -81,10 +81,10 @@ def find_images(folder: Path) -> list[Path]:
     images = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_ENDINGS and p.is_file())
     if not images:
         raise InputError(f"init: no images ({', '.join(IMAGE_ENDINGS)}) under '{folder}'")
-    unspeakable = [path for path in images if path.name != path.name.encode("utf-8", "ignore").decode()]
-    if unspeakable:
+    undecodable = [path for path in images if path.name != path.name.encode("utf-8", "ignore").decode()]
+    if undecodable:
         raise InputError(
-            f"init: the name of image '{unspeakable[0]}' is not UTF-8, which a manifest cannot hold; rename the file"
+            f"init: the name of image '{undecodable[0]}' is not UTF-8, which a manifest cannot hold; rename the file"
         )
     return images
 
@@ -166,7 +166,7 @@ class NewManifest:
     ----------
     name : of the data set.
     pairs : at least one.
-    told : the boards, or the side of a square of all chessboards that are found, mm, as a person measured it.
+    declared : the boards, or the side of a square of all chessboards that are found, mm, as a person measured it.
     calibrations : camera -> path of its calibration file, absolute or from the folder of the manifest.
     cameras : pair -> the cameras of its two images.
     pose_types : pair -> pose type.
@@ -176,7 +176,7 @@ class NewManifest:
 
     name: str
     pairs: Sequence[FoundPair]
-    told: Sequence[ToldBoard] | float
+    declared: Sequence[DeclaredBoard] | float
     calibrations: Mapping[str, str]
     cameras: Mapping[str, tuple[str, str]]
     pose_types: Mapping[str, str]
@@ -186,7 +186,7 @@ class NewManifest:
 
 def manifest_text(new: NewManifest, root: Path) -> str:
     """Return the manifest as text, with what was found as comments; images are named relative to its folder `root`."""
-    pairs, told = new.pairs, new.told
+    pairs, declared = new.pairs, new.declared
     if not pairs:
         raise InputError(
             "init: no two images look like a pair; name them left01/right01, ...left/...right, view1/view2 or "
@@ -198,16 +198,16 @@ def manifest_text(new: NewManifest, root: Path) -> str:
     ]
     most = max((s.boards for pair in pairs for s in (pair.first, pair.second)), key=len)
     out += [f"name = {toml_text(new.name)}", ""]
-    if isinstance(told, float):
+    if isinstance(declared, float):
         counts = ", ".join(f"{n} of {c}x{r}" for (c, r), n in Counter(most).items())
         out.append(f"# Most boards in one image: {counts}.")
         for number, (columns, rows) in enumerate(most, start=1):
             out += ["[[boards]]", f'id = "plane{number}"', f"columns = {columns}", f"rows = {rows}"]
-            out += [f"square_mm = {told:g}", ""]
+            out += [f"square_mm = {declared:g}", ""]
         ids = [f"plane{number}" for number in range(1, len(most) + 1)]
     else:
-        out += [line for board in told for line in board.lines(root)]
-        ids = [board.board.board_id for board in told]
+        out += [line for board in declared for line in board.lines(root)]
+        ids = [board.board.board_id for board in declared]
     size = pairs[0].first.size_px
     out.append(f"# Images are {size[0]}x{size[1]} px.")
     if len(new.calibrations) == 1:

@@ -33,7 +33,7 @@ from pathlib import Path, PurePosixPath
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.io.boards.board_file import BOARD_KEYS, measured_board
-from rigkit.io.disk.schema_words import BOOLEAN, NAME, NUMBER, POSITIVE, TEXT, choice, file, rows, said, table
+from rigkit.io.disk.schema_words import BOOLEAN, NAME, NUMBER, POSITIVE, TEXT, choice, described, file, rows, table
 from rigkit.io.disk.toml_reader import TomlTable, read_toml
 
 _HASH = "a SHA-256; write the 64 characters of 0-9 and a-f that `sha256sum` prints"
@@ -41,26 +41,26 @@ PUBLIC_FILE = file(
     "rigkit.public/1",
     "A public capture, and what somebody measured of it",
     {
-        "name": said(NAME, "of the set", "bumblebee2"),
-        "about": said(TEXT, "what it is", "11 stereo pairs of a chessboard"),
-        "source": said(TEXT, "where it comes from", "https://github.com/..."),
-        "licence": said(TEXT, "of its files", "CC-BY-4.0"),
-        "rendered": said(BOOLEAN, "images of a computer, not of a camera", False),
-        "folder": said(TEXT, "where its files are in a folder of captures", "public/bumblebee2"),
-        "boards?": rows({"id?": said(NAME, "its name", "board"), **BOARD_KEYS}, "boards in its images"),
+        "name": described(NAME, "of the set", "bumblebee2"),
+        "about": described(TEXT, "what it is", "11 stereo pairs of a chessboard"),
+        "source": described(TEXT, "where it comes from", "https://github.com/..."),
+        "licence": described(TEXT, "of its files", "CC-BY-4.0"),
+        "rendered": described(BOOLEAN, "images of a computer, not of a camera", False),
+        "folder": described(TEXT, "where its files are in a folder of captures", "public/bumblebee2"),
+        "boards?": rows({"id?": described(NAME, "its name", "board"), **BOARD_KEYS}, "boards in its images"),
         "measured?": rows(
             {
-                "id": said(TEXT, "what was measured", "baseline"),
-                "value": said(NUMBER, "how much", 120.0),
-                "sigma?": said(POSITIVE, "where somebody stated one", 0.1),
+                "id": described(TEXT, "what was measured", "baseline"),
+                "value": described(NUMBER, "how much", 120.0),
+                "sigma?": described(POSITIVE, "where somebody stated one", 0.1),
                 "unit": choice("mm", "deg", "px"),
-                "how": said(TEXT, "by what it was measured: steel rule, set square, calipers", "calipers"),
+                "how": described(TEXT, "by what it was measured: steel rule, set square, calipers", "calipers"),
             },
             "what is known of it",
         ),
-        "files": said(table(said({**TEXT, "pattern": "^[0-9a-f]{64}$"}, _HASH)), "SHA-256 of each file"),
-        "urls?": said(
-            table(said({**TEXT, "pattern": r"^(https?|file)://\S+$"}, "an address (https://...)")),
+        "files": described(table(described({**TEXT, "pattern": "^[0-9a-f]{64}$"}, _HASH)), "SHA-256 of each file"),
+        "urls?": described(
+            table(described({**TEXT, "pattern": r"^(https?|file)://\S+$"}, "an address (https://...)")),
             "where to fetch them; after # a file in a .tar or .zip",
         ),
     },

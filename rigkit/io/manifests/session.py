@@ -27,29 +27,44 @@ from rigkit.core.printing import brief
 from rigkit.identification.board_ids import BOARD_SIDES
 from rigkit.io.boards.board_file import load_board
 from rigkit.io.disk.reading import is_file_or_lost_link
-from rigkit.io.disk.schema_words import ANY_OF, COUNT, NAME, TEXT, Schema, array, choice, file, rows, said, table, texts
+from rigkit.io.disk.schema_words import (
+    ANY_OF,
+    COUNT,
+    NAME,
+    TEXT,
+    Schema,
+    array,
+    choice,
+    described,
+    file,
+    rows,
+    table,
+    texts,
+)
 from rigkit.io.disk.toml_reader import TomlTable, named_path, read_toml
 from rigkit.io.manifests.truth_file import TRUTH_KEYS, between
 
 SESSION_SCHEMA = "rigkit.session/1"
 SESSION_NAME = "session.toml"
 
-_IMAGES = said({ANY_OF: [TEXT, texts()]}, "a pattern, or a list of files and patterns", "images/*.jpg")
+_IMAGES = described({ANY_OF: [TEXT, texts()]}, "a pattern, or a list of files and patterns", "images/*.jpg")
 _MODEL_KEYS: Mapping[str, Schema] = {
-    "model?": said(choice("auto", *MODELS), "camera model; auto (default): the one that predicts best"),
-    "degree?": said(COUNT, "terms of brown (4, 5, 8), degree of scaramuzza; by default chosen by held-out error", 6),
+    "model?": described(choice("auto", *MODELS), "camera model; auto (default): the one that predicts best"),
+    "degree?": described(
+        COUNT, "terms of brown (4, 5, 8), degree of scaramuzza; by default chosen by held-out error", 6
+    ),
 }
 ONE_CAMERA_KEYS = ("schema", "images", "board", "boards", "model", "degree", "board_shape")
 """Other keys of a session are of rigs."""
 _CAMERA_KEYS: Mapping[str, Schema] = {
-    "id": said(NAME, "its name", "left"),
+    "id": described(NAME, "its name", "left"),
     "images": _IMAGES,
-    "calibration?": said(TEXT, "file of a lens that stays as it is: only the mount is found", "left.json"),
+    "calibration?": described(TEXT, "file of a lens that stays as it is: only the mount is found", "left.json"),
     **_MODEL_KEYS,
 }
 _RIGID_KEYS: Mapping[str, Schema] = {
-    "boards": said(texts(2), "boards mounted to each other", ["left", "floor", "right"]),
-    "layout?": said(
+    "boards": described(texts(2), "boards mounted to each other", ["left", "floor", "right"]),
+    "layout?": described(
         table(choice(*BOARD_SIDES)), "which is which, of boards that look alike", {"left": "left", "floor": "floor"}
     ),
     **TRUTH_KEYS,
@@ -59,22 +74,22 @@ SESSION_FILE = file(
     "What to calibrate, and how",
     {
         "images?": _IMAGES,
-        "board?": said(TEXT, 'file of the board in the images; or boards = ["a.toml", "b.toml"]', "board.toml"),
-        "boards?": said(texts(1), "files of the boards, where there are several", ["a.toml", "b.toml"]),
+        "board?": described(TEXT, 'file of the board in the images; or boards = ["a.toml", "b.toml"]', "board.toml"),
+        "boards?": described(texts(1), "files of the boards, where there are several", ["a.toml", "b.toml"]),
         **_MODEL_KEYS,
-        "board_shape?": said(
+        "board_shape?": described(
             choice("auto", *SHAPES), "flat, warp (print scale and bow), released (every corner), or auto"
         ),
-        "frames?": said(
+        "frames?": described(
             choice("name", "number", "order"),
             "of several cameras, which images were taken together: those of one name, one number at the end of the "
             "name, or one place in the sorted list",
         ),
-        "rig?": said(
+        "rig?": described(
             TEXT, "file of a rig whose cameras stay as they are, lens and mount: others are added to it", "rig.json"
         ),
         "cameras?": rows(_CAMERA_KEYS, "several cameras, instead of images; the first is the rig's frame", min_items=2),
-        "baselines?": said(
+        "baselines?": described(
             array(between("mm", "a camera", "left", "right")),
             "what a person measured between two lenses: judged, not used",
         ),
@@ -144,9 +159,9 @@ def load_session(path: str | Path) -> Session:
 def options_of(table: TomlTable, of_all: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return model, degree and board shape that a table asks for, by the fields of `Session`; what it leaves out is as
     `of_all` cameras have it."""
-    usual = {"model": "auto", "degree": None, "board_shape": "auto"} if of_all is None else dict(of_all)
-    usual |= {"degree": None} if "model" in table else {}
-    out = usual | {key: table[key] for key in usual if key in table}
+    typical = {"model": "auto", "degree": None, "board_shape": "auto"} if of_all is None else dict(of_all)
+    typical |= {"degree": None} if "model" in table else {}
+    out = typical | {key: table[key] for key in typical if key in table}
     if out["degree"] is not None:
         with table.located():
             check_order(out["model"], out["degree"])

@@ -8,31 +8,31 @@ from typing import Any
 from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 from rigkit.core.truth import Feature, MeasuredAngle, MeasuredDistance, MeasuredLength, PairTruth
-from rigkit.io.disk.schema_words import POSITIVE, TEXT, Schema, array, obj, said
+from rigkit.io.disk.schema_words import POSITIVE, TEXT, Schema, array, described, obj
 from rigkit.io.disk.toml_reader import TomlTable
 
 
 def measured(unit: str) -> dict[str, Schema]:
     """Return the keys of something measured in a unit."""
     return {
-        f"value_{unit}": said(POSITIVE, f"as measured, {unit}", {"deg": 90.0, "mm": 300.0}[unit]),
-        f"sigma_{unit}": said(POSITIVE, "how far off the measurement may well be: one standard deviation", 0.5),
-        "how": said(TEXT, "by what it was measured: steel rule, set square, calipers", "steel rule"),
+        f"value_{unit}": described(POSITIVE, f"as measured, {unit}", {"deg": 90.0, "mm": 300.0}[unit]),
+        f"sigma_{unit}": described(POSITIVE, "how far off the measurement may well be: one standard deviation", 0.5),
+        "how": described(TEXT, "by what it was measured: steel rule, set square, calipers", "steel rule"),
     }
 
 
 def between(unit: str, what: str, a: str, b: str) -> Schema:
     """Return the schema of something measured between two things, such as `a` and `b`."""
-    return obj({"a": said(TEXT, what, a), "b": said(TEXT, "the other one", b), **measured(unit)})
+    return obj({"a": described(TEXT, what, a), "b": described(TEXT, "the other one", b), **measured(unit)})
 
 
 _SQUARE = {"a": "plane1", "b": "plane2", "value_deg": 90.0, "sigma_deg": 0.3, "how": "set square"}
 _DISTANCE = {"a": "plane1.centre", "b": "plane2", "value_mm": 300.0, "sigma_mm": 1.0, "how": "steel rule"}
 TRUTH_KEYS: Mapping[str, Schema] = {
-    "angles?": said(
+    "angles?": described(
         array(between("deg", "a board", "plane1", "plane2")), "angles between boards, across their faces", [_SQUARE]
     ),
-    "distances?": said(
+    "distances?": described(
         array(between("mm", "a place: plane1, plane1.centre, plane1[0,5]", "plane1.centre", "plane2")),
         "distances between places",
         [_DISTANCE],

@@ -99,12 +99,12 @@ class Video:
         with quiet_opencv():
             while self.next_number < number:
                 if not self._capture.grab():
-                    self._tell_of_the_rest()
+                    self._warn_of_truncation()
                     return None
                 self.next_number += 1
             well, picture = self._capture.read()
         if not well:
-            self._tell_of_the_rest()
+            self._warn_of_truncation()
             return None
         self.next_number += 1
         # Decoders of sequences keep grey files grey.
@@ -119,10 +119,10 @@ class Video:
         with quiet_opencv():
             while self._capture.grab():
                 self.next_number += 1
-        self._tell_of_the_rest()
+        self._warn_of_truncation()
         return self.next_number - first
 
-    def _tell_of_the_rest(self) -> None:
+    def _warn_of_truncation(self) -> None:
         """Say once that the video ends before the frames that it announces do."""
         if self.next_number < COMPLETE * self.count:
             _log.warning(

@@ -22,7 +22,7 @@ from rigkit.geometry.rotation import exp_so3, log_so3, rotation_angle, unit
 from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.reconstruction.growing.curvature import without_curvature
-from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_both_ways
+from rigkit.reconstruction.growing.grow import GrowingView, GrownPatches, LineKnowledge, grow, grow_in_both_directions
 from rigkit.reconstruction.growing.propagate import kept, propagated
 from rigkit.reconstruction.growing.surface import WINDOW_AREA_PX, GrownSurface, PairRays, fit_surface
 from rigkit.reconstruction.growing.sweep import filled
@@ -130,7 +130,7 @@ def grow_scene(
     pose, covariance = in_unit(even.pose.cam2_from_cam1, even.pose.covariance, r.baseline_mm)
     known = _knowledge(even.matches, pose)
     step = max(CLOUD_STEP, round(float(np.sqrt(np.prod(view1.size_px) / CLOUD_NODES))))
-    grown = grow_both_ways(view1, view2, agreeing, step=step, known=known).centred()
+    grown = grow_in_both_directions(view1, view2, agreeing, step=step, known=known).centred()
     grown = without_curvature(grown, r.camera1, r.camera2, pose)
     if not len(grown):
         raise DegenerateError(
@@ -140,7 +140,7 @@ def grow_scene(
     grown, sweep = filled(grown, PairRays.of(grown, r.camera1, r.camera2).measured(pose), view1, view2, pose)
     rays = PairRays.of(grown, r.camera1, r.camera2)
     measured = rays.measured(pose)
-    surface = fit_surface(measured, step, even.pose.misfit_px)
+    surface = fit_surface(measured, step, even.pose.epipolar_rms_px)
     if sweep is not None:
         surface = surface.where(kept(surface, grown, measured.slope, sweep, view1))
         surface, grown = propagated(surface, grown, measured.slope, sweep, view1, view2, pose)

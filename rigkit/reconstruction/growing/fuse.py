@@ -170,8 +170,8 @@ def _variance(errors: FloatArray, normals: FloatArray) -> FloatArray:
 def _information(sigma: FloatArray) -> FloatArray:
     """Return 1 / sigma^2, that of the median where none is known."""
     known = np.isfinite(sigma) & (sigma > 0.0)
-    usual = float(np.median(sigma[known])) if known.any() else 1.0
-    return np.asarray(1.0 / np.where(known, sigma, usual) ** 2)
+    typical = float(np.median(sigma[known])) if known.any() else 1.0
+    return np.asarray(1.0 / np.where(known, sigma, typical) ** 2)
 
 
 def _merge(earlier: _MergedSurface, later: _MergedSurface) -> None:

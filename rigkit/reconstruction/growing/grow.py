@@ -225,7 +225,7 @@ def grow(
     )
 
 
-def grow_both_ways(
+def grow_in_both_directions(
     view1: GrowingView, view2: GrowingView, seeds: Correspondences, *, step: int, known: LineKnowledge
 ) -> GrownPatches:
     """Return the pairs that grow from `seeds`, which lead back to their nodes when they are grown from image 2.

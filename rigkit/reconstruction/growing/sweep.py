@@ -31,7 +31,7 @@ MAX_SWEEP_LEVELS = 160
 FARTHER, NEARER = 0.1, 0.5
 """Of the range of inverse ranges that grew, to either side: what is before all of it, with too little texture to grow,
 seems to be anywhere else where its texture repeats."""
-BEND_COST = CENSUS_BITS // 6
+CURVATURE_COST = CENSUS_BITS // 6
 """Of a step to the next level, in bits of the census."""
 JUMP_COST = 2 * CENSUS_BITS
 """Of any larger step, where the brightness is even; less where it changes."""
@@ -51,7 +51,7 @@ MAX_OF_SHIFTED = 0.4
 0.6: the cheapest of all surfaces is half as dear as others by choice alone."""
 SHIFTED_LEVELS = 3
 """From which on a range is another one: blurred detail is alike over two levels."""
-MAX_MISFIT_LEVELS = 1.0
+MAX_RESIDUAL_LEVELS = 1.0
 """By which the sweep disagrees with the grown pairs, as a standard deviation, for it to be believed elsewhere."""
 UNLIT_LEVELS = 8.0
 """Grey levels where no light falls: noise and compression."""
@@ -102,7 +102,7 @@ class Sweep:
         at = np.clip(np.rint(pixels1 / self.step_px).astype(np.int64), 0, np.array([columns - 2, rows - 2]))
         return at[..., 1], at[..., 0]
 
-    def beside_winner(self, level: FloatArray, at: tuple[IntArray, IntArray], slope: FloatArray) -> BoolArray:
+    def near_winner(self, level: FloatArray, at: tuple[IntArray, IntArray], slope: FloatArray) -> BoolArray:
         """Return which levels (...) at samples (...) are beside the sweep's own surface.
 
         `slope` (...) is by how many px along the epipolar line a place moves with the inverse range.
@@ -137,9 +137,9 @@ class Sweep:
             for dr, dc in ((0, 0), (1, 0), (0, 1))
         )
         # The census tells no surfaces apart that are less than a sample apart.
-        apart = np.maximum(self.step_px / (slope * spacing), 1.0)
-        surfaces = np.stack([level, below - level, right - level, apart], axis=1)
-        out, beside = np.full(len(plane), np.inf), self.beside_winner(level, at, slope)
+        step_levels = np.maximum(self.step_px / (slope * spacing), 1.0)
+        surfaces = np.stack([level, below - level, right - level, step_levels], axis=1)
+        out, beside = np.full(len(plane), np.inf), self.near_winner(level, at, slope)
         own, other = swept_rivals(
             self.costs,
             len(self.inverse),
@@ -174,7 +174,7 @@ def filled(
         return FilledPairs(grown, None)
     sweep = _swept(grown, measured, view1, view2, cam2_from_cam1)
     best, around = swept_surfaces(
-        sweep.costs, len(sweep.inverse), sweep.samples1, bend=BEND_COST, jump=JUMP_COST, even=EVEN_LEVELS
+        sweep.costs, len(sweep.inverse), sweep.samples1, bend=CURVATURE_COST, jump=JUMP_COST, even=EVEN_LEVELS
     )
     level, good = _winners(best, around, sweep, view2, cam2_from_cam1)
     sweep = replace(sweep, winners=level, seen=good)
@@ -183,15 +183,15 @@ def filled(
     at_nodes = (measured.z[..., 0] - sweep.inverse[0]) / spacing
     of_grown = np.full(level.shape, np.nan)
     of_grown[::SAMPLES_A_NODE, ::SAMPLES_A_NODE] = at_nodes
-    good = _believed(sweep, good, of_grown)
+    good = _reliable(sweep, good, of_grown)
     off = np.abs(level - of_grown)[good & np.isfinite(of_grown)]
-    misfit = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
-    if not misfit < MAX_MISFIT_LEVELS:
+    residual = SIGMA_OF_MEDIAN * float(np.median(off)) if off.size else np.inf
+    if not residual < MAX_RESIDUAL_LEVELS:
         return FilledPairs(grown, None)
     at = sweep.nearest(grown.pixels1)
-    grown = grown.where(grown.valid & (sweep.beside_winner(at_nodes, at, measured.slope) | ~good[at]))
+    grown = grown.where(grown.valid & (sweep.near_winner(at_nodes, at, measured.slope) | ~good[at]))
     inverse = np.where(good, sweep.inverse[0] + spacing * level, np.nan)[::SAMPLES_A_NODE, ::SAMPLES_A_NODE]
-    return FilledPairs(_with(grown, inverse, misfit * spacing, view1, view2, cam2_from_cam1), sweep)
+    return FilledPairs(_with(grown, inverse, residual * spacing, view1, view2, cam2_from_cam1), sweep)
 
 
 def _swept(
@@ -285,7 +285,7 @@ def _winners(
     return level, good
 
 
-def _believed(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
+def _reliable(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
     """Return which `good` samples (R, C) are on surfaces that are no chance.
 
     A surface goes on where neighbours are no more than a level apart; `grown` are the levels (R, C) of patches. One
@@ -306,10 +306,10 @@ def _believed(sweep: Sweep, good: BoolArray, grown: FloatArray) -> BoolArray:
     with np.errstate(invalid="ignore"):
         agrees = good & (np.abs(level - grown) <= 1.0)
     size, agreed = np.bincount(label), np.bincount(label, weights=agrees.ravel()) > 0.0
-    believed = size >= SMALLEST
-    alone = np.flatnonzero((believed & ~agreed & (size < LARGE))[label])
-    believed &= agreed | (size >= LARGE) | (_of_shifted(sweep, alone, label[alone], len(size)) < MAX_OF_SHIFTED)
-    return np.asarray(good & believed[label].reshape(level.shape))
+    reliable = size >= SMALLEST
+    alone = np.flatnonzero((reliable & ~agreed & (size < LARGE))[label])
+    reliable &= agreed | (size >= LARGE) | (_of_shifted(sweep, alone, label[alone], len(size)) < MAX_OF_SHIFTED)
+    return np.asarray(good & reliable[label].reshape(level.shape))
 
 
 def _of_shifted(sweep: Sweep, samples: IntArray, label: IntArray, count: int) -> FloatArray:

@@ -29,7 +29,7 @@ from rigkit.relative_pose.solvers.pose import free_directions, translation_basis
 
 AMPLITUDES_PX = np.geomspace(0.003, 1.0, 9)
 """Of a family of a lens's errors over its image, rms, that are weighed against each other."""
-USUAL_PX = 0.07
+TYPICAL_PX = 0.07
 """Of these before any pair is seen, as a half-normal distribution: careful calibrations leave a twentieth of a pixel an
 axis. What looks like another pose leaves no trace in the distances, so that none seen is not none there; with a
 heavy tail (half-Cauchy) a tilt of pixels took the pose half a degree along."""
@@ -43,13 +43,13 @@ class SystematicPose:
     Attributes
     ----------
     covariance : (6, 6) of (left rotation perturbation rad, translation).
-    misfit_px : what the lenses' errors move pairs by across their epipolar lines, rms.
+    epipolar_rms_px : what the lenses' errors move pairs by across their epipolar lines, rms.
     by_distance : (6, N) change of the pose by those of the pairs' distances in sigmas (`point_terms`).
     """
 
     cam2_from_cam1: Rigid3
     covariance: FloatArray
-    misfit_px: float
+    epipolar_rms_px: float
     by_distance: FloatArray
 
 
@@ -105,8 +105,8 @@ def pose_with_lens_errors(
     # Sampson's distance is shared by both images.
     in_px = np.sqrt(2.0) * matches.sigma1_px[:, None] * rows_of_lenses
     moment = found.inverse[count:, count:] + np.outer(found.modes, found.modes)
-    misfit = np.sqrt(np.mean(np.sum(in_px @ moment * in_px, axis=1)))
-    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, float(misfit), spread @ by_row[:count])
+    residual = np.sqrt(np.mean(np.sum(in_px @ moment * in_px, axis=1)))
+    return SystematicPose(Rigid3(R, t), spread @ covariance @ spread.T, float(residual), spread @ by_row[:count])
 
 
 def _lens_rows(
@@ -195,4 +195,4 @@ def _posterior(normal: FloatArray, right: FloatArray, count: int, families: IntA
 
 def _log_prior(amplitudes_px: FloatArray) -> FloatArray:
     """Return the logarithm of the density (A,) of the logarithms of amplitudes (A, F)."""
-    return np.asarray(np.sum(np.log(amplitudes_px) - 0.5 * (amplitudes_px / USUAL_PX) ** 2, axis=1))
+    return np.asarray(np.sum(np.log(amplitudes_px) - 0.5 * (amplitudes_px / TYPICAL_PX) ** 2, axis=1))

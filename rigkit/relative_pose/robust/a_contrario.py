@@ -55,8 +55,8 @@ def log_false_alarms(
         fitting += int(_fits(wrong, pose, gate).sum())
         total += n
     by_point = (fitting + 1.0) / (total + 1.0)
-    apart = ~_fits(matches, pose, gate)
-    by_affinity = (affinity_fits[apart].sum() + 1.0) / (apart.sum() + 1.0)
+    outlying = ~_fits(matches, pose, gate)
+    by_affinity = (affinity_fits[outlying].sum() + 1.0) / (outlying.sum() + 1.0)
     log_chance = float(np.log(by_point * by_affinity))
     return float(np.log(n)) + _log_choose(n, k) + _log_choose(k, freedom) + (k - freedom) * log_chance
 

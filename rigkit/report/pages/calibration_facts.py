@@ -12,7 +12,7 @@ from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import InputError
-from rigkit.core.findings import Severity, gravest_first, worst
+from rigkit.core.findings import Severity, most_severe_first, worst
 from rigkit.core.printing import digits
 from rigkit.core.tables import Cell, Table, cells, columns
 from rigkit.planning.plan import Plan
@@ -41,7 +41,7 @@ def camera_facts(c: Calibration, plan: Plan | None = None) -> PageFacts:
         tables.append(
             Table(LEFT_OUT_KEY, "Left out", columns("image | why"), tuple(cells(*entry) for entry in c.dropped))
         )
-    sentences = [*map(str, gravest_first(c.verdicts))]
+    sentences = [*map(str, most_severe_first(c.verdicts))]
     if plan is not None:
         sentences += [next_words(plan), *plan_words(plan)]
         tables.append(plan_table(plan))
@@ -63,7 +63,7 @@ def rig_facts(rig: RigCalibration, checks: Sequence[Check], cameras: Mapping[str
         headline=rig_reach(rig, checks),
         badge=BADGE_WORDS[severity],
         passed=PASSED[severity],
-        sentences=tuple(map(str, gravest_first(rig.verdicts))),
+        sentences=tuple(map(str, most_severe_first(rig.verdicts))),
         basis=rig_basis(rig),
         tables=rig_tables(rig, checks),
         parts=cameras,

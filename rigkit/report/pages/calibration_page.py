@@ -11,7 +11,7 @@ import numpy as np
 
 from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.calibration.rig.result import RigCalibration
-from rigkit.core.findings import gravest_first
+from rigkit.core.findings import most_severe_first
 from rigkit.core.printing import brief
 from rigkit.core.tables import Table
 from rigkit.io.media.images import Image
@@ -27,7 +27,7 @@ from rigkit.report.pages.calibration_facts import (
     rig_facts,
     training_note,
 )
-from rigkit.report.pages.page_facts import PageFacts, told
+from rigkit.report.pages.page_facts import PageFacts, verdict_line
 from rigkit.report.pages.plan_page import shown_views
 from rigkit.report.pictures.scene_view import boards_scene, rig_scene
 from rigkit.report.render import data_uri, drawing, render, shown_table
@@ -118,7 +118,7 @@ def _shared(rig: RigCalibration, checks: Sequence[Check]) -> dict[str, Any]:
     """Return what the cameras share, as the template shows it."""
     facts = rig_facts(rig, checks, {})
     return {
-        **_said(rig, facts, "frames"),
+        **_summary(rig, facts, "frames"),
         "scene": rig_scene(rig),
         "tables": [shown_table(table) for table in facts.tables],
     }
@@ -131,7 +131,7 @@ def _shown(section: CalibrationSection) -> dict[str, Any]:
     sources = {name: data_uri("image/jpeg", data) for name, data in section.thumbnails.items()}
     return {
         "name": section.name,
-        **_said(c, facts, "images"),
+        **_summary(c, facts, "images"),
         "scene": boards_scene(c.views, c.boards),
         "drawings": [(name, drawing(draw(c))) for name, draw in DRAWINGS],
         "next": [] if section.plan is None else shown_views(section.plan, c.corners.used[0]),
@@ -148,14 +148,14 @@ def _pictures(table: Table, sources: Mapping[str, str]) -> list[str | None]:
     return [sources.get(name) if name not in names[:k] else None for k, name in enumerate(names)]
 
 
-def _said(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:
+def _summary(c: Calibration | RigCalibration, facts: PageFacts, taken: str) -> dict[str, Any]:
     """Return what is said first, of a camera or a rig alike: how good it is, severity, colour and words of each
     finding, the gravest first, and what it rests on."""
     held, note = c.heldout_rms_px, training_note(c.rms_px, c.heldout_rms_px)
     return {
         "heldout": f"not available (too few {taken})" if held is None else f"{held:.3f} px",
         "training": f"{c.rms_px:.3f} px" + (f" ({note})" if note else ""),
-        "findings": [(str(one.severity), VERDICTS[one.severity], one.text) for one in gravest_first(c.verdicts)],
-        "told": told(facts),
+        "findings": [(str(one.severity), VERDICTS[one.severity], one.text) for one in most_severe_first(c.verdicts)],
+        "verdict_line": verdict_line(facts),
         "basis": facts.basis,
     }

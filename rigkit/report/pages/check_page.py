@@ -63,11 +63,11 @@ def check_facts(check: SentinelCheck) -> PageFacts:
     else:
         # What changed in several ways is told by what it does alone.
         what = change.hypothesis.words if change.hypothesis.kind == "lens" else change
-        said = "Moved since" if check.baseline is not None else "Does NOT hold"
-        headline = f"{said} ({p}): {what}; {_cost_words(check, change)}"
-        unsure = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
+        message = "Moved since" if check.baseline is not None else "Does NOT hold"
+        headline = f"{message} ({p}): {what}; {_cost_words(check, change)}"
+        caveat = "" if change.size_px >= ALARM_PX else f", perhaps {change.max_px:.2f} px: these pictures tell it badly"
         sentences.append(
-            f"It moves the projection by {change.size_px:.3f} px rms{unsure}; after the correction "
+            f"It moves the projection by {change.size_px:.3f} px rms{caveat}; after the correction "
             f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
         )
     if not check.holds and check.baseline is None and len(check.watched.cameras) > 1:
@@ -127,16 +127,16 @@ def _could_have_found(power: Power) -> str:
     whose = "" if power.camera is None else f" of camera '{power.camera}'"
     size = f"{power.size:g} {power.unit}"
     seen = f"A change of {size} rms over the image" if power.unit == "px" else f"A turn of {size}"
-    said = f"{seen} would have been found with chance {power.chance:.2f} ({power.kind}{whose}, what is seen worst"
+    message = f"{seen} would have been found with chance {power.chance:.2f} ({power.kind}{whose}, what is seen worst"
     if np.isfinite(power.found_from):
-        said += f"; {FOUND:.0%} of the time from {power.found_from:.2g} {power.unit} on"
+        message += f"; {FOUND:.0%} of the time from {power.found_from:.2g} {power.unit} on"
     if power.chance >= FOUND:
-        return f"{said})."
+        return f"{message})."
     if power.frames is None:
-        told = "far from so sure" if power.both is None else "not so sure itself"
+        reason = "far from so sure" if power.both is None else "not so sure itself"
         more = "" if power.both is None else f": it takes about {power.both} times as many, in both"
-        return f"{said}); more pictures like these alone would not find it, for the calibration is {told}{more}."
-    return f"{said}); {power.frames} pictures like these would find it {FOUND:.0%} of the time."
+        return f"{message}); more pictures like these alone would not find it, for the calibration is {reason}{more}."
+    return f"{message}); {power.frames} pictures like these would find it {FOUND:.0%} of the time."
 
 
 def _frames_needed(power: Power) -> str:

@@ -33,11 +33,11 @@ def build_cloud_page(title: str, cloud: OrientedCloud, provenance: Mapping[str, 
         values.tobytes()
         for values in (places.astype("<f4"), np.rint(127.0 * shown.normals).astype(np.int8), shown.colours)
     )
-    told = f"{len(cloud)} points, half of them known to {np.nanmedian(cloud.sigma_mm):.3g} {unit} or better"
+    summary = f"{len(cloud)} points, half of them known to {np.nanmedian(cloud.sigma_mm):.3g} {unit} or better"
     return render(
         "cloud.html",
         title=title,
-        lead=told if len(shown) == len(cloud) else f"{told}; {len(shown)} are shown",
+        lead=summary if len(shown) == len(cloud) else f"{summary}; {len(shown)} are shown",
         count=len(shown),
         spacing=f"{POINT_SIDE * float(np.median(nearest[:, 1])):.3g}",
         packed=base64.b64encode(packed).decode(),

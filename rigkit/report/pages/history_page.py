@@ -25,8 +25,8 @@ CONTROL_SIGMAS = 3.0
 def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
     """Return what the page of a register says."""
     alarms = sum(not entry.holds for entry in entries)
-    told = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
-    count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {told}"
+    labels = {0: "none an alarm", 1: "one an alarm"}.get(alarms, f"{alarms} of them alarms")
+    count = "one entry" if len(entries) == 1 else f"{len(entries)} entries, {labels}"
     first, last = entries[0].date[:10], entries[-1].date[:10]
     lead = f"{count}, of {last}." if first == last else f"{count}, from {first} to {last}."
     kept = editions(entries)
@@ -53,15 +53,15 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
 
 def overwritten(kept: Sequence[Edition]) -> tuple[str, ...]:
     """Return which calibrations were replaced by others of the same name, in sentences."""
-    said = []
+    message = []
     for watched in dict.fromkeys(edition.watched for edition in kept if edition.several):
         own = [edition for edition in kept if edition.watched == watched]
         since = " and ".join(edition.entries[0].date[:10] for edition in own[1:])
-        said.append(
+        message.append(
             f"{watched} is another file since the entry of {since}: amounts are changes of what it held then, and each "
             "is drawn by itself."
         )
-    return tuple(said)
+    return tuple(message)
 
 
 def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:
@@ -111,10 +111,10 @@ def _heat_tables(kept: Sequence[Edition]) -> tuple[Table, ...]:
             if heat is not None:
                 low, high = own[0].temperature_c, own[-1].temperature_c
                 what, _, unit = name.rpartition(", ")
-                said = f"{heat.per_degree:+.2g} ± {heat.sigma:.1g} {unit} per °C"
+                message = f"{heat.per_degree:+.2g} ± {heat.sigma:.1g} {unit} per °C"
                 rows.append(
                     cells(f"{edition.name}: {what}" if len(kept) > 1 else what)
-                    + cells(Cell(said, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
+                    + cells(Cell(message, best=heat.chance < ALARM_CHANCE), f"{heat.chance:.2g}")
                     + cells(f"{low:g} to {high:g}", len(own))
                 )
     heads = columns("amount | with the temperature | chance if it does nothing | from, to [°C] | entries .0")
@@ -159,8 +159,8 @@ def heat_svg(entries: Sequence[HistoryEntry], name: str, heat: HeatDrift) -> str
             f'<path d="{ends}" stroke="{stroke}"/>{svg.words(LEFT_MARGIN - 5, height + 4, f"{amount:.2g}", "end")}'
         )
     out.append(f'<path d="{svg.line(np.stack([x, y], axis=-1))}" fill="none" stroke="{INK}" stroke-opacity="0.6"/>')
-    told = [f"{c:g} °C" for c in celsius]
-    return "".join([*out, *_points(entries, name, x, top), *_below(x, told), "</svg>"])
+    labels = [f"{c:g} °C" for c in celsius]
+    return "".join([*out, *_points(entries, name, x, top), *_below(x, labels), "</svg>"])
 
 
 def _top(limit: float, value: FloatArray, sigma: FloatArray) -> float:
@@ -174,11 +174,11 @@ def _across(values: FloatArray) -> FloatArray:
     return np.asarray(LEFT_MARGIN + (DRAWN_WIDTH - LEFT_MARGIN - 14.0) * part)
 
 
-def _below(x: FloatArray, told: Sequence[str]) -> list[str]:
+def _below(x: FloatArray, labels: Sequence[str]) -> list[str]:
     """Return the words below the first and the last of the points at `x`."""
-    if len(told) == 1:
-        return [svg.words(x[0], DRIFT_HEIGHT - 6, told[0], "middle")]
-    return [svg.words(x[k], DRIFT_HEIGHT - 6, told[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
+    if len(labels) == 1:
+        return [svg.words(x[0], DRIFT_HEIGHT - 6, labels[0], "middle")]
+    return [svg.words(x[k], DRIFT_HEIGHT - 6, labels[k], anchor) for k, anchor in ((0, "start"), (-1, "end"))]
 
 
 def _points(entries: Sequence[HistoryEntry], name: str, x: FloatArray, top: float) -> list[str]:

@@ -41,9 +41,13 @@ class PageFacts:
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as a document of its own, rigkit.page/1."""
-        return {"schema": PAGE_SCHEMA, **self._said(), "parts": {n: part._said() for n, part in self.parts.items()}}
+        return {
+            "schema": PAGE_SCHEMA,
+            **self._summary(),
+            "parts": {n: part._summary() for n, part in self.parts.items()},
+        }
 
-    def _said(self) -> dict[str, Any]:
+    def _summary(self) -> dict[str, Any]:
         return {
             "headline": self.headline,
             "badge": self.badge,
@@ -54,7 +58,7 @@ class PageFacts:
         }
 
 
-def told(facts: PageFacts) -> dict[str, str]:
+def verdict_line(facts: PageFacts) -> dict[str, str]:
     """Return the verdict that stands first: in a word or two, and the result in the user's units."""
     return {"words": facts.badge, "colour": BADGES[facts.passed], "headline": facts.headline}
 
@@ -83,7 +87,7 @@ def build_facts_page(
         "facts.html",
         title=title,
         lead="",
-        told=told(facts),
+        verdict_line=verdict_line(facts),
         sentences=facts.sentences,
         links=links,
         pictures=[

@@ -146,7 +146,7 @@ def plan_page(
         "plan.html",
         title=title,
         lead="",
-        told={"words": "", "colour": "", "headline": facts.headline},
+        verdict_line={"words": "", "colour": "", "headline": facts.headline},
         views=shown_views(plan, taken),
         dots=taken is not None and len(taken) > 0,
         tables=[shown_table(table) for table in facts.tables],

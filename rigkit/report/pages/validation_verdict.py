@@ -47,15 +47,15 @@ class ValidationVerdict:
     def sentences(self) -> tuple[str, ...]:
         """What does not hold, probably why, what other methods say of the same images, and how fine the ruler is."""
 
-        def told(facts: Sequence[FailedFact]) -> list[str]:
+        def lines_of(facts: Sequence[FailedFact]) -> list[str]:
             return [f"{fact.what.lower()}: {fact.pair_id}: {fact.words}" for fact in facts]
 
         cause = "to look at" if self.passed else "probable cause"
         own, others = ([f for f in self.failed if (f.what == BY_OTHERS) == other] for other in (False, True))
         return (
-            *told(own),
+            *lines_of(own),
             *(f"{cause}: {words}" for words in self.causes),
-            *told(others),
+            *lines_of(others),
             *filter(None, [self.fineness]),
         )
 

@@ -14,7 +14,7 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels, without_nan
 from rigkit.core.errors import InputError
 from rigkit.core.findings import Finding
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 
 
 class Quantity(StrEnum):
@@ -62,7 +62,7 @@ class Instrument:
             raise InputError(f"certificate: a covariance has degrees of freedom, got {self.freedom}")
 
     @classmethod
-    def of(cls, known: Watched, pair: tuple[str, str] | None = None) -> Instrument:
+    def of(cls, known: Monitored, pair: tuple[str, str] | None = None) -> Instrument:
         """Return a camera, or two of a rig: its first two, or a `pair` by their names, the one whose image the
         certificate is drawn over first.
 

@@ -63,15 +63,17 @@ def measured_points(rays: Rays, task: Task, is_rig: bool) -> tuple[Points, Float
         basis = np.stack([np.ones_like(x), x, y], axis=1)
         left_over = np.eye(len(x)) - basis @ np.linalg.pinv(basis)
         return points, left_over[None, :, :, None] * rays[:, None, None, :]
-    points = np.stack([middle + sign * half * way for way in (level, upright) for sign in (-1.0, 1.0)], axis=1)
+    points = np.stack(
+        [middle + sign * half * direction for direction in (level, upright) for sign in (-1.0, 1.0)], axis=1
+    )
     if is_rig:
         ends = np.stack([-level, level, zero, zero], axis=1), np.stack([zero, zero, -upright, upright], axis=1)
     else:
         # length = 2 D tan(angle / 2): an end that moves across its ray by s opens the angle by s / range.
         opening = task.distance_mm * (1.0 + (half / task.distance_mm) ** 2) / np.hypot(task.distance_mm, half)
         across = []
-        for way, pair in ((level, points[:, :2]), (upright, points[:, 2:])):
-            away = np.stack([-way, way], axis=1)
+        for direction, pair in ((level, points[:, :2]), (upright, points[:, 2:])):
+            away = np.stack([-direction, direction], axis=1)
             sight = pair / np.linalg.norm(pair, axis=-1, keepdims=True)
             away = away - np.sum(away * sight, axis=-1, keepdims=True) * sight
             across.append(opening * away / np.linalg.norm(away, axis=-1, keepdims=True))
@@ -99,9 +101,9 @@ def hessians(points: Points, quantity: Quantity) -> FloatArray:
         return np.asarray(out.T @ by_edge @ out)[:, None]
     each = []
     for first in range(0, count, 2):
-        way = points[:, first + 1] - points[:, first]
-        length = np.linalg.norm(way, axis=-1)[:, None, None]
-        unit = way / length[:, 0]
+        direction = points[:, first + 1] - points[:, first]
+        length = np.linalg.norm(direction, axis=-1)[:, None, None]
+        unit = direction / length[:, 0]
         across = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length
         out = _differences([(first, first + 1)], count)
         each.append(out.T @ across @ out)

@@ -19,37 +19,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
-from rigkit.validation.sentinel.judge import Baseline, Look, SentinelCheck, judge_evidence
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
+from rigkit.validation.sentinel.judge import Baseline, Look, SentinelCheck, evaluate_evidence
 from rigkit.validation.sentinel.whitened import Whitened, disagreement
 
 CORRECTIONS = 4
 """Times that the correction is linearised anew: published lenses are off by up to 2 px."""
 
 
-def judge_since(watched: Watched, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames, against the cameras as what `before` finds in frames of
     the time when they were trusted corrects them.
 
     Raises DegenerateError where the frames of before do not go together with the cameras at all.
     """
-    trusted, now, change = watched, watched, np.zeros(watched.layout.count)
-    first = said = before(watched)
+    trusted, now, change = monitored, monitored, np.zeros(monitored.layout.count)
+    first = message = before(monitored)
     for k in range(CORRECTIONS):
-        said = before(now)
-        wider = _Disagreement.of(said, look(now))
-        whitened = Whitened.of(trusted, wider.of_frames(said))
+        message = before(now)
+        wider = _Disagreement.of(message, look(now))
+        whitened = Whitened.of(trusted, wider.of_frames(message))
         if k == 0:
             score = whitened.score
             beyond = float(score @ np.linalg.solve(whitened.covariance, score)) - len(score)
-            trusted = replace(watched, covariance=max(beyond, 1.0) * watched.covariance)
-            whitened = Whitened.of(trusted, wider.of_frames(said))
+            trusted = replace(monitored, covariance=max(beyond, 1.0) * monitored.covariance)
+            whitened = Whitened.of(trusted, wider.of_frames(message))
         gain = np.linalg.solve(whitened.covariance, whitened.by_theta @ trusted.covariance).T
         change = gain @ (whitened.score + whitened.by_theta @ change)
-        now = watched.changed(change)
+        now = monitored.changed(change)
     left = np.eye(len(change)) - gain @ whitened.by_theta
     corrected = replace(now, covariance=gain @ gain.T + left @ trusted.covariance @ left.T)
-    check = judge_evidence(corrected, lambda now: wider.of_frames(look(now)), cost)
+    check = evaluate_evidence(corrected, lambda now: wider.of_frames(look(now)), cost)
     return replace(check, baseline=Baseline(len(first.score), first.rms_px, before(corrected).rms_px))
 
 
@@ -65,24 +65,27 @@ class _Disagreement:
         """Return that of frames of several times, between which something may have changed."""
         count = times[0].score.shape[1]
         information, score = [], []
-        for k, said in enumerate(times):
+        for k, message in enumerate(times):
             own = slice(k * count, (k + 1) * count)
             each = (
-                np.zeros((len(said.score), len(times) * count, len(times) * count)),
-                np.zeros((len(said.score), len(times) * count)),
+                np.zeros((len(message.score), len(times) * count, len(times) * count)),
+                np.zeros((len(message.score), len(times) * count)),
             )
-            each[0][:, own, own], each[1][:, own] = said.information / said.variance_px2, said.score / said.variance_px2
+            each[0][:, own, own], each[1][:, own] = (
+                message.information / message.variance_px2,
+                message.score / message.variance_px2,
+            )
             information.append(each[0])
             score.append(each[1])
         return cls(*disagreement(np.concatenate(information), np.concatenate(score)))
 
-    def of_frames(self, said: FreshEvidence) -> FreshEvidence:
+    def of_frames(self, message: FreshEvidence) -> FreshEvidence:
         """Return what frames say, counted so much less."""
         if self.ratio <= 1.0:
-            return said
+            return message
         return replace(
-            said,
-            variance_px2=self.ratio * said.variance_px2,
-            overdispersion=float(np.sqrt(self.ratio)) * said.overdispersion,
-            freedom=min(self.freedom, said.freedom),
+            message,
+            variance_px2=self.ratio * message.variance_px2,
+            overdispersion=float(np.sqrt(self.ratio)) * message.overdispersion,
+            freedom=min(self.freedom, message.freedom),
         )

@@ -34,8 +34,8 @@ from rigkit.geometry.triangulation import triangulate_rays
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import MIN_SIGMA_PX
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
-from rigkit.validation.sentinel.judge import SentinelCheck, judge_evidence
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
+from rigkit.validation.sentinel.judge import SentinelCheck, evaluate_evidence
 from rigkit.validation.sentinel.whitened import MIN_FREE_VARIANCE, disagreement
 
 FEATURES = 2500
@@ -67,17 +67,17 @@ class PairMatches:
 
 
 def check_scene(
-    watched: Watched, frames: Sequence[Sequence[Any]], cost: Sequence[Goal] = (), *, progress: Progress = silent
+    monitored: Monitored, frames: Sequence[Sequence[Any]], cost: Sequence[Goal] = (), *, progress: Progress = silent
 ) -> SentinelCheck:
     """Return the verdict on images of a textured scene, one a camera in every frame.
 
     Raises DegenerateError where too few matches are found.
     """
-    return check_matches(watched, matches_of_scenes(watched, frames, progress=progress), cost)
+    return check_matches(monitored, matches_of_scenes(monitored, frames, progress=progress), cost)
 
 
 def matches_of_scenes(
-    watched: Watched, frames: Sequence[Sequence[Any]], *, progress: Progress = silent
+    monitored: Monitored, frames: Sequence[Sequence[Any]], *, progress: Progress = silent
 ) -> list[PairMatches]:
     """Return the matches of the first camera with each other one in images of textured scenes, one a camera in every
     frame; frames with too few are left out."""
@@ -86,7 +86,7 @@ def matches_of_scenes(
         progress("matches", k, len(frames))
         for c in range(1, len(images)):
             try:
-                matches = scene_matches(watched, (0, c), images[0], images[c])
+                matches = scene_matches(monitored, (0, c), images[0], images[c])
             except DegenerateError:
                 continue  # No texture in this one.
             if len(matches.pixels1) >= MIN_FRAME_MATCHES:
@@ -95,21 +95,21 @@ def matches_of_scenes(
     return found
 
 
-def scene_matches(watched: Watched, numbers: tuple[int, int], image1: Any, image2: Any) -> PairMatches:
+def scene_matches(monitored: Monitored, numbers: tuple[int, int], image1: Any, image2: Any) -> PairMatches:
     """Return matches, by cameras of these numbers, of what is not repeated in either image.
 
     Raises as `match_affine_features`.
     """
     found = match_affine_features(image1, image2, tilts=(1.0,), features_per_view=FEATURES, unique=True)
-    return straightened(watched, numbers, found)
+    return straightened(monitored, numbers, found)
 
 
-def straightened(watched: Watched, numbers: tuple[int, int], found: Correspondences) -> PairMatches:
+def straightened(monitored: Monitored, numbers: tuple[int, int], found: Correspondences) -> PairMatches:
     """Return aligned patches of two cameras, without what an affine warp leaves of the map between the images."""
     assert found.A21 is not None
     first, second = numbers
-    cameras = watched.cameras[first], watched.cameras[second]
-    motion = _motion(watched, first, second)
+    cameras = monitored.cameras[first], monitored.cameras[second]
+    motion = _motion(monitored, first, second)
     one, two = (
         _SeenRays.by(camera, pixels) for camera, pixels in zip(cameras, (found.pixels1, found.pixels2), strict=True)
     )
@@ -124,12 +124,12 @@ def straightened(watched: Watched, numbers: tuple[int, int], found: Corresponden
     return PairMatches(first, second, found.pixels1, pixels2)
 
 
-def check_matches(watched: Watched, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return the verdict on matches of a rig's cameras; raises as `matches_say`."""
-    return judge_evidence(watched, lambda now: matches_say(now, matches), cost)
+def check_matches(monitored: Monitored, matches: Sequence[PairMatches], cost: Sequence[Goal] = ()) -> SentinelCheck:
+    """Return the verdict on matches of a rig's cameras; raises as `evidence_of_matches`."""
+    return evaluate_evidence(monitored, lambda now: evidence_of_matches(now, matches), cost)
 
 
-def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEvidence:
+def evidence_of_matches(monitored: Monitored, matches: Sequence[PairMatches]) -> FreshEvidence:
     """Return what matches of a rig's cameras say of theta.
 
     Raises DegenerateError where there are none, or the lenses see none of them.
@@ -138,16 +138,16 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         raise DegenerateError(
             f"check: less than {MIN_FRAME_MATCHES} matches in every frame; show the rig a scene with texture and depth"
         )
-    layout = watched.layout
+    layout = monitored.layout
     n = layout.count
     information, scores, variances, disagreements = [], [], [], []
     squares, left_squares, count, freedom = 0.0, 0.0, 0, 0.0
     for pair in matches:
-        residual, jacobian, good = _linearised(watched, pair)
+        residual, jacobian, good = _linearised(monitored, pair)
         if len(residual) == 0:
             raise DegenerateError("check: the lenses see none of the matches; check which camera took which picture")
         left, weight, sigma = _unexplained(residual, jacobian, layout.mount(pair.second))
-        by_part = _parts(pair.pixels1[good], watched.cameras[pair.first].size_px)
+        by_part = _parts(pair.pixels1[good], monitored.cameras[pair.first].size_px)
         own, score = np.zeros((PARTS**2, n, n)), np.zeros((PARTS**2, n))
         np.add.at(own, by_part, weight[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :])
         np.add.at(score, by_part, -(weight * residual)[:, None] * jacobian)
@@ -160,12 +160,12 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
         freedom += min(free, np.count_nonzero(own.any(axis=(1, 2))) - 1.0)
         squares, count = squares + float((weight * residual**2).sum()), count + len(residual)
         left_squares += float((weight * left**2).sum())
-    usual = float(np.median(variances))
-    share = usual / np.array(variances)
+    typical = float(np.median(variances))
+    share = typical / np.array(variances)
     return FreshEvidence(
         information=share[:, None, None] * np.array(information),
         score=share[:, None] * np.array(scores),
-        variance_px2=usual,
+        variance_px2=typical,
         rms_px=float(np.sqrt(squares / count)),
         expected_px=float(np.sqrt(left_squares / count)),
         corners=count,
@@ -175,25 +175,25 @@ def matches_say(watched: Watched, matches: Sequence[PairMatches]) -> FreshEviden
     )
 
 
-def _linearised(watched: Watched, pair: PairMatches) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _linearised(monitored: Monitored, pair: PairMatches) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the Sampson distances (M,) px of the matches that the cameras see, their derivatives (M, T), and which of
     N these are."""
-    reach = REACH_SIGMAS * np.sqrt(np.diag(watched.covariance))
+    reach = REACH_SIGMAS * np.sqrt(np.diag(monitored.covariance))
     views = ((pair.first, pair.pixels1), (pair.second, pair.pixels2))
-    usual = [_SeenRays.by(watched.cameras[c], pixels) for c, pixels in views]
-    residual = _distances(watched, pair, usual)
-    layout = watched.layout
+    typical = [_SeenRays.by(monitored.cameras[c], pixels) for c, pixels in views]
+    residual = _distances(monitored, pair, typical)
+    layout = monitored.layout
     jacobian = np.zeros((len(residual), layout.count))
     for k in np.flatnonzero(reach > 0.0).tolist():
         step = np.zeros(layout.count)
         step[k] = reach[k]
         moved = [c for c, _ in views if layout.cameras[c].start <= k < layout.cameras[c].stop]
         ends = []
-        for changed in (watched.changed(step), watched.changed(-step)):
+        for changed in (monitored.changed(step), monitored.changed(-step)):
             # Of a lens that stays, rays stay.
             seen = [
                 _SeenRays.by(changed.cameras[c], pixels) if c in moved else same
-                for (c, pixels), same in zip(views, usual, strict=True)
+                for (c, pixels), same in zip(views, typical, strict=True)
             ]
             ends.append(_distances(changed, pair, seen))
         jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * reach[k])
@@ -253,17 +253,17 @@ class _SeenRays:
         return cls(rays, camera.ray_jacobian(pixels), valid)
 
 
-def _distances(watched: Watched, pair: PairMatches, seen: Sequence[_SeenRays]) -> FloatArray:
+def _distances(monitored: Monitored, pair: PairMatches, seen: Sequence[_SeenRays]) -> FloatArray:
     """Return the Sampson distances (N,) px of a pair's matches, NaN where a camera does not see them."""
-    motion = _motion(watched, pair.first, pair.second)
+    motion = _motion(monitored, pair.first, pair.second)
     essential = skew(motion.translation_mm) @ motion.rotation
     first, second = seen
     found = sampson_distances(essential, first.rays, second.rays, first.jacobians, second.jacobians)
     return np.where(first.valid & second.valid, found, np.nan)
 
 
-def _motion(watched: Watched, first: int, second: int) -> Rigid3:
-    return watched.cam_from_rig[second] @ watched.cam_from_rig[first].inverse()
+def _motion(monitored: Monitored, first: int, second: int) -> Rigid3:
+    return monitored.cam_from_rig[second] @ monitored.cam_from_rig[first].inverse()
 
 
 def _parts(pixels: Pixels, size_px: tuple[int, int]) -> IntArray:

@@ -39,7 +39,7 @@ POSE_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
-class Watched:
+class Monitored:
     """What is to be checked.
 
     Attributes
@@ -100,7 +100,7 @@ class Watched:
         same = np.abs(found - stated).max() < SAME_BOARD * square * max(board.size)
         return found if same else stated
 
-    def changed(self, change: FloatArray) -> Watched:
+    def changed(self, change: FloatArray) -> Monitored:
         """Return cameras and mounts after a change (T,) of theta."""
         layout = self.layout
         cameras = [
@@ -140,24 +140,24 @@ class FreshEvidence:
     freedom: float
 
 
-def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
+def evidence_of(monitored: Monitored, views: Sequence[FreshView]) -> FreshEvidence:
     """Return what fresh views say of theta.
 
     Raises InputError without views, DegenerateError where no view has a pose.
     """
     if not views:
         raise InputError("check: no board was found in the pictures; take sharp ones in which the whole board is seen")
-    found = _PosedBoards.of(watched, views)
+    found = _PosedBoards.of(monitored, views)
     for _ in range(POSE_ROUNDS):
-        products = found.products(watched)
-        n = watched.layout.count
+        products = found.products(monitored)
+        n = monitored.layout.count
         # Of a board nearly all of whose corners stray, too few are left for a pose: what they leave open stays.
         inverse = np.linalg.pinv(products[:, n : n + 6, n : n + 6], hermitian=True)
         step = (inverse @ products[:, n : n + 6, -1:])[..., 0]
         found = found.moved(np.asarray(step, dtype=np.float64))
-    information, score = reduced_by_cluster(found.products(watched), watched.layout.count, found.frame)
-    squares, count, left_out = found.residual_squares(watched)
-    sigma = watched.fresh_sigma_px
+    information, score = reduced_by_cluster(found.products(monitored), monitored.layout.count, found.frame)
+    squares, count, left_out = found.residual_squares(monitored)
+    sigma = monitored.fresh_sigma_px
     return FreshEvidence(
         information=information,
         score=score,
@@ -166,13 +166,13 @@ def evidence_of(watched: Watched, views: Sequence[FreshView]) -> FreshEvidence:
         expected_px=float(np.sqrt(2.0) * sigma),
         corners=count,
         left_out=left_out,
-        overdispersion=watched.overdispersion,
-        freedom=watched.freedom,
+        overdispersion=monitored.overdispersion,
+        freedom=monitored.freedom,
     )
 
 
-def told_by(
-    watched: Watched, board: Board, rotation: FloatArray, translation_mm: Points, seen: Sequence[BoolArray]
+def board_information(
+    monitored: Monitored, board: Board, rotation: FloatArray, translation_mm: Points, seen: Sequence[BoolArray]
 ) -> FloatArray:
     """Return what each of C frames would say of theta, (C, T, T) in px^2: information as `FreshEvidence` has it.
 
@@ -184,7 +184,7 @@ def told_by(
     placed = _PosedBoards(
         rotation, translation_mm, frames, observations, (frames,) * len(seen), tuple(o.weight for o in observations)
     )
-    return reduced_by_cluster(placed.products(watched), watched.layout.count, frames)[0]
+    return reduced_by_cluster(placed.products(monitored), monitored.layout.count, frames)[0]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -200,7 +200,7 @@ class _PosedBoards:
     weight: tuple[FloatArray, ...]
 
     @classmethod
-    def of(cls, watched: Watched, views: Sequence[FreshView]) -> _PosedBoards:
+    def of(cls, monitored: Monitored, views: Sequence[FreshView]) -> _PosedBoards:
         keys = list(dict.fromkeys((v.frame, v.view.board.board_id) for v in views))
         number = {key: k for k, key in enumerate(keys)}
         frames = {name: k for k, name in enumerate(dict.fromkeys(frame for frame, _ in keys))}
@@ -208,7 +208,7 @@ class _PosedBoards:
         most = np.zeros(len(keys), dtype=np.int64)
         observations: list[Observations | None] = []
         groups, weights = [], []
-        for c, pose in enumerate(watched.cam_from_rig):
+        for c, pose in enumerate(monitored.cam_from_rig):
             own = [v for v in views if v.camera == c]
             group = np.array([number[v.frame, v.view.board.board_id] for v in own], dtype=np.int64)
             groups.append(group)
@@ -217,7 +217,7 @@ class _PosedBoards:
                 weights.append(np.zeros((0, 0)))
                 continue
             seen = Observations.from_views([v.view for v in own])
-            state, weight = _posed(watched, c, seen)
+            state, weight = _posed(monitored, c, seen)
             back = pose.inverse()
             for k, g in enumerate(group.tolist()):
                 if seen.present[k].sum() > most[g]:
@@ -229,22 +229,22 @@ class _PosedBoards:
         frame = np.array([frames[name] for name, _ in keys], dtype=np.int64)
         return cls(rotation, translation, frame, tuple(observations), tuple(groups), tuple(weights))
 
-    def state(self, watched: Watched, c: int, observations: Observations) -> State:
+    def state(self, monitored: Monitored, c: int, observations: Observations) -> State:
         """Return camera `c` before its boards, as their poses in the rig have them."""
-        pose, group = watched.cam_from_rig[c], self.group[c]
+        pose, group = monitored.cam_from_rig[c], self.group[c]
         rotation = pose.rotation @ self.rotation[group]
         translation = self.translation_mm[group] @ pose.rotation.T + pose.translation_mm
-        return watched.state(c, observations, rotation, translation)
+        return monitored.state(c, observations, rotation, translation)
 
-    def products(self, watched: Watched) -> FloatArray:
+    def products(self, monitored: Monitored) -> FloatArray:
         """Return for each board in a frame the sums of the products of its rows, (G, T + 7, T + 7): derivatives by
         theta and by its pose in the rig, and the residual."""
-        layout, each = watched.layout, []
+        layout, each = monitored.layout, []
         for c, (seen, pose, lens) in enumerate(
-            zip(self.observations, watched.cam_from_rig, layout.cameras, strict=True)
+            zip(self.observations, monitored.cam_from_rig, layout.cameras, strict=True)
         ):
             if seen is not None:
-                own = view_products(seen, self.state(watched, c, seen), self.weight[c])
+                own = view_products(seen, self.state(monitored, c, seen), self.weight[c])
                 lever = self.translation_mm[self.group[c]] @ pose.rotation.T
                 follow = pose_jacobians_of_mount(pose.rotation, layout.mounts[c], self.group[c], lever)
                 each.append((own, np.arange(lens.start, lens.stop), (follow,)))
@@ -255,21 +255,21 @@ class _PosedBoards:
         rotation = exp_so3(step[:, :3]) @ self.rotation
         return replace(self, rotation=rotation, translation_mm=self.translation_mm + step[:, 3:])
 
-    def residual_squares(self, watched: Watched) -> tuple[float, int, int]:
+    def residual_squares(self, monitored: Monitored) -> tuple[float, int, int]:
         """Return the sum of the squared residuals of the corners kept, px^2, how many these are, and how many not."""
         total, kept, left = 0.0, 0, 0
         for c, seen in enumerate(self.observations):
             if seen is not None:
                 used = self.weight[c] > 0.0
-                total += float((evaluate(self.state(watched, c, seen), seen).px[used] ** 2).sum())
+                total += float((evaluate(self.state(monitored, c, seen), seen).px[used] ** 2).sum())
                 kept, left = kept + int(used.sum()), left + int((seen.present & ~used).sum())
         return total, max(kept, 1), left
 
 
-def _posed(watched: Watched, c: int, observations: Observations) -> tuple[State, FloatArray]:
+def _posed(monitored: Monitored, c: int, observations: Observations) -> tuple[State, FloatArray]:
     """Return every board where its own view by camera `c` puts it, and the weights of its corners, zero for those that
     stray."""
-    camera, poses = watched.cameras[c], []
+    camera, poses = monitored.cameras[c], []
     for view in observations.views:
         try:
             poses.append(cam_from_seen_board(camera, view.pixels, view.points()))
@@ -280,7 +280,7 @@ def _posed(watched: Watched, c: int, observations: Observations) -> tuple[State,
             ) from error
     rotation = np.array([pose.rotation for pose in poses])
     translation = np.array([pose.translation_mm for pose in poses])
-    state = watched.state(c, observations, rotation, translation)
+    state = monitored.state(c, observations, rotation, translation)
     state, _ = refine_poses(observations, state, observations.weight)
     norm = evaluate(state, observations).weighted(observations)
     kept = inliers(norm, observations, sigma_of(norm, observations.present), camera.size_px)

@@ -15,10 +15,10 @@ from rigkit.cameras.base import Camera
 from rigkit.cameras.board_pose import cam_from_seen_board
 from rigkit.core.detections import BoardView, grid_turned
 from rigkit.core.errors import DegenerateError, InputError
-from rigkit.validation.sentinel.evidence import FreshView, Watched
+from rigkit.validation.sentinel.evidence import FreshView, Monitored
 from rigkit.validation.sentinel.judge import check_views
 
-WAYS_TO_FLIP = {
+FLIPS = {
     "turned by half a turn": (-1.0, -1.0),
     "mirrored left to right": (-1.0, 1.0),
     "mirrored top to bottom": (1.0, -1.0),
@@ -29,34 +29,36 @@ MIN_SHARE_FLIPPED = 0.01
 lenses lie off the middle by 0.1 to 3.5 % (camodocal-fisheye, bouguet-stereo), and a flip doubles that."""
 
 
-def flipped_pictures(watched: Watched, views: Sequence[FreshView]) -> str:
+def flipped_pictures(monitored: Monitored, views: Sequence[FreshView]) -> str:
     """Return how pictures must have been flipped, of a rig those of which camera or of all, where they fit once they
     are put back: several ways in words where they look the same. "" where none does, and where the flip is too small to
     tell."""
-    count = len(watched.cameras)
+    count = len(monitored.cameras)
     if count > 1:
         # To a board one camera in a mirror is the other one in a mirror, where the rig looks the same in it.
         one = [
-            f"those of '{name}' {way}" for c, name in enumerate(watched.names) for way in _ways(watched, views, (c,))
+            f"those of '{name}' {flip}"
+            for c, name in enumerate(monitored.names)
+            for flip in _fitting_flips(monitored, views, (c,))
         ]
         if one:
             return " or ".join(one)
-    return " or ".join(_ways(watched, views, tuple(range(count))))
+    return " or ".join(_fitting_flips(monitored, views, tuple(range(count))))
 
 
-def _ways(watched: Watched, views: Sequence[FreshView], which: tuple[int, ...]) -> list[str]:
+def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tuple[int, ...]) -> list[str]:
     """Return in how many ways the pictures of some cameras fit once they are put back, in words."""
-    cameras = [watched.cameras[c] for c in which]
+    cameras = [monitored.cameras[c] for c in which]
     # A board that another camera sees, too, stands elsewhere in a flipped picture: that is no knock.
     whose = {frame: {v.camera for v in views if v.frame == frame} for frame in {v.frame for v in views}}
     together = any(len(seen) > 1 and not seen.isdisjoint(which) for seen in whose.values())
     fit = []
-    for words, signs in WAYS_TO_FLIP.items():
+    for words, signs in FLIPS.items():
         if not together and max(_moved(camera, signs) for camera in cameras) < MIN_SHARE_FLIPPED:
             continue
         # In a mirror a board's columns or its rows are counted backwards, as the colours of its ends have it.
-        ways = (0, 1) if np.prod(signs) < 0.0 else (None,)
-        if any(_fits(watched, _all_put_back(watched, views, which, signs, way)) for way in ways):
+        flips = (0, 1) if np.prod(signs) < 0.0 else (None,)
+        if any(_fits(monitored, _all_put_back(monitored, views, which, signs, flip)) for flip in flips):
             fit.append(words)
     return fit
 
@@ -68,7 +70,7 @@ def _moved(camera: Camera, signs: tuple[float, float]) -> float:
 
 
 def _all_put_back(
-    watched: Watched,
+    monitored: Monitored,
     views: Sequence[FreshView],
     which: tuple[int, ...],
     signs: tuple[float, float],
@@ -78,12 +80,12 @@ def _all_put_back(
     out = [view for view in views if view.camera not in which]
     for view in views:
         if view.camera in which:
-            put = _put_back(view, signs, watched.cameras[view.camera].size_px, backwards)
-            out.append(counted_alike(watched, put, out))
+            put = _put_back(view, signs, monitored.cameras[view.camera].size_px, backwards)
+            out.append(counted_alike(monitored, put, out))
     return out
 
 
-def counted_alike(watched: Watched, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
+def counted_alike(monitored: Monitored, fresh: FreshView, before: Sequence[FreshView]) -> FreshView:
     """Return a view of a board that looks the same turned, numbered from the end from which another camera did."""
     view, c = fresh.view, fresh.camera
     name = view.board.board_id
@@ -92,22 +94,22 @@ def counted_alike(watched: Watched, fresh: FreshView, before: Sequence[FreshView
         return fresh
     first = same[0]
     try:
-        pose = cam_from_seen_board(watched.cameras[first.camera], first.view.pixels, first.view.points())
+        pose = cam_from_seen_board(monitored.cameras[first.camera], first.view.pixels, first.view.points())
     except (InputError, DegenerateError):
         return fresh
-    here = watched.cam_from_rig[c] @ watched.cam_from_rig[first.camera].inverse() @ pose
+    here = monitored.cam_from_rig[c] @ monitored.cam_from_rig[first.camera].inverse() @ pose
     turned = replace(view, grid=grid_turned(view.grid, view.board.size, 2))
 
     def apart(one: BoardView) -> float:
-        pixels, seen = watched.cameras[c].project(here.apply(one.points()))
+        pixels, seen = monitored.cameras[c].project(here.apply(one.points()))
         return float(np.median(np.linalg.norm(pixels - one.pixels, axis=1)[seen])) if seen.any() else np.inf
 
     return replace(fresh, view=turned) if apart(turned) < apart(view) else fresh
 
 
-def _fits(watched: Watched, views: Sequence[FreshView]) -> bool:
+def _fits(monitored: Monitored, views: Sequence[FreshView]) -> bool:
     try:
-        return check_views(watched, views).holds
+        return check_views(monitored, views).holds
     except (DegenerateError, InputError):
         return False
 

@@ -15,7 +15,7 @@ from rigkit.planning.candidates import CANDIDATES_KEPT, Reach, held_boards, sees
 from rigkit.planning.goal import Goal
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, Proposal, choose_views, covariance_of
-from rigkit.validation.sentinel.evidence import Watched, told_by
+from rigkit.validation.sentinel.evidence import Monitored, board_information
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,14 +39,14 @@ class Frames:
     information: FloatArray
 
     @classmethod
-    def of(cls, watched: Watched, boards: Sequence[Board], reach: Reach) -> Frames:
+    def of(cls, monitored: Monitored, boards: Sequence[Board], reach: Reach) -> Frames:
         """Raises DegenerateError where no board fits into the image of any camera."""
         parts: list[Frames] = []
         refused: DegenerateError | None = None
         for number, board in enumerate(boards):
-            for c in range(len(watched.cameras)):
+            for c in range(len(monitored.cameras)):
                 try:
-                    parts.append(cls._before(watched, c, board, number, reach))
+                    parts.append(cls._before(monitored, c, board, number, reach))
                 except DegenerateError as error:
                     refused = error
         if not parts:
@@ -55,49 +55,49 @@ class Frames:
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
 
     @classmethod
-    def _before(cls, watched: Watched, c: int, board: Board, number: int, reach: Reach) -> Frames:
+    def _before(cls, monitored: Monitored, c: int, board: Board, number: int, reach: Reach) -> Frames:
         """Return frames in which camera `c` sees the board; they are spread evenly, and so are the first of them."""
-        held = held_boards(watched.cameras[c], board, reach)
-        held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(watched.cameras)))))
-        in_rig = held.transformed(watched.cam_from_rig[c].inverse())
+        held = held_boards(monitored.cameras[c], board, reach)
+        held = held.chosen(np.arange(min(len(held), -(-CANDIDATES_KEPT // len(monitored.cameras)))))
+        in_rig = held.transformed(monitored.cam_from_rig[c].inverse())
         seen = np.stack(
             [
                 sees_held(camera, board, in_rig.transformed(pose), reach)
-                for camera, pose in zip(watched.cameras, watched.cam_from_rig, strict=True)
+                for camera, pose in zip(monitored.cameras, monitored.cam_from_rig, strict=True)
             ],
             axis=1,
         )
         seen[:, c] = True
         corners = [own[:, None] & board.exists() for own in seen.T]
         count = np.ones(len(held), dtype=np.int64)
-        told = told_by(watched, board, in_rig.rotation, in_rig.translation_mm, corners)
-        return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, told)
+        gained = board_information(monitored, board, in_rig.rotation, in_rig.translation_mm, corners)
+        return cls(in_rig.rotation, in_rig.translation_mm, number * count, seen, c * count, gained)
 
-    def plan(self, watched: Watched, boards: Sequence[Board], goal: Goal, count: int) -> Plan:
+    def plan(self, monitored: Monitored, boards: Sequence[Board], goal: Goal, count: int) -> Plan:
         """Return the `count` frames that would lower the goal's error most. Images are taken to disagree as those of
         the calibration do."""
-        inverse, sigma = covariance_of(watched.covariance), watched.fresh_sigma_px
+        inverse, sigma = covariance_of(monitored.covariance), monitored.fresh_sigma_px
         taken, errors = choose_views(inverse, self.information / sigma**2, goal, count)
-        known = Knowledge(watched.cameras[0], inverse, CornerError(sigma))
-        views = self.proposals(watched, boards, taken, errors)
-        return Plan(known, goal, float(goal.error(watched.covariance)), views)
+        known = Knowledge(monitored.cameras[0], inverse, CornerError(sigma))
+        views = self.proposals(monitored, boards, taken, errors)
+        return Plan(known, goal, float(goal.error(monitored.covariance)), views)
 
     def proposals(
-        self, watched: Watched, boards: Sequence[Board], taken: Sequence[int], errors: Sequence[float]
+        self, monitored: Monitored, boards: Sequence[Board], taken: Sequence[int], errors: Sequence[float]
     ) -> tuple[Proposal, ...]:
         """Return some, and the errors after them, as views of the cameras for which they were thought of."""
         return tuple(
-            self._proposal(k, watched, boards[self.board[k]], error) for k, error in zip(taken, errors, strict=True)
+            self._proposal(k, monitored, boards[self.board[k]], error) for k, error in zip(taken, errors, strict=True)
         )
 
-    def _proposal(self, index: int, watched: Watched, board: Board, error: float) -> Proposal:
+    def _proposal(self, index: int, monitored: Monitored, board: Board, error: float) -> Proposal:
         c = int(self.owner[index])
         rig_from_board = Rigid3(self.rotation[index], self.translation_mm[index])
-        names = [watched.names[c], *(n for k, n in enumerate(watched.names) if self.seen[index, k] and k != c)]
+        names = [monitored.names[c], *(n for k, n in enumerate(monitored.names) if self.seen[index, k] and k != c)]
         return Proposal(
             board,
-            watched.cam_from_rig[c] @ rig_from_board,
+            monitored.cam_from_rig[c] @ rig_from_board,
             error,
-            watched.cameras[c],
-            tuple(names) if len(watched.names) > 1 else (),
+            monitored.cameras[c],
+            tuple(names) if len(monitored.names) > 1 else (),
         )

@@ -14,7 +14,7 @@ from rigkit.cameras.moving_pupil import far_camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.rotation import skew
 from rigkit.planning.goal import GOAL_GRID, Goal, projection_goal
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 
 FIELD_GRID = (24, 18)
 FIT_RANK = 1e-9
@@ -40,7 +40,7 @@ class Hypothesis:
     @property
     def words(self) -> str:
         """What happened, in words."""
-        told = {
+        texts = {
             "focus": "the focus of {} changed",
             "principal point": "the principal point of {} moved",
             "distortion": "the distortion of {} changed",
@@ -50,14 +50,14 @@ class Hypothesis:
             "moved": "{} was shifted and turned",
             "scale": "the scale changed: all baselines alike, or the board's squares are not what they were",
         }
-        return told[self.kind].format("the camera" if self.camera is None else f"camera '{self.camera}'")
+        return texts[self.kind].format("the camera" if self.camera is None else f"camera '{self.camera}'")
 
 
-def hypotheses_of(watched: Watched) -> list[Hypothesis]:
+def hypotheses_of(monitored: Monitored) -> list[Hypothesis]:
     """Return what may have happened, the simplest first."""
-    several = len(watched.cameras) > 1
-    layout, lenses, mounts = watched.layout, [], []
-    for c, (name, camera) in enumerate(zip(watched.names, watched.cameras, strict=True)):
+    several = len(monitored.cameras) > 1
+    layout, lenses, mounts = monitored.layout, [], []
+    for c, (name, camera) in enumerate(zip(monitored.names, monitored.cameras, strict=True)):
         own = name if several else None
         whole = np.zeros((layout.count, 6))
         whole[layout.cameras[c]] = _lens_directions(camera)
@@ -69,24 +69,24 @@ def hypotheses_of(watched: Watched) -> list[Hypothesis]:
             ("lens", slice(0, 6)),
         ):
             lenses.append(Hypothesis(kind, own, whole[:, part], units[part]))
-        if several and (c > 0 or len(watched.cameras) > 2):
-            turn = _mount_directions(watched, c)
+        if several and (c > 0 or len(monitored.cameras) > 2):
+            turn = _mount_directions(monitored, c)
             mounts.append(Hypothesis("rotation", own, turn[:, :3], ("deg",) * 3))
             mounts.append(Hypothesis("shift", own, turn[:, 3:], ("mm",) * 3))
             mounts.append(Hypothesis("moved", own, turn, ("deg",) * 3 + ("mm",) * 3))
     if several:
         scale = np.zeros((layout.count, 1))
-        for c, pose in enumerate(watched.cam_from_rig[1:], start=1):
+        for c, pose in enumerate(monitored.cam_from_rig[1:], start=1):
             scale[layout.mount(c)][3:, 0] = 0.01 * pose.translation_mm
         mounts.append(Hypothesis("scale", None, scale, ("%",)))
     return sorted([*lenses, *mounts], key=lambda hypothesis: hypothesis.directions.shape[1])
 
 
-def lens_goals(watched: Watched) -> list[Goal]:
+def lens_goals(monitored: Monitored) -> list[Goal]:
     """Return for each camera the rms change of its projection of what is far away, after the best rotation, over its
     image."""
-    out, layout = [], watched.layout
-    for camera, run in zip(watched.cameras, layout.cameras, strict=True):
+    out, layout = [], monitored.layout
+    for camera, run in zip(monitored.cameras, layout.cameras, strict=True):
         far = far_camera(camera)
         goal, own = projection_goal(far), slice(run.start, run.start + far.parameters.size)
         weight = np.zeros((layout.count, layout.count))
@@ -135,21 +135,21 @@ def _lens_directions(camera: Camera) -> FloatArray:
     return out
 
 
-def _mount_directions(watched: Watched, c: int) -> FloatArray:
+def _mount_directions(monitored: Monitored, c: int) -> FloatArray:
     """Return the change of theta (T, 6) where camera `c` turns by a degree about its own axes or is shifted by a
     millimetre along them: x in it becomes exp(w) x + v."""
-    layout, degree = watched.layout, np.radians(1.0)
+    layout, degree = monitored.layout, np.radians(1.0)
     out = np.zeros((layout.count, 6))
     if c > 0:
         # exp(w) (R x + t) + v: the turn swings t, too.
-        pose = watched.cam_from_rig[c]
+        pose = monitored.cam_from_rig[c]
         run = layout.mount(c)
         out[run.start : run.start + 3, :3] = degree * np.eye(3)
         out[run.start + 3 : run.stop, :3] = -degree * skew(pose.translation_mm)
         out[run.start + 3 : run.stop, 3:] = np.eye(3)
         return out
     # The first is the frame: when it moves, all others move the other way.
-    for k, pose in enumerate(watched.cam_from_rig[1:], start=1):
+    for k, pose in enumerate(monitored.cam_from_rig[1:], start=1):
         run = layout.mount(k)
         out[run.start : run.start + 3, :3] = -degree * pose.rotation
         out[run.start + 3 : run.stop, 3:] = -pose.rotation

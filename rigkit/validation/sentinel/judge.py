@@ -20,12 +20,12 @@ from rigkit.calibration.solving.clustered import LARGE_FREEDOM
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
 from rigkit.planning.goal import Goal
-from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.evidence import FreshEvidence, FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.power import Power, powers_of
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
-Look: TypeAlias = Callable[[Watched], FreshEvidence]
+Look: TypeAlias = Callable[[Monitored], FreshEvidence]
 """What fresh frames say, given cameras and mounts."""
 
 ALARM_CHANCE = 0.01
@@ -106,7 +106,7 @@ class SentinelCheck:
     ----------
     chance : probability that an unchanged camera or rig shows at least as much.
     change : what explains the pictures best, alarming or not; None where no hypothesis can be told.
-    watched, fixed : as calibrated, and after `change`.
+    monitored, fixed : as calibrated, and after `change`.
     step, covariance : change of theta (T,), and its covariance (T, T).
     rms_px, rms_fixed_px : of the fresh corners before and after.
     expected_px : rms that corners of unchanged cameras show, with what the calibration leaves open.
@@ -116,13 +116,13 @@ class SentinelCheck:
     cost : error that the change makes in the user's measurement (rms over the image), in `cost_unit`.
     flipped : how the pictures must have been flipped if nothing changed (`flipped_pictures`); "" where that is no
         explanation, or was not asked.
-    baseline : what was wrong before; `watched` is without it. None where fresh frames are held against the file.
+    baseline : what was wrong before; `monitored` is without it. None where fresh frames are held against the file.
     """
 
     chance: float
     change: Change | None
-    watched: Watched
-    fixed: Watched
+    monitored: Monitored
+    fixed: Monitored
     step: FloatArray
     covariance: FloatArray
     rms_px: float
@@ -140,7 +140,7 @@ class SentinelCheck:
     @property
     def unexplained(self) -> bool:
         """Nothing that may happen to these cameras explains the pictures: another camera, or another board."""
-        return _inexplicable(self.rms_fixed_px, self.expected_px)
+        return _exceeds_expected(self.rms_fixed_px, self.expected_px)
 
     @property
     def holds(self) -> bool:
@@ -150,57 +150,57 @@ class SentinelCheck:
         return self.change is None or self.chance >= ALARM_CHANCE or self.change.max_px < ALARM_PX
 
 
-def _inexplicable(rms_px: float, expected_px: float) -> bool:
+def _exceeds_expected(rms_px: float, expected_px: float) -> bool:
     """Say whether residuals are beyond all that is expected; those that are no numbers are."""
     return not rms_px <= max(MAX_OF_EXPECTED * expected_px, ALARM_PX)
 
 
-def check_views(watched: Watched, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
-    """Return whether fresh views of boards agree with what is `watched`; `cost` weighs a change of theta by what it
+def check_views(monitored: Monitored, views: Sequence[FreshView], cost: Sequence[Goal] = ()) -> SentinelCheck:
+    """Return whether fresh views of boards agree with what is `monitored`; `cost` weighs a change of theta by what it
     does to a measurement (the worst of several), by default to the projection.
 
     Raises as `evidence_of`.
     """
-    return judge_evidence(watched, lambda now: evidence_of(now, views), cost)
+    return evaluate_evidence(monitored, lambda now: evidence_of(now, views), cost)
 
 
-def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
+def evaluate_evidence(monitored: Monitored, look: Look, cost: Sequence[Goal] = ()) -> SentinelCheck:
     """Return the verdict on what `look` finds in fresh frames."""
-    evidence = look(watched)
-    expected_px, known, chance = _expected_px(watched, evidence), list[Change](), 1.0
+    evidence = look(monitored)
+    expected_px, known, chance = _expected_px(monitored, evidence), list[Change](), 1.0
     try:
-        whitened = Whitened.of(watched, evidence)
-        known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(watched)) if c is not None]
+        whitened = Whitened.of(monitored, evidence)
+        known = [c for c in (_fitted(whitened, hypothesis) for hypothesis in hypotheses_of(monitored)) if c is not None]
     except DegenerateError:
         # Pictures of something else are far from all that can be linearised: that is the verdict.
-        if not _inexplicable(evidence.rms_px, expected_px):
+        if not _exceeds_expected(evidence.rms_px, expected_px):
             raise
         chance = 0.0
-    step, covariance, change = np.zeros(watched.layout.count), watched.covariance, None
-    fixed, after = watched, evidence
+    step, covariance, change = np.zeros(monitored.layout.count), monitored.covariance, None
+    fixed, after = monitored, evidence
     if known:
         chance = _chance_of_any(whitened, known)
         penalty = float(np.log(max(len(whitened.score), 3)))
         best = max(known, key=lambda c: _evident(c, penalty))
-        amounts, fixed, after = _refined(watched, look, best)
+        amounts, fixed, after = _refined(monitored, look, best)
         for rival in sorted(known, key=lambda c: _cost(c, penalty)):
             if _cost(rival, penalty) >= _cost(best, penalty) or rival.gain < AS_MUCH * best.gain:
                 continue
-            other = _refined(watched, look, rival)
+            other = _refined(monitored, look, rival)
             left = after.corners * (other[2].rms_px ** 2 - after.rms_px**2) / expected_px**2
             if left < _cost(best, penalty) - _cost(rival, penalty):
                 best, (amounts, fixed, after) = rival, other
                 break
         step = best.hypothesis.directions @ amounts
         unsure = best.hypothesis.directions @ best.covariance @ best.hypothesis.directions.T
-        covariance = watched.covariance + unsure
-        size_px, max_px = _sizes_px(watched, evidence, step, unsure)
+        covariance = monitored.covariance + unsure
+        size_px, max_px = _sizes_px(monitored, evidence, step, unsure)
         change = replace(best, amounts=amounts, size_px=size_px, max_px=max_px)
-    goals = cost or lens_goals(watched)
+    goals = cost or lens_goals(monitored)
     return SentinelCheck(
         chance=chance,
         change=change,
-        watched=watched,
+        monitored=monitored,
         fixed=fixed,
         step=step,
         covariance=covariance,
@@ -211,19 +211,19 @@ def judge_evidence(watched: Watched, look: Look, cost: Sequence[Goal] = ()) -> S
         corners=evidence.corners,
         tried=tuple(known),
         powers=()
-        if _inexplicable(after.rms_px, expected_px)
-        else powers_of(watched, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
+        if _exceeds_expected(after.rms_px, expected_px)
+        else powers_of(monitored, evidence, [c.hypothesis for c in known], ALARM_CHANCE),
         cost=float(np.sqrt(max([0.0, *(float(step @ g.weight @ step) for g in goals)]))),
         cost_unit=goals[0].unit,
     )
 
 
-def _expected_px(watched: Watched, evidence: FreshEvidence) -> float:
+def _expected_px(monitored: Monitored, evidence: FreshEvidence) -> float:
     """Return the rms that corners of unchanged cameras show: their scatter, and what the calibration leaves open."""
     shown = evidence.information.sum(axis=0) / evidence.corners
     # Pictures of something else may be too far off for any derivative: they say nothing of that.
     with np.errstate(over="ignore", invalid="ignore"):
-        left_open = float((shown * watched.covariance).sum())
+        left_open = float((shown * monitored.covariance).sum())
     return float(np.sqrt(evidence.expected_px**2 + (max(left_open, 0.0) if np.isfinite(left_open) else 0.0)))
 
 
@@ -260,11 +260,11 @@ def _cost(change: Change, penalty: float) -> float:
     return change.amounts.size * penalty + rare
 
 
-def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, Watched, FreshEvidence]:
+def _refined(monitored: Monitored, look: Look, change: Change) -> tuple[FloatArray, Monitored, FreshEvidence]:
     """Return the amounts of a change, what is watched after it, and what the frames say then: linearised anew there, as
     long as that is possible."""
     amounts = change.amounts
-    fixed = watched.changed(change.hypothesis.directions @ amounts)
+    fixed = monitored.changed(change.hypothesis.directions @ amounts)
     after = look(fixed)
     for _ in range(FIX_ROUNDS):
         try:
@@ -273,7 +273,7 @@ def _refined(watched: Watched, look: Look, change: Change) -> tuple[FloatArray, 
             again = None
         if again is None:
             break
-        closer = watched.changed(change.hypothesis.directions @ (amounts + again.amounts))
+        closer = monitored.changed(change.hypothesis.directions @ (amounts + again.amounts))
         try:
             then = look(closer)
         except DegenerateError:  # A step so wide that the lens sees nothing any more.
@@ -304,22 +304,24 @@ def _fitted(whitened: Whitened, hypothesis: Hypothesis) -> Change | None:
     )
 
 
-def _sizes_px(watched: Watched, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray) -> tuple[float, float]:
+def _sizes_px(
+    monitored: Monitored, evidence: FreshEvidence, step: FloatArray, unsure: FloatArray
+) -> tuple[float, float]:
     """Return how large a change of theta (T,) is, whose estimate has the covariance `unsure`. It is the largest of:
     over the image of the camera that suffers most, after the best rotation; how far a camera that turned on its mount
     sees what is far away move; what the corners show of it. The square of an estimate is too large by its variance,
     which is taken off; and the same where it is not."""
     shown = evidence.information.sum(axis=0) / evidence.corners
-    turns = [_turn_weight(watched, c) for c in range(1, len(watched.cameras))]
-    weights = [shown, *(goal.weight for goal in lens_goals(watched)), *turns]
+    turns = [_turn_weight(monitored, c) for c in range(1, len(monitored.cameras))]
+    weights = [shown, *(goal.weight for goal in lens_goals(monitored)), *turns]
     squares = np.array([(step @ weight @ step, (weight * unsure).sum()) for weight in weights])
     return float(np.sqrt(max(0.0, *(squares[:, 0] - squares[:, 1])))), float(np.sqrt(max(0.0, *squares[:, 0])))
 
 
-def _turn_weight(watched: Watched, c: int) -> FloatArray:
+def _turn_weight(monitored: Monitored, c: int) -> FloatArray:
     """Return what a turn of camera `c` in a change of theta moves, (T, T): see `turn_weight`."""
-    layout = watched.layout
+    layout = monitored.layout
     turn = layout.mount(c).start
     out = np.zeros((layout.count, layout.count))
-    out[turn : turn + 3, turn : turn + 3] = turn_weight(watched.cameras[c])
+    out[turn : turn + 3, turn : turn + 3] = turn_weight(monitored.cameras[c])
     return out

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chndtr, fdtri, gammaincinv
 
 from rigkit.core.arrays import FloatArray
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
 from rigkit.validation.sentinel.hypotheses import Hypothesis, lens_goals
 from rigkit.validation.sentinel.whitened import NULL_RANK, Whitened
 
@@ -61,21 +61,21 @@ class Power:
 
 
 def powers_of(
-    watched: Watched, evidence: FreshEvidence, hypotheses: Iterable[Hypothesis], alarm_chance: float
+    monitored: Monitored, evidence: FreshEvidence, hypotheses: Iterable[Hypothesis], alarm_chance: float
 ) -> tuple[Power, ...]:
     """Return how well changes of each lens, and turns of mounts, would have been seen by frames like these, where a
     chance below `alarm_chance` of any of the hypotheses is an alarm."""
     hypotheses = list(hypotheses)
-    several = [Whitened.of(watched, _repeated(evidence, times)) for times in TIMES]
-    surer = [
-        Whitened.of(replace(watched, covariance=watched.covariance / times), _repeated(evidence, times))
+    several = [Whitened.of(monitored, _repeated(evidence, times)) for times in TIMES]
+    more_precise = [
+        Whitened.of(replace(monitored, covariance=monitored.covariance / times), _repeated(evidence, times))
         for times in TIMES
     ]
-    goals = dict(zip(watched.names, lens_goals(watched), strict=True))
+    goals = dict(zip(monitored.names, lens_goals(monitored), strict=True))
     out = []
     for hypothesis in hypotheses:
         if hypothesis.kind in LENS_KINDS:
-            weight = goals[hypothesis.camera or watched.names[0]].weight
+            weight = goals[hypothesis.camera or monitored.names[0]].weight
             metric, size, unit = hypothesis.directions.T @ weight @ hypothesis.directions, CHANGED_PX, "px"
         elif hypothesis.kind == "rotation":
             metric, size, unit = np.eye(3), TURNED_DEG, "deg"
@@ -85,10 +85,14 @@ def powers_of(
         now = _Shown.of(several[0], hypothesis, metric, alone)
         enough, both = (
             next(
-                (t for t, w in zip(TIMES, thought, strict=True) if _Shown.of(w, hypothesis, metric, alone).finds(size)),
+                (
+                    t
+                    for t, w in zip(TIMES, hypothetical, strict=True)
+                    if _Shown.of(w, hypothesis, metric, alone).finds(size)
+                ),
                 None,
             )
-            for thought in (several, surer)
+            for hypothetical in (several, more_precise)
         )
         out.append(
             Power(

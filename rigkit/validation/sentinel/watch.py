@@ -15,10 +15,10 @@ from rigkit.cameras.moving_pupil import PUPIL_TERMS, NearCamera
 from rigkit.cameras.uncertain import UncertainCamera
 from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 
 
-def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Watched:
+def monitored_camera(calibration: Calibration, name: str, *, beyond_model: bool = True) -> Monitored:
     """Return a camera as it was calibrated, by default with what its lens may do beyond its model; its pupil, where
     that moves, is as unsure as it was solved for."""
     known = (
@@ -26,7 +26,7 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
         if beyond_model
         else UncertainCamera(calibration.near, calibration.near_covariance[:-6, :-6])
     )
-    return Watched(
+    return Monitored(
         names=(name,),
         cameras=(known.camera,),
         cam_from_rig=(Rigid3.identity(),),
@@ -38,10 +38,10 @@ def watched_camera(calibration: Calibration, name: str, *, beyond_model: bool = 
     )
 
 
-def watched_rig(rig: RigCalibration) -> Watched:
+def monitored_rig(rig: RigCalibration) -> Monitored:
     """Return a rig as it was calibrated, with what its lenses may do beyond their models."""
     cameras, covariance = rig.with_departures
-    central = Watched(
+    central = Monitored(
         names=tuple(c.name for c in rig.cameras),
         cameras=cameras,
         cam_from_rig=tuple(c.cam_from_rig for c in rig.cameras),
@@ -54,7 +54,7 @@ def watched_rig(rig: RigCalibration) -> Watched:
     return with_pupils(central, rig.pupils)
 
 
-def with_pupils(central: Watched, pupils: Mapping[str, SolvedPupil]) -> Watched:
+def with_pupils(central: Monitored, pupils: Mapping[str, SolvedPupil]) -> Monitored:
     """Return cameras with the pupils, by name, that move, and the covariance of all their parameters.
 
     A pupil e follows lenses and mounts x as their covariance has it, e = W x + rest; the rests of two pupils are taken

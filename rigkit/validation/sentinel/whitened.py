@@ -14,7 +14,7 @@ import numpy as np
 from rigkit.calibration.solving.clustered import effective_freedom
 from rigkit.core.arrays import FloatArray
 from rigkit.core.errors import DegenerateError
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
 
 COMMON_FREEDOM = 10.0
 """By how much more images disagree than independent corners would is one number, the mean over all directions: lens and
@@ -37,7 +37,7 @@ class Whitened:
     freedom: float
 
     @classmethod
-    def of(cls, watched: Watched, evidence: FreshEvidence) -> Whitened:
+    def of(cls, monitored: Monitored, evidence: FreshEvidence) -> Whitened:
         information = evidence.information.sum(axis=0) / evidence.variance_px2
         score = evidence.score.sum(axis=0) / evidence.variance_px2
         # Scaled to a unit diagonal: parameters differ by many powers of ten.
@@ -53,7 +53,7 @@ class Whitened:
         root = np.sqrt(values[seen])
         left = vectors[:, seen] * root / scale[:, None]
         own = (vectors[:, seen] * scale[:, None]).T @ score / root
-        covariance = np.eye(len(own)) + left.T @ watched.covariance @ left
+        covariance = np.eye(len(own)) + left.T @ monitored.covariance @ left
         if not len(own) or np.linalg.cond(covariance) > MAX_CONDITION_NUMBER:
             raise DegenerateError(
                 "check: beside these pictures, what the calibration says of its own numbers is worth nothing (its "
@@ -61,7 +61,7 @@ class Whitened:
             )
         freedom = min(
             effective_freedom(known.freedom, known.overdispersion, len(own), COMMON_FREEDOM)
-            for known in (watched, evidence)
+            for known in (monitored, evidence)
         )
         return cls(own, covariance, left.T, freedom)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.judging.verdicts import judge_session
+from rigkit.calibration.judging.verdicts import diagnose_session
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.rig.board_ties import suggest_ties
 from rigkit.core.errors import DegenerateError, InputError
@@ -155,7 +155,7 @@ def calibration_from(
                 raise
             raise InputError(f"{shown} ({error})") from error
     also = [*suggest_ties(views, result), *interlaced(result, named_images(session))]
-    verdicts = judge_session(result, dropped, also)
+    verdicts = diagnose_session(result, dropped, also)
     if verdicts[0].severity is Severity.BAD:
         shown = misread(session.images, session.boards)
         if shown is not None and 2 * len(views) < len(session.images):

@@ -30,7 +30,7 @@ from rigkit.workflows.inputs.frames import (
     frames_folder,
     frames_of_video,
     frames_of_videos,
-    timestamps_beside,
+    timestamps_next_to,
     with_frames,
 )
 from rigkit.workflows.inputs.paths import NamesFiles
@@ -61,13 +61,13 @@ def calibrate_sources(
     Raises as `calibrate_folders` and `calibrate_session_file` do.
     """
     first = sources[0]
-    is_told = folder_options != FolderOptions(timestamps=folder_options.timestamps)
-    if len(sources) == 1 and not is_told and (first / SESSION_NAME).is_file():
+    has_options = folder_options != FolderOptions(timestamps=folder_options.timestamps)
+    if len(sources) == 1 and not has_options and (first / SESSION_NAME).is_file():
         first = first / SESSION_NAME
     # An image alone is told what would do instead.
     if len(sources) > 1 or first.is_dir() or is_video(first) or first.suffix.lower() in IMAGE_ENDINGS:
         return calibrate_folders(sources, folder_options, options, progress=progress)
-    if is_told:
+    if has_options:
         if not first.exists():
             raise InputError(
                 f"calibrate: '{first}' does not exist; give a folder of images, a video or a session's file"
@@ -139,14 +139,14 @@ def calibrate_folders(
         output=options.output,
         known=options.known,
     )
-    new = {path: text for path, text in wanted.files.items() if not _says(path, text)}
+    new = {path: text for path, text in wanted.files.items() if not _has_content(path, text)}
     results = [path for path in (options.output, options.report) if path not in (None, Path())]
-    told = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
-    ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *told])
+    declared = [*folders, *([folder_options.timestamps] if folder_options.timestamps else [])]
+    ensure_writable([*new, *results], force=options.force, inputs=[*(set(wanted.files) - set(new)), *declared])
     before = {path: read_bytes(path, "session") for path in new if path.exists()}
     write_together(dict(new), force=options.force)
     try:
-        with _told_of(folders, wanted.path):
+        with _errors_about(folders, wanted.path):
             return calibrate_session_file(wanted.path, options, progress=progress)
     except BaseException:
         if before:
@@ -157,19 +157,19 @@ def calibrate_folders(
         raise
 
 
-def _boards(places: Sequence[Path], told: FolderOptions, progress: Progress) -> tuple[str, ...]:
+def _boards(places: Sequence[Path], declared: FolderOptions, progress: Progress) -> tuple[str, ...]:
     """Return the boards that are told, or those that images show, with squares as large as is told."""
-    if told.boards and told.square_mm is not None:
+    if declared.boards and declared.square_mm is not None:
         raise InputError("calibrate: --board says how large squares are; leave --square-mm out")
-    if told.square_mm is None:
-        return told.boards
-    boards = boards_seen(places, told.square_mm, progress)
+    if declared.square_mm is None:
+        return declared.boards
+    boards = boards_seen(places, declared.square_mm, progress)
     _log.info(f"the images show --board {' --board '.join(boards)}")
     return boards
 
 
 @contextmanager
-def _told_of(given: Sequence[str | Path], session: Path) -> Iterator[None]:
+def _errors_about(given: Sequence[str | Path], session: Path) -> Iterator[None]:
     """Let errors of the block name the folders and videos that a person gave, not the session that was made of them:
     after a failure it is gone again."""
     with about(*given):
@@ -218,7 +218,7 @@ def _folders_of(
     cameras = {video.stem: video for video in videos}
     if len(cameras) < len(videos):
         raise InputError("calibrate: two videos have the same name, which names a camera; rename one")
-    times = timestamps or timestamps_beside(videos)
+    times = timestamps or timestamps_next_to(videos)
     frames_of_videos(cameras, folder, seen, timestamps=times, progress=progress)
     return [folder / name for name in cameras]
 
@@ -233,7 +233,7 @@ def _videos_inside(place: Path) -> list[Path]:
     return [path for path in inside if path.suffix.lower() in VIDEO_ENDINGS] or [place]
 
 
-def _says(path: Path, text: str) -> bool:
+def _has_content(path: Path, text: str) -> bool:
     """Say whether the file is there and says this, whatever its comments are."""
     if not path.is_file():
         return False

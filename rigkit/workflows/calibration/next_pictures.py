@@ -22,7 +22,7 @@ from rigkit.planning.plan import Plan, plan_views
 from rigkit.planning.rig_goal import rig_goal
 from rigkit.validation.certificate.contracts import Instrument, Quantity, Task
 from rigkit.validation.certificate.propagation import gradients, measured_points
-from rigkit.validation.sentinel.evidence import Watched
+from rigkit.validation.sentinel.evidence import Monitored
 from rigkit.validation.sentinel.frames import Frames
 
 NEXT_VIEWS = 3
@@ -51,7 +51,7 @@ def next_views(
 
 
 def next_frames(
-    watched: Watched, boards: Sequence[Board], count: int, *, length: Task | None = None, reach: Reach | None = None
+    watched: Monitored, boards: Sequence[Board], count: int, *, length: Task | None = None, reach: Reach | None = None
 ) -> Plan:
     """Return the frames that would improve a rig most: of every camera at one moment, of one board. Boards are taken
     for flat, and images to disagree as those of the calibration do.

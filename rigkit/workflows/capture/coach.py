@@ -20,10 +20,10 @@ from rigkit.cameras.base import Camera
 from rigkit.coach.coach import Coach, Image, Take, ignored
 from rigkit.coach.guide import GuideOptions, stated_words
 from rigkit.coach.keeper import Keeper, folder_of
-from rigkit.coach.look import Glance
+from rigkit.coach.look import FrameObservation
 from rigkit.coach.rig_whole import left_of_rig
 from rigkit.coach.server import LOCAL, coach_app, new_token, own_address, serve
-from rigkit.coach.sources import Frame, device_frames, watched_frames
+from rigkit.coach.sources import Frame, device_frames, frames_of_folders
 from rigkit.core.errors import DegenerateError, InputError, RigkitError
 from rigkit.core.findings import Severity, worst
 from rigkit.core.processes import worker_pool
@@ -41,7 +41,7 @@ from rigkit.workflows.calibration.calibrate_any import calibrate_session_file
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.folder_session import session_to_come
-from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_beside
+from rigkit.workflows.inputs.frames import frames_of_videos, moments_of_videos, timestamps_next_to
 from rigkit.workflows.inputs.paths import NamesFiles
 
 LOCALHOST, EVERYWHERE = "127.0.0.1", "0.0.0.0"
@@ -164,7 +164,7 @@ def coach_recording(
     Raises InputError where a video cannot be read, or shows no board.
     """
     sources, boards = dict(zip(coach.keeper.names, videos, strict=True)), coach.guide.options.boards
-    times = timestamps_beside(videos)
+    times = timestamps_next_to(videos)
 
     def tell(what: str, done: int, total: int) -> None:
         coach.say(f"{what.capitalize()}: {done} of {total}")
@@ -178,7 +178,7 @@ def coach_recording(
     guide = coach.guide
     if not guide.frames:
         return ""
-    advice = guide.advise([Glance(size_px=glance.size_px, view=None) for glance in guide.frames[-1]])
+    advice = guide.advise([FrameObservation(size_px=glance.size_px, view=None) for glance in guide.frames[-1]])
     more = advice.more_percent
     bring = "" if more is None else f"; two more pictures would bring {more:.0f} %"
     return "" if advice.enough else f". What it lacks: {advice.words[0].lower()}{advice.words[1:]}{bring}"
@@ -255,5 +255,5 @@ def _frames(options: CoachOptions) -> Iterator[Frame] | None:
     if sum(bool(source) for source in (options.watch, options.video, options.device)) > 1:
         raise InputError("coach: frames come from one place: --watch, --video or --device")
     if options.watch:
-        return watched_frames(options.watch)
+        return frames_of_folders(options.watch)
     return device_frames(options.device) if options.device else None

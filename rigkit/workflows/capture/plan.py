@@ -26,19 +26,19 @@ from rigkit.planning.plan import Plan, plan_views
 from rigkit.report.pages.check_page import power_table
 from rigkit.report.pages.plan_page import plan_page
 from rigkit.validation.certificate.contracts import Task
-from rigkit.validation.sentinel.evidence import Watched
-from rigkit.validation.sentinel.telling import views_that_tell
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.change_aim import informative_views
+from rigkit.validation.sentinel.evidence import Monitored
+from rigkit.validation.sentinel.watch import monitored_camera
 from rigkit.workflows.calibration.calibrate import CalibrateOptions, calibrate_session, session_inputs
 from rigkit.workflows.calibration.next_pictures import NEXT_VIEWS, goal_of, next_frames, next_views
-from rigkit.workflows.checks.check import load_watched
+from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad, warn_of_pupil
 from rigkit.workflows.inputs.corners import Cache
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
 
-USUAL_SIGMA_PX = 0.15
-USUAL_RHO = 0.05
+TYPICAL_SIGMA_PX = 0.15
+TYPICAL_RHO = 0.05
 """What corners of real boards have: so much scatter, and this part of its variance in common in a view (50 corners then
 count like 15)."""
 
@@ -71,7 +71,7 @@ class LensOptions:
     boards: tuple[Board, ...]
     model: str | None = None
     """Camera model; None: the usual one for such a lens."""
-    sigma_px: float = USUAL_SIGMA_PX
+    sigma_px: float = TYPICAL_SIGMA_PX
     """Standard deviation of a corner."""
 
 
@@ -105,13 +105,13 @@ def plan_session(
         require_sure(source)
         warn_if_bad(source)
     if rig:
-        watched, boards = load_watched(source)
+        monitored, boards = load_monitored(source)
         if not boards:
             raise InputError(f"plan: '{source}' does not say what boards there are; calibrate it with rigkit")
         if options.check:
-            return _checked(watched, boards, options, source)
+            return _checked(monitored, boards, options, source)
         with about(source):
-            plan = next_frames(watched, boards, options.count, length=options.length, reach=options.reach)
+            plan = next_frames(monitored, boards, options.count, length=options.length, reach=options.reach)
         return _shown(plan, options, f"Next pictures for {source.name}", source)
     if source.suffix == ".toml":
         session = load_session(source)
@@ -128,7 +128,7 @@ def plan_session(
             raise InputError(f"plan: no whole board was seen for '{source}'; give the session that it was made from")
     taken = calibration.corners.used[0]
     if options.check:
-        return _checked(watched_camera(calibration, source.stem), boards, options, source, taken)
+        return _checked(monitored_camera(calibration, source.stem), boards, options, source, taken)
     warn_of_pupil(source, calibration)
     with about(source):
         plan = next_views(calibration, boards, options.count, length=options.length, reach=options.reach)
@@ -136,11 +136,11 @@ def plan_session(
 
 
 def _checked(
-    watched: Watched, boards: Sequence[Board], options: PlanOptions, source: Path, taken: Pixels | None = None
+    monitored: Monitored, boards: Sequence[Board], options: PlanOptions, source: Path, taken: Pixels | None = None
 ) -> PlannedSession:
     """Return the pictures to check a camera or a rig with."""
     with about(source):
-        plan, powers = views_that_tell(watched, boards, options.count, options.reach)
+        plan, powers = informative_views(monitored, boards, options.count, options.reach)
     found = (power_table(powers, "What these pictures would find"),)
     return _shown(plan, options, f"Pictures to check {source.name} with", source, taken, found)
 
@@ -152,7 +152,7 @@ def plan_lens(lens: LensOptions, options: PlanOptions) -> PlannedSession:
     """
     ensure_writable(options.report, force=options.force)
     camera = guessed_camera(lens.hfov_deg, lens.size_px, lens.model)
-    knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, USUAL_RHO))
+    knowledge = Knowledge.guessed(camera, CornerError(lens.sigma_px, TYPICAL_RHO))
     plan = plan_views(
         knowledge, lens.boards, goal_of(camera, options.reach, options.length), options.count, reach=options.reach
     )

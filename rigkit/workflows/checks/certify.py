@@ -18,7 +18,7 @@ from rigkit.report.pages.certificate_page import certificate_facts, certificate_
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.certify import certify
 from rigkit.validation.certificate.contracts import Certificate, Instrument, Task
-from rigkit.workflows.checks.check import load_watched
+from rigkit.workflows.checks.check import load_monitored
 from rigkit.workflows.inputs.camera_files import called_bad
 from rigkit.workflows.inputs.paths import NamesFiles
 from rigkit.workflows.outputs.provenance import digest_line, software_facts
@@ -68,8 +68,8 @@ def certify_file(path: str | Path, task: Task, options: CertifyOptions | None = 
     if (bad := called_bad(path)) is not None:
         certificate = replace(certificate, findings=(bad, *certificate.findings))
     if any(isinstance(camera, NearCamera) for camera in certificate.instrument.cameras):
-        said = Finding.good("the lens does not look from one point: how its entrance pupil moves is counted in")
-        certificate = replace(certificate, findings=(*certificate.findings, said))
+        message = Finding.good("the lens does not look from one point: how its entrance pupil moves is counted in")
+        certificate = replace(certificate, findings=(*certificate.findings, message))
     title = f"Certificate: {task.quantity} with {Path(path).name}"
     facts = {Path(path).name: digest_line(Path(path)), **software_facts()}
     files: dict[Path, str | bytes] = {}
@@ -92,7 +92,7 @@ def load_instrument(
     rig = is_rig_file(path)
     if cameras is not None and not rig:
         raise InputError(f"'{path}': --cameras names two cameras of a rig, and this is not a rig's file")
-    known, _ = load_watched(Path(path))
+    known, _ = load_monitored(Path(path))
     if rig and len(known.names) < 2:
         raise InputError(f"'{path}': a rig of one camera; give that camera's calibration")
     return Instrument.of(replace(known, sigma_px=sigma_px or known.sigma_px), cameras)

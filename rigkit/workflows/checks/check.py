@@ -41,11 +41,11 @@ from rigkit.report.pages.check_page import check_facts, check_page
 from rigkit.report.pages.page_facts import PageFacts
 from rigkit.validation.certificate.contracts import Task
 from rigkit.validation.sentinel.baseline import judge_since
-from rigkit.validation.sentinel.epipolar import matches_of_scenes, matches_say
-from rigkit.validation.sentinel.evidence import FreshView, Watched, evidence_of
+from rigkit.validation.sentinel.epipolar import evidence_of_matches, matches_of_scenes
+from rigkit.validation.sentinel.evidence import FreshView, Monitored, evidence_of
 from rigkit.validation.sentinel.flipped import counted_alike, flipped_pictures
-from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, judge_evidence
-from rigkit.validation.sentinel.watch import watched_camera, with_pupils
+from rigkit.validation.sentinel.judge import Look, SentinelCheck, check_views, evaluate_evidence
+from rigkit.validation.sentinel.watch import monitored_camera, with_pupils
 from rigkit.workflows.calibration.next_pictures import length_goals
 from rigkit.workflows.detect import images_in
 from rigkit.workflows.inputs.camera_files import require_sure, warn_if_bad
@@ -107,12 +107,12 @@ def check_pictures(
     exchanged, or a file that cannot be written; DegenerateError: pictures that say nothing of the camera.
     """
     options, source = options or CheckOptions(), Path(path)
-    watched, known = load_watched(source)
+    monitored, known = load_monitored(source)
     warn_if_bad(source)
     if not images:
         raise InputError("check: give fresh images, or a folder of them")
-    now = _frames(watched, [Path(image) for image in images])
-    before = _frames(watched, options.before) if options.before else []
+    now = _frames(monitored, [Path(image) for image in images])
+    before = _frames(monitored, options.before) if options.before else []
     inputs = [source, *(image for frame in (*now, *before) for image in frame)]
     ensure_writable((options.fix, options.report), force=options.force, inputs=inputs)
     if options.history is not None:
@@ -120,16 +120,18 @@ def check_pictures(
     both = {path for frame in now for path in frame} & {path for frame in before for path in frame}
     if both:
         raise InputError(f"check: '{min(both)}' is both a fresh image and one of before")
-    goals = [] if options.length is None else length_goals(watched.cameras, watched.cam_from_rig, options.length)
-    pictures = _Pictures(source=source, watched=watched, boards=options.boards or known, known=known, progress=progress)
+    goals = [] if options.length is None else length_goals(monitored.cameras, monitored.cam_from_rig, options.length)
+    pictures = _Pictures(
+        source=source, monitored=monitored, boards=options.boards or known, known=known, progress=progress
+    )
     with about(source):
         look, views = pictures.seen(now, scene=options.scene)
         if before:
-            check = judge_since(watched, pictures.seen(before, scene=options.scene)[0], look, goals)
+            check = judge_since(monitored, pictures.seen(before, scene=options.scene)[0], look, goals)
         else:
-            check = judge_evidence(watched, look, goals)
+            check = evaluate_evidence(monitored, look, goals)
         if views and not check.holds:
-            check = replace(check, flipped=flipped_pictures(check.watched, views))
+            check = replace(check, flipped=flipped_pictures(check.monitored, views))
             _require_right_order(check, views)
     files = _files(source, check, options)
     write_together(files, force=options.force)
@@ -168,7 +170,7 @@ def _register(
     add_entry(register, entry)
 
 
-def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
+def load_monitored(source: Path) -> tuple[Monitored, tuple[Board, ...]]:
     """Return what a file of a calibration or a rig says, and the whole boards it knows.
 
     Raises InputError for another file, or one that does not say how sure it is.
@@ -178,15 +180,15 @@ def load_watched(source: Path) -> tuple[Watched, tuple[Board, ...]]:
         known = load_calibration(source)
         with about(source):
             boards = without_parts(shape.board for shape in known.boards)
-        return watched_camera(known, source.stem), boards
+        return monitored_camera(known, source.stem), boards
     rig = load_saved_rig(source)
-    return _watched_rig(rig, source), without_parts(rig.boards)
+    return _monitored_rig(rig, source), without_parts(rig.boards)
 
 
-def _watched_rig(known: SavedRig, source: Path) -> Watched:
+def _monitored_rig(known: SavedRig, source: Path) -> Monitored:
     """Return what a rig's file says; raises InputError for one that does not say how sure it is."""
     lenses, covariance, sigma_px = known.stated(source)
-    central = Watched(
+    central = Monitored(
         names=tuple(known.cameras),
         cameras=lenses,
         cam_from_rig=tuple(pose for _, pose in known.cameras.values()),
@@ -199,17 +201,17 @@ def _watched_rig(known: SavedRig, source: Path) -> Watched:
     return with_pupils(central, known.pupils)
 
 
-def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
+def _frames(monitored: Monitored, sources: Sequence[Path]) -> list[list[Path]]:
     """Return the images of every moment, one a camera."""
-    count = len(watched.cameras)
+    count = len(monitored.cameras)
     if count == 1:
         return [[image] for image in images_in(sources)]
     if all(source.is_dir() for source in sources):
         if len(sources) != count:
-            names = ", ".join(watched.names)
+            names = ", ".join(monitored.names)
             raise InputError(f"check: a rig of {count} cameras ({names}) needs {count} folders, got {len(sources)}")
         by_name = {source.name: source for source in sources}
-        ordered = [by_name[name] for name in watched.names] if set(by_name) == set(watched.names) else sources
+        ordered = [by_name[name] for name in monitored.names] if set(by_name) == set(monitored.names) else sources
         columns = [list(images_in([source])) for source in ordered]
         if len({len(column) for column in columns}) > 1:
             counts = ", ".join(f"{len(column)} in '{s}'" for column, s in zip(columns, ordered, strict=True))
@@ -219,7 +221,7 @@ def _frames(watched: Watched, sources: Sequence[Path]) -> list[list[Path]]:
     if len(images) % count:
         raise InputError(
             f"check: {len(images)} different images, which are not moments of {count} cameras each "
-            f"({', '.join(watched.names)}); give as many of each camera"
+            f"({', '.join(monitored.names)}); give as many of each camera"
         )
     return [images[k : k + count] for k in range(0, len(images), count)]
 
@@ -230,7 +232,7 @@ class _Pictures:
     what was left out of them, and what could not be used, so far."""
 
     source: Path
-    watched: Watched
+    monitored: Monitored
     boards: Sequence[Board]
     known: Sequence[Board]
     progress: Progress
@@ -240,27 +242,27 @@ class _Pictures:
     def seen(self, frames: Sequence[Sequence[Path]], *, scene: bool) -> tuple[Look, list[FreshView]]:
         """Return what frames say, given cameras, and the boards in them; none of a scene."""
         if scene:
-            if len(self.watched.cameras) < 2:
+            if len(self.monitored.cameras) < 2:
                 raise InputError(
                     "check: a scene without boards tells of a rig only; one camera needs pictures of a board"
                 )
             read = [self._read(frame) for frame in frames]
-            matches = matches_of_scenes(self.watched, [images for images in read if images], progress=self.progress)
-            return (lambda now: matches_say(now, matches)), []
+            matches = matches_of_scenes(self.monitored, [images for images in read if images], progress=self.progress)
+            return (lambda now: evidence_of_matches(now, matches)), []
         if not self.boards:
             raise InputError(f"check: '{self.source}' does not say what boards there are; give --board 9x6x25")
         found = self._boards_seen(frames)
         wrong = other_size({name: own for each in found for name, own in each.items()}, self.boards, self.known)
         if wrong is not None:
             raise InputError(f"check: {wrong}; give the board that the pictures show with --board")
-        views = _views(self.watched, frames, found, self.boards, self.left_out)
+        views = _views(self.monitored, frames, found, self.boards, self.left_out)
         if not views:
             raise InputError(f"check: {_nothing_to_check(self.left_out, self.unreadable, self.boards)}")
         return (lambda now: evidence_of(now, views)), views
 
     def _read(self, frame: Sequence[Path]) -> list[Any]:
         """Return the images of a moment, none where one cannot be used: why goes to `unreadable`."""
-        images = [self._image(camera, path) for camera, path in zip(self.watched.cameras, frame, strict=True)]
+        images = [self._image(camera, path) for camera, path in zip(self.monitored.cameras, frame, strict=True)]
         return [] if any(image is None for image in images) else images
 
     def _image(self, camera: Camera, path: Path) -> Any:
@@ -273,7 +275,7 @@ class _Pictures:
 
     def _boards_seen(self, frames: Sequence[Sequence[Path]]) -> list[dict[str, Sequence[BoardDetection]]]:
         """Return of every camera what each of its images shows; why one cannot be used goes to `unreadable`."""
-        total, cameras = sum(len(frame) for frame in frames), self.watched.cameras
+        total, cameras = sum(len(frame) for frame in frames), self.monitored.cameras
         found: list[dict[str, Sequence[BoardDetection]]] = [{} for _ in cameras]
         for k, frame in enumerate(frames):
             for c, path in enumerate(frame):
@@ -286,7 +288,7 @@ class _Pictures:
 
 
 def _views(
-    watched: Watched,
+    monitored: Monitored,
     frames: Sequence[Sequence[Path]],
     seen: Sequence[Mapping[str, Sequence[BoardDetection]]],
     boards: Sequence[Board],
@@ -295,14 +297,14 @@ def _views(
     """Return the boards in all images; one without any goes to `left_out`, with the reason."""
     out: list[FreshView] = []
     own = [without_lookalikes(found, boards) for found in seen]
-    whose = watched.names if len(watched.names) > 1 else (None,)
+    whose = monitored.names if len(monitored.names) > 1 else (None,)
     for k, frame in enumerate(frames):
         name = f"{k:04d}"
         for c, path in enumerate(frame):
             if str(path) not in own[c]:
                 continue
             views, reason = views_of_image(path.name, own[c][str(path)], boards, whose[c])
-            out += [counted_alike(watched, FreshView(name, c, view), out) for view in views]
+            out += [counted_alike(monitored, FreshView(name, c, view), out) for view in views]
             if reason is not None:
                 left_out.append((str(path), reason))
     return out
@@ -322,12 +324,12 @@ def _nothing_to_check(left_out: Sequence[tuple[str, str]], unreadable: Sequence[
 def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> None:
     """Raise InputError where the images of two cameras of a rig exchanged say that it holds, or are explained by what
     may happen to it while these are not: cameras of one lens might as well have changed their places."""
-    names = check.watched.names
+    names = check.monitored.names
     for i, j in combinations(range(len(names)), 2):
         other = {i: j, j: i}
         trial = [replace(view, camera=other.get(view.camera, view.camera)) for view in views]
         try:
-            exchanged = check_views(check.watched, trial)
+            exchanged = check_views(check.monitored, trial)
         except (DegenerateError, InputError):
             continue
         if exchanged.holds or (check.unexplained and not exchanged.unexplained):
@@ -342,16 +344,16 @@ def _require_right_order(check: SentinelCheck, views: Sequence[FreshView]) -> No
 def fixed_text(source: Path, check: SentinelCheck) -> str:
     """Return the file `source` with the change that explains the pictures, and a finding that says so."""
     data: dict[str, Any] = json.loads(source.read_text(encoding="utf-8"))
-    watched = load_watched(source)[0]
+    monitored = load_monitored(source)[0]
     # Of a change since pictures of before, that alone.
-    fixed, own = watched.changed(check.step), watched.of_models
+    fixed, own = monitored.changed(check.step), monitored.of_models
     since = "" if check.baseline is None else f" beside {check.baseline.frames} of before"
-    said = Finding.look(
+    message = Finding.look(
         f"corrected from {check.frames} fresh frames{since}: {check.change}; views and residuals are older",
         "calibrate anew when there is time",
     )
     # What the lenses may do beyond their models the file says by itself; nothing that happens changes a pupil.
-    covariance = np.array(data["covariance"]) + (check.covariance - check.watched.covariance)[np.ix_(own, own)]
+    covariance = np.array(data["covariance"]) + (check.covariance - check.monitored.covariance)[np.ix_(own, own)]
     if "cameras" in data:
         for entry, camera, pose in zip(data["cameras"], fixed.cameras, fixed.cam_from_rig, strict=True):
             entry["camera"] = camera_to_json(lens_of(far_camera(camera)))
@@ -366,5 +368,5 @@ def fixed_text(source: Path, check: SentinelCheck) -> str:
         else:
             data["frame_covariance"] = with_block(frame, covariance, 1.0).tolist()
     data["covariance"] = covariance.tolist()
-    data["verdicts"] = [*findings_to_json([said]), *data.get("verdicts", [])]
+    data["verdicts"] = [*findings_to_json([message]), *data.get("verdicts", [])]
     return json_text(data)

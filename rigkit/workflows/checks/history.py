@@ -28,14 +28,14 @@ from rigkit.io.disk.reading import about
 from rigkit.io.disk.writing import ensure_writable, write_atomic
 from rigkit.planning.information import MIN_SIGMA_PX
 from rigkit.report.pages.history_page import history_page, overwritten
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
-from rigkit.validation.sentinel.judge import judge_evidence
-from rigkit.validation.sentinel.watch import watched_camera
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
+from rigkit.validation.sentinel.judge import evaluate_evidence
+from rigkit.validation.sentinel.watch import monitored_camera
 from rigkit.workflows.inputs.camera_files import warn_if_bad
 from rigkit.workflows.outputs.provenance import digest_line, digest_of, software_facts
 
 RECALIBRATION_GRID = (40, 30)
-CLOCKS_APART = timedelta(days=1)
+MAX_CLOCK_DIFFERENCE = timedelta(days=1)
 """Machines of one lab may differ by less: their zones, or how well their clocks are set."""
 _log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ def show_history(
     """
     ensure_writable(report, force=force, inputs=[register])
     kept = load_history(register)
-    earlier = sum(one.moment - two.moment > CLOCKS_APART for one, two in pairwise(kept))
+    earlier = sum(one.moment - two.moment > MAX_CLOCK_DIFFERENCE for one, two in pairwise(kept))
     if earlier:
         _log.warning(
             "register '%s': %s follow one of a later day: a clock was wrong, or registers were joined; they are shown "
@@ -57,7 +57,7 @@ def show_history(
             register,
             "1 entry" if earlier == 1 else f"{earlier} entries",
         )
-    to_come = [entry.date for entry in kept if entry.moment - datetime.now(UTC) > CLOCKS_APART]
+    to_come = [entry.date for entry in kept if entry.moment - datetime.now(UTC) > MAX_CLOCK_DIFFERENCE]
     if to_come:
         _log.warning(
             "register '%s': %s to come, '%s' the last: a clock was wrong; correct the dates in that file",
@@ -66,8 +66,8 @@ def show_history(
             to_come[-1],
         )
     entries = tuple(sorted(kept, key=lambda entry: entry.moment))
-    for said in (*overwritten(editions(entries)), *_since(register, entries)):
-        _log.warning("register '%s': %s", register, said)
+    for message in (*overwritten(editions(entries)), *_since(register, entries)):
+        _log.warning("register '%s': %s", register, message)
     if report is None:
         return entries, ()
     facts = software_facts() | {register.name: digest_line(register)}
@@ -104,8 +104,8 @@ def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c:
     with about(new, reference):
         # Both follow what the lens does beyond its model.
         central = replace(before, pupil=None)
-        watched = watched_camera(central, reference.stem, beyond_model=False)
-        check = judge_evidence(watched, lambda watched: _as_evidence(watched, now))
+        watched = monitored_camera(central, reference.stem, beyond_model=False)
+        check = evaluate_evidence(watched, lambda watched: _as_evidence(watched, now))
     places = as_seen_from(register, new), as_seen_from(register, reference)
     entry = HistoryEntry.of_check(
         check, places[0], reference=places[1], digest=digest_of(reference), temperature_c=temperature_c
@@ -113,7 +113,7 @@ def add_to_history(register: Path, new: Path, reference: Path, *, temperature_c:
     add_entry(register, entry)
 
 
-def _as_evidence(watched: Watched, calibration: Calibration) -> FreshEvidence:
+def _as_evidence(watched: Monitored, calibration: Calibration) -> FreshEvidence:
     """Return what another calibration says of the camera watched: its covariance is the inverse of its information. Its
     free rotation is taken out first."""
     camera, new = watched.cameras[0], calibration.camera

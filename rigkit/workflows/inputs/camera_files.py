@@ -127,7 +127,7 @@ def warn_if_bad(path: str | Path, verdicts: Iterable[Finding] | None = None) -> 
         _log.warning("'%s': %s", path, bad.message)
 
 
-def told_of_pupil(calibration: Calibration) -> str | None:
+def pupil_note(calibration: Calibration) -> str | None:
     """Return what is to be said where a lens is taken for one that looks from one point; None where it does."""
     if calibration.pupil is None:
         return None
@@ -147,14 +147,14 @@ def warn_of_pupils(path: str | Path, rig: SavedRig) -> None:
     """Say where lenses of a rig's file are taken for ones that look from one point, and do not."""
     for name, pupil in rig.pupils.items():
         if name in rig.outlines:
-            told = _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
-            _log.warning("'%s': %s", path, told)
+            note = _left_out(f"camera '{name}'", rig.cameras[name][0], pupil.terms, rig.outlines[name])
+            _log.warning("'%s': %s", path, note)
 
 
 def warn_of_pupil(path: str | Path, calibration: Calibration) -> None:
     """Say where the lens of a file is taken for one that looks from one point, and does not."""
-    if (told := told_of_pupil(calibration)) is not None:
-        _log.warning("'%s': %s", path, told)
+    if (note := pupil_note(calibration)) is not None:
+        _log.warning("'%s': %s", path, note)
 
 
 def is_rig(path: str | Path) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 
 from rigkit.calibration.calibrate import calibrate
-from rigkit.calibration.views.usable import GRIDS_BESIDE, other_size, views_of_image, without_lookalikes
+from rigkit.calibration.views.usable import OTHER_GRIDS, other_size, views_of_image, without_lookalikes
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import DegenerateError, InputError
@@ -84,7 +84,7 @@ def session_views(
         own, reason = views_of_image(name, boards[name], session.boards, session.camera)
         views += own
         if reason is None and len(boards[name]) < len(item.detections):
-            reason = GRIDS_BESIDE
+            reason = OTHER_GRIDS
         if reason is not None:
             dropped.append((name, reason))
     wrong = other_size({name: item.detections for name, item in found.items()}, session.boards)

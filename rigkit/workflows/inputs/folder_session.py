@@ -85,7 +85,7 @@ def session_of_folders(
     known : what stays as it is of several cameras.
     """
     if not boards:
-        raise InputError(_untold(folders))
+        raise InputError(_missing_board_message(folders))
     cameras = cameras_in(folders)
     for folder in dict.fromkeys(folder for own in cameras.values() for folder, _ in own):
         name_unread(folder)
@@ -182,7 +182,7 @@ def _shown(places: Sequence[Path], progress: Progress = silent) -> Suggestion:
     return suggestion(sorted(image for folder, pattern in entries for image in folder.glob(pattern)), progress)
 
 
-def _untold(folders: Sequence[Path]) -> str:
+def _missing_board_message(folders: Sequence[Path]) -> str:
     """Return what to say where no board is given: what the images show of it."""
     shown = _shown(folders)
     if shown.fault is not None:

@@ -59,7 +59,7 @@ class FrameChoice:
 
     def offer(self, frame: KeptFrame) -> tuple[bool, list[int]]:
         """Consider `frame`; return whether it is kept, and the numbers of those that are no longer."""
-        near = [k for k, other in self.kept.items() if _apart(frame, other) < self._radius]
+        near = [k for k, other in self.kept.items() if _frame_distance(frame, other) < self._radius]
         self.near_copies += bool(near)
         if near and frame.sigma_px > CLEARLY_SHARPER * min(self.kept[k].sigma_px for k in near):
             return False, []
@@ -87,7 +87,7 @@ class FrameChoice:
         ordered = sorted(self.kept.values(), key=lambda frame: frame.sigma_px)
         rest: list[KeptFrame] = []
         for frame in ordered:
-            if all(_apart(frame, other) >= self._radius for other in rest):
+            if all(_frame_distance(frame, other) >= self._radius for other in rest):
                 rest.append(frame)
         gone = set(self.kept) - {frame.number for frame in rest}
         self.kept = {frame.number: frame for frame in sorted(rest, key=lambda frame: frame.number)}
@@ -98,14 +98,14 @@ class FrameChoice:
         with the one that most cameras see the sharpest."""
         frames = list(self.kept.values())
         first = min(range(len(frames)), key=lambda k: (-len(frames[k].views), frames[k].sigma_px))
-        chosen, apart = [first], np.array([_apart(frames[first], other) for other in frames])
+        chosen, distance = [first], np.array([_frame_distance(frames[first], other) for other in frames])
         while len(chosen) < self._max_frames:
-            chosen.append(int(apart.argmax()))
-            apart = np.minimum(apart, [_apart(frames[chosen[-1]], other) for other in frames])
+            chosen.append(int(distance.argmax()))
+            distance = np.minimum(distance, [_frame_distance(frames[chosen[-1]], other) for other in frames])
         return [frames[k].number for k in chosen]
 
 
-def _apart(one: KeptFrame, two: KeptFrame) -> float:
+def _frame_distance(one: KeptFrame, two: KeptFrame) -> float:
     """Return how far apart two moments are, in extents of the board: by the camera that sees most of a difference; far
     where one sees the board only once."""
     if one.views.keys() != two.views.keys():

@@ -74,7 +74,7 @@ def frames_folder(sources: Sequence[Path]) -> Path:
     return place / ("frames" if len(sources) > 1 else f"{stem}-frames")
 
 
-def timestamps_beside(sources: Sequence[Path]) -> Path | None:
+def timestamps_next_to(sources: Sequence[Path]) -> Path | None:
     """Return the timestamps.csv in the folder of the videos, None where there is none."""
     path = sources[0].parent / "timestamps.csv"
     return path if len(sources) > 1 and path.is_file() else None
@@ -158,8 +158,8 @@ def frames_of_videos(
 
 def _warn_of_clocks(videos: Mapping[str, Video]) -> None:
     """Say where lengths or rates of videos contradict that frames of one number are of one moment."""
-    for what, told in (("frames", "count"), ("frames per second", "rate_hz")):
-        known = {name: value for name, video in videos.items() if (value := getattr(video, told))}
+    for what, stored in (("frames", "count"), ("frames per second", "rate_hz")):
+        known = {name: value for name, video in videos.items() if (value := getattr(video, stored))}
         if len({round(value, 2) for value in known.values()}) > 1:
             words = ", ".join(f"{value:.6g} of '{name}'" for name, value in known.items())
             _log.warning(
@@ -248,7 +248,7 @@ def with_frames(session: Session | RigSession, progress: Progress = silent) -> S
         raise InputError(f"{session.path}: several videos of one camera; keep one")
     boards = next(iter(own.values())).boards
     done = frames_of_videos(
-        sources, place, boards, timestamps=timestamps_beside(list(sources.values())), progress=progress
+        sources, place, boards, timestamps=timestamps_next_to(list(sources.values())), progress=progress
     )
     cameras: dict[str, Session] = {}
     for name, camera in own.items():
@@ -339,10 +339,10 @@ def _kept_before(folder: Path, asked: Mapping[str, object]) -> VideoFrames | Non
     if not (folder / RECORD).is_file():
         return None
     try:
-        told = json.loads(read_text(folder / RECORD, "record"))
-        images = {name: tuple(folder / p for p in paths) for name, paths in told["images"].items()}
-        counts = {key: int(told[key]) for key in ("looked_at", "with_boards", "near_copies")}
-        same = told["schema"] == FRAMES_SCHEMA and told["asked"] == json.loads(json.dumps(asked))
+        stored = json.loads(read_text(folder / RECORD, "record"))
+        images = {name: tuple(folder / p for p in paths) for name, paths in stored["images"].items()}
+        counts = {key: int(stored[key]) for key in ("looked_at", "with_boards", "near_copies")}
+        same = stored["schema"] == FRAMES_SCHEMA and stored["asked"] == json.loads(json.dumps(asked))
     except (InputError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
     if not same or not all(path.is_file() for paths in images.values() for path in paths):

@@ -13,8 +13,8 @@ from rigkit.core.printing import brief, counted
 from rigkit.core.progress import Progress, silent
 from rigkit.detection.detect import detect_boards
 from rigkit.detection.doubtful import doubtful_grid
+from rigkit.detection.duplicate_marks import duplicate_boards
 from rigkit.detection.saddles.response import GreyImage, grey_image
-from rigkit.detection.twins import alike_boards
 from rigkit.detection.unknown import BoardGuess, difference, guess_board
 from rigkit.detection.whole_grids import MIN_IMAGES_OF_GUESS
 from rigkit.io.boards.board_words import words_of_board
@@ -30,7 +30,7 @@ EXPLAINING_IMAGES = 4
 MIN_SHARE_OF_IMAGES = 0.5
 """A board is in this part of the images, at least, or something else may be in them."""
 
-FRAMES_APART = 10
+FRAME_STRIDE = 10
 """Frames from one that is looked at to the next, of a video that does not say how many it has."""
 
 
@@ -92,11 +92,11 @@ def identify_board(paths: Sequence[str | Path], *, progress: Progress = silent) 
             raise InputError(f"no board is seen in {counted(len(names), 'image')}, and {unreadable[0]}")
         seen = _doubtful(list(images.items())) or "no chessboard, ChArUco board, AprilGrid or grid of circles"
         raise CheckFailed(f"no board is seen in {counted(len(names), 'image')}: {seen}")
-    if not guess.told:
-        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_untold(guess)}")
+    if not guess.determined:
+        raise CheckFailed(f"{counted(len(guess.images), 'image')} of {len(names)} show {_partial_board_words(guess)}")
     pictures = list(images.values())
     elsewhere = _elsewhere([(names[k], pictures[k]) for k in range(len(names)) if k not in guess.images])
-    twice = tuple(names[k] for k in guess.images if alike_boards(pictures[k], [guess.board]) is not None)
+    twice = tuple(names[k] for k in guess.images if duplicate_boards(pictures[k], [guess.board]) is not None)
     return IdentifiedBoard(
         board=guess.board,
         seen=tuple(names[k] for k in guess.images),
@@ -116,7 +116,11 @@ def _elsewhere(rest: Sequence[tuple[str, GreyImage]]) -> tuple[str, tuple[str, .
     if len(rest) < MIN_IMAGES_OF_GUESS:
         return None
     guess = guess_board([image for _, image in rest])
-    if guess is None or not guess.told or len(guess.images) < max(MIN_IMAGES_OF_GUESS, MIN_SHARE_OF_IMAGES * len(rest)):
+    if (
+        guess is None
+        or not guess.determined
+        or len(guess.images) < max(MIN_IMAGES_OF_GUESS, MIN_SHARE_OF_IMAGES * len(rest))
+    ):
         return None
     return words_of_board(guess.board), tuple(rest[k][0] for k in guess.images)
 
@@ -127,11 +131,11 @@ def explained(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     if mirrored is not None:
         return mirrored
     guess, *_ = _guess(paths)
-    if guess is None or not guess.told:
+    if guess is None or not guess.determined:
         return None
-    told = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
-    words = [one for one in told if one is not None]
-    if len(words) < len(told) or not words:
+    determined = [difference(seen, board) for board in boards for seen in (guess.board, *guess.beside)]
+    words = [one for one in determined if one is not None]
+    if len(words) < len(determined) or not words:
         return None
     what, count = guess.board.describe().split(", ")[0], len(guess.images)
     if what in words[0]:
@@ -153,9 +157,9 @@ def misread(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
 def _alike(paths: Sequence[Path], boards: Sequence[Board]) -> str | None:
     """Say that images show two boards with the same marks; None where they do not."""
     for name, image in _pictures(paths, EXPLAINING_IMAGES):
-        said = None if isinstance(image, InputError) else alike_boards(image, boards)
-        if said is not None:
-            return f"image '{Path(name).name}': {said}"
+        message = None if isinstance(image, InputError) else duplicate_boards(image, boards)
+        if message is not None:
+            return f"image '{Path(name).name}': {message}"
     return None
 
 
@@ -242,14 +246,14 @@ def suggestion(paths: Sequence[Path], progress: Progress = silent) -> Suggestion
         return Suggestion(fault=otherwise)
     if guess is None:
         return Suggestion(doubt=_doubtful(pictures))
-    if not guess.told:
-        return Suggestion(part=_untold(guess))
+    if not guess.determined:
+        return Suggestion(part=_partial_board_words(guess))
     # Chessboards beside it may hang on a wall.
     boards = [guess.board, *(board for board in guess.beside if board.identified)]
     return Suggestion(" --board ".join(map(words_of_board, boards)))
 
 
-def _untold(guess: BoardGuess) -> str:
+def _partial_board_words(guess: BoardGuess) -> str:
     """Say what images show of a board, where that is not all: a chessboard that has one of several sizes, or the only
     one at least, a ChArUco board with more rows, or an AprilGrid whose edges are aside of where they were printed."""
     if not guess.sizes:
@@ -296,8 +300,8 @@ def _guess(
         except (InputError, DegenerateError):
             return None, [], None
         # Where some do not show it, more are asked.
-        told = guess is not None and guess.told and 1 < len(guess.images) == len(pictures)
-        if told or (len(paths) <= max_images and not any(map(is_video, paths))):
+        determined = guess is not None and guess.determined and 1 < len(guess.images) == len(pictures)
+        if determined or (len(paths) <= max_images and not any(map(is_video, paths))):
             break
     return guess, pictures, unreadable
 
@@ -324,7 +328,7 @@ def _pictures(
 def _frames(path: Path, max_images: int) -> Iterator[tuple[str, GreyImage]]:
     """Yield so many frames of a video, evenly spread over it."""
     with Video(path) as video:
-        step = max(1, video.count // max_images) if video.count else FRAMES_APART
+        step = max(1, video.count // max_images) if video.count else FRAME_STRIDE
         for k in range(max_images):
             # The middles of equal parts: at its ends a board is on its way in or out.
             frame = video.frame(k * step + step // 2)

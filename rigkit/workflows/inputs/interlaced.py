@@ -18,7 +18,7 @@ MAX_LINES = 1088
 IMAGES_OF_FIELDS = 4
 """So many images, spread over the session; boards need not move in all of them."""
 MIN_INTERLACED = 2
-APART_PX = 0.2
+MIN_FIELD_SHIFT_PX = 0.2
 """Fields this far apart are of two moments. On 239 boards in REAL images of one moment, 50 of them made worse in other
 ways, they are 0.06 px apart at most (squares of 9 px), in an interlaced REAL one 0.37, in 14 whose odd lines were moved
 by 2.5 px rms 1.4 (median)."""
@@ -38,14 +38,14 @@ def interlaced(calibration: Calibration, images: Mapping[str, Path]) -> list[Fin
             # Corners are kept beside the session: the image itself may have gone bad since.
             continue
         shifts[view.image] = abs(shift_between_fields(grey, view.pixels))
-    apart = {image: shift for image, shift in shifts.items() if shift > APART_PX}
-    if len(apart) < MIN_INTERLACED:
+    shifted = {image: shift for image, shift in shifts.items() if shift > MIN_FIELD_SHIFT_PX}
+    if len(shifted) < MIN_INTERLACED:
         return []
-    image, most = max(apart.items(), key=lambda one: one[1])
+    image, most = max(shifted.items(), key=lambda one: one[1])
     return [
         Finding.look(
             f"images are interlaced: every second line is of another moment, in '{image}' shifted by {most:.1f} px "
-            f"({len(apart)} of {len(shifts)} images looked at)",
+            f"({len(shifted)} of {len(shifts)} images looked at)",
             "set the camera or the grabber to progressive, or hold board and camera still",
             image,
         )

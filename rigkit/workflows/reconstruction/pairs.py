@@ -65,13 +65,13 @@ def match_images(
     try:
         matched = match_found(pair, camera1, camera2, found1, found2, chain, support)
     except RigkitError as error:
-        said = squares_that_fit(pair, camera1, camera2, found1, found2)
-        if not said:
+        message = squares_that_fit(pair, camera1, camera2, found1, found2)
+        if not message:
             raise
-        raise type(error)(f"pair '{pair.pair_id}': {'; '.join(said)} ({error})") from error
+        raise type(error)(f"pair '{pair.pair_id}': {'; '.join(message)} ({error})") from error
     if matched.identity.missing:
-        said = squares_that_fit(pair, camera1, camera2, found1, found2)
-        matched = replace(matched, notes=(*said, *matched.notes))
+        message = squares_that_fit(pair, camera1, camera2, found1, found2)
+        matched = replace(matched, notes=(*message, *matched.notes))
     return matched, image1, image2
 
 

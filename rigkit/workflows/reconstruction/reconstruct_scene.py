@@ -175,8 +175,8 @@ def reconstruct_views(options: SceneOptions, *, progress: Progress = silent) -> 
                 f"images A '{a}' and B '{b}' are the same picture to the last pixel: no baseline; give two images "
                 "taken from different places"
             )
-    told = (options.correspondences, options.rig, options.camera, options.camera2, options.pose)
-    with about(*(path for path in told if path is not None)):
+    given = (options.correspondences, options.rig, options.camera, options.camera2, options.pose)
+    with about(*(path for path in given if path is not None)):
         scene, found = _sparse(options, near, known_pose, images, progress)
     maps: Mapping[str, NDArray[Any]] = {}
     known = known_pose is not None

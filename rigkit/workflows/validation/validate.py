@@ -155,14 +155,14 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
     causes = diagnose_cameras(pair.pair_id, names, (found1, found2), pair.boards, known)
 
     def wrong_squares() -> tuple[str, ...]:
-        said = squares_that_fit(pair, camera1, camera2, found1, found2)
-        return tuple(f"pair '{pair.pair_id}': {words}" for words in said)
+        note = squares_that_fit(pair, camera1, camera2, found1, found2)
+        return tuple(f"pair '{pair.pair_id}': {words}" for words in note)
 
     try:
         matched = match_found(pair, camera1, camera2, found1, found2, job.options.chain, job.options.support)
         if matched.identity.missing:
             causes += wrong_squares()
-        return _judge(job, matched, image1, image2, causes)
+        return _validated(job, matched, image1, image2, causes)
     except RigkitError as error:
         # Without a board that is left out, nothing was matched at all.
         causes = causes or wrong_squares()
@@ -171,7 +171,7 @@ def _validate(job: PairJob[ValidateOptions]) -> PairValidation:
         raise type(error)(f"{'; '.join(causes)} ({error})") from error
 
 
-def _judge(
+def _validated(
     job: PairJob[ValidateOptions],
     matched: MatchedPair,
     image1: NDArray[Any],

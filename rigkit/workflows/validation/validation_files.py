@@ -87,8 +87,8 @@ def validation_files(
     lead += f"affine transformations, {seconds:.0f} s"
     lead += "".join(f"; not validated: {failure}" for failure in failures)
     # What stands with the pairs is not said twice.
-    apart = ("checks", "estimators") if sections else ()
-    shown = [table for table in tables if table.key not in apart]
+    separate = ("checks", "estimators") if sections else ()
+    shown = [table for table in tables if table.key not in separate]
     known = _calibrations(dataset, cameras)
     shown += [camera_table(known)] if known else []
     remarks = camera_remarks(known)

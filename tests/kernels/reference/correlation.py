@@ -59,8 +59,8 @@ def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> F
         return np.ones(boards)
     member, level = owner[seen] == np.arange(boards)[:, None], noise[seen]
     # A hand or a ruler in the window is no noise, but as much the same from pixel to pixel as anything can be.
-    usual = np.exp((member @ np.log(level)) / np.maximum(member.sum(axis=1), 1))
-    member &= level <= COVERED_TIMES * usual[:, None]
+    typical = np.exp((member @ np.log(level)) / np.maximum(member.sum(axis=1), 1))
+    member &= level <= COVERED_TIMES * typical[:, None]
     count = np.maximum(member.sum(axis=1), 1)[:, None]
     twice = 2.0 * pixels
     part = twice - np.floor(twice)
@@ -73,18 +73,18 @@ def sigma_factors(corners: NoiseOfCorners, boards: int, rules: FactorRules) -> F
     return np.where(member.any(axis=1), factors(mean, count, rules.radius_px), 1.0)
 
 
-def uneven_factors(corners: NoiseOfCorners, usual: FloatArray, rules: FactorRules) -> FloatArray:
+def uneven_factors(corners: NoiseOfCorners, typical: FloatArray, rules: FactorRules) -> FloatArray:
     products, pairs, noise, _, _, _, _, good, owner = corners
     assert (rules.min_alike, rules.uneven_times) == (MIN_ALIKE, UNEVEN_TIMES)
     out = np.ones(len(owner))
     seen = good & (pairs[:, 0] > 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = (products[:, 1:] / np.maximum(pairs[:, 1:], 1.0)).mean(axis=1) / noise**2
-        odd = np.flatnonzero(seen & (alike > MIN_ALIKE * usual[owner] ** 2))
+        odd = np.flatnonzero(seen & (alike > MIN_ALIKE * typical[owner] ** 2))
     if len(odd):
         alone = NoiseOfCorners._make(part[odd] for part in corners)
         own = sigma_factors(alone._replace(owner=np.arange(len(odd))), len(odd), rules)
-        times = own / usual[owner[odd]]
+        times = own / typical[owner[odd]]
         out[odd] = np.where(times > UNEVEN_TIMES, times, 1.0)
     return out
 
@@ -117,11 +117,11 @@ def influence(sides: FloatArray, blur: FloatArray, radius_px: float) -> tuple[Fl
     """
     lengths = np.maximum(np.hypot(sides[..., :1], sides[..., 1:]), 1.0)
     turned = sides / lengths @ _ALONG_AND_ASIDE
-    along, aside = turned[..., : len(LAGS)], turned[..., len(LAGS) :]
+    along, lateral = turned[..., : len(LAGS)], turned[..., len(LAGS) :]
     reach = np.minimum(lengths, 2.0 * radius_px)
     # Over so much of the line it overlaps with itself, shifted: less over what has the other sign.
     overlap = np.maximum(1.0 - 3.0 * np.abs(along) / reach, 0.0)
-    across = np.exp(aside**2 / (-4.0 * blur**2)[:, None, None])
+    across = np.exp(lateral**2 / (-4.0 * blur**2)[:, None, None])
     weight: FloatArray = ((across * overlap).sum(axis=1) * 0.5 - LIGHT_SHARE) / (1.0 - LIGHT_SHARE)
     light = np.maximum(1.0 - _LENGTH / reach[:, 0], 0.0)
     lost: FloatArray = 4.0 * (_TIMES * weight * (weight + light)).sum(axis=1)

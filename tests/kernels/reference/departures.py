@@ -38,7 +38,7 @@ def products(
     lever: np.ndarray,
     pixels: np.ndarray,
     residuals: np.ndarray,
-    told: np.ndarray,
+    usable: np.ndarray,
     view: np.ndarray,
     size_px: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -48,6 +48,6 @@ def products(
     beyond = displacements(pixels, size_px)
     lens = sigmas[:, None] * d_pixels_d_parameters
     rows = np.concatenate([turn, d_pixels_d_point, lens, beyond, residuals.T[:, None]], axis=1)
-    each = [rows[..., told & (view == k)] for k in range(view.max() + 1)]
+    each = [rows[..., usable & (view == k)] for k in range(view.max() + 1)]
     with_pose = np.array([np.einsum("ikn,ijn->kj", part, part[:, :6]) for part in each])
     return with_pose, np.asarray(sum(np.einsum("ikn,ijn->kj", part[:, 6:], part[:, 6:]) for part in each))

@@ -198,9 +198,9 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
     out = []
     for angle, bend, line in ((T1, K1, 0), (T2, K2, 1)):
         cosine, sine = np.cos(known[:, angle, None]), np.sin(known[:, angle, None])
-        along, aside = cosine * qu + sine * qv, cosine * qv - sine * qu
+        along, lateral = cosine * qu + sine * qv, cosine * qv - sine * qu
         kappa = known[:, bend, None]
-        distance = aside - (np.float32(0.5) * kappa) * (along * along + blur * blur)
+        distance = lateral - (np.float32(0.5) * kappa) * (along * along + blur * blur)
         flat = np.float32(PIXEL_KURTOSIS) * (cosine**4 + sine**4)
         beside = (geometry.gaps[:, line].astype(np.float32), _paper(geometry)[:, line].astype(np.float32))
         tilts = np.zeros((len(qu), 2)) if geometry.tilts is None else geometry.tilts[:, line]
@@ -209,7 +209,7 @@ def _parts(values: FloatArray, window: Window, geometry: Geometry) -> tuple[tupl
         step, beyond = _step(distance, *around), _beyond(distance, *around)
         for slope, grown in ((step[1], step[4]), (beyond[1], beyond[2]), (beyond[4], beyond[5])):
             grown[...] += kappa * blur * slope
-        out.append((*step, along, aside, cosine, sine, kappa, beyond))
+        out.append((*step, along, lateral, cosine, sine, kappa, beyond))
     return tuple(out)
 
 

@@ -29,7 +29,7 @@ from kernels.reference.edge_model import (
 from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.detection.guided.corner_fit import MARKER_BLURS
 from rigkit.detection.saddles.response import GreyImage
-from rigkit.detection.subpixel.edge_curvature import BENT_RAD, DECAY, FREE, LINE_REACH, MIN_CORNER_SIGMA_PX
+from rigkit.detection.subpixel.edge_curvature import CURVED_RAD, DECAY, FREE, LINE_REACH, MIN_CORNER_SIGMA_PX
 from rigkit.detection.subpixel.edge_fit import (
     ANGLE_SIGMA_RAD,
     BLUR_LAG,
@@ -154,7 +154,7 @@ def line_curvatures(
         found, sigma = _most_probable(normal, right, np.broadcast_to(decay, (len(row), COEFFICIENTS)))
         size = np.linalg.norm(found, axis=2)
         turn = np.maximum(2.0 * size[:, 2], np.sqrt(2.0 * size[:, 3]))
-        bent = turn > BENT_RAD
+        bent = turn > CURVED_RAD
         if bent.any():
             expected: FloatArray = np.repeat(decay[None], np.count_nonzero(bent), axis=0)
             expected[:, 2:] = np.maximum(decay[2:], 0.5 * turn[bent, None] ** np.arange(1, COEFFICIENTS - 1))

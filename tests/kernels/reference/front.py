@@ -54,9 +54,9 @@ def smoothed(image: GreyImage, kernel: FloatImage) -> tuple[FloatImage, FloatIma
 
 def level(image: GreyImage, rules: LevelRules, step: int) -> tuple[FloatImage, FloatImage, FloatImage]:
     smooth, half = smoothed(image, SMOOTH)
-    usual, darkest, brightest = typical(smooth, step, EXTREME)
+    median_level, darkest, brightest = typical(smooth, step, EXTREME)
     contrast = (max(brightest - darkest, MIN_SPAN) / 200.0) ** 2
-    noise = min(NOISE_FACTOR * usual, THRESHOLD_CEILING * contrast)
+    noise = min(NOISE_FACTOR * median_level, THRESHOLD_CEILING * contrast)
     return smooth, half, thresholds(smooth, THRESHOLD_FLOOR * contrast, noise, darkest, brightest)
 
 

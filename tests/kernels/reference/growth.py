@@ -24,21 +24,21 @@ from rigkit.detection.lattice.grow import (
     MAX_RING_PX,
     MAX_SADDLES_TRIED,
     MIN_AREA_PX2,
-    MIN_FORETELLING,
+    MIN_PREDICTING,
     MIN_RING_PX,
     ODD,
     RING,
 )
 from rigkit.detection.lattice.lattice import Lattice
 from rigkit.detection.lattice.links import (
-    ASIDE_LENGTHS,
     CONTRAST_RATIO,
-    MAX_ASIDE_PX,
-    MIN_ASIDE_PX,
+    LATERAL_LENGTHS,
+    MAX_LATERAL_PX,
     MIN_EDGE_PLACES,
+    MIN_LATERAL_PX,
     Links,
 )
-from rigkit.detection.lattice.local_fit import PLIANT, STIFF, LocalFit, _local_fit
+from rigkit.detection.lattice.local_fit import FLEXIBLE, STIFF, LocalFit, _local_fit
 from rigkit.detection.saddles.response import Level
 from rigkit.kernels.growth import FitRules, GridBuckets, GrowthRules
 
@@ -80,10 +80,10 @@ def fit(lattice: FloatArray, cells: BoolArray, rules: FitRules) -> FloatArray:
     solution = np.swapaxes(solved[..., :2], 1, 2)
     gain = np.sqrt(((weights * (solved[..., 2] @ design.T)) ** 2).sum(axis=1))
     zero = np.zeros((len(row), 2))
-    bend_column, bend_row = (2.0 * solution[..., k] if degree > 1 else zero for k in (3, 5))
+    curvature_column, curvature_row = (2.0 * solution[..., k] if degree > 1 else zero for k in (3, 5))
     position = solution[..., 0] + centre
     single = np.stack([known.sum(axis=1), gain], axis=1)
-    return np.hstack([position, solution[..., 1], solution[..., 2], bend_column, bend_row, single])
+    return np.hstack([position, solution[..., 1], solution[..., 2], curvature_column, curvature_row, single])
 
 
 def grown(
@@ -107,7 +107,7 @@ def grown(
         known = lattice.known
         if known[0].any() or known[-1].any() or known[:, 0].any() or known[:, -1].any():
             return left
-        for way, (degree, ridge) in enumerate((STIFF, PLIANT)):
+        for way, (degree, ridge) in enumerate((STIFF, FLEXIBLE)):
             cells = _beside(known) & due[way]
             due[way] &= ~cells
             prediction = _local_fit(fit(lattice.pixels, cells, FitRules(degree, FIT_RADIUS, False, FIT_WIDTH, ridge)))
@@ -147,13 +147,11 @@ def _widened(cells: BoolArray) -> BoolArray:
 
 
 def _added(lattice: Lattice, cell: IntArray, fit: LocalFit, saddles: FloatArray, level: Level) -> BoolArray:
-    """Fill those of the cells `cell` (M, 2) of `lattice`, foretold by `fit`, that can be; return which (R, C)."""
+    """Fill those of the cells `cell` (M, 2) of `lattice`, predicted by `fit`, that can be; return which (R, C)."""
     added = np.zeros(lattice.known.shape, bool)
     height, width = level.smooth.shape
     place = to_level(level, fit.pixels)
-    usable = (
-        (fit.support >= MIN_FORETELLING) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
-    )
+    usable = (fit.support >= MIN_PREDICTING) & (place > 0.0).all(axis=1) & (place < [width - 1, height - 1]).all(axis=1)
     index, found = _nearest(saddles, fit.pixels, np.where(usable, GROWTH_REACH * _longest(fit), 0.0))
     owner, slot = np.nonzero(found & usable[:, None])
     pixels = saddles[index[owner, slot]]
@@ -226,8 +224,8 @@ def _edges_seen(
     end = to_level(level, lattice.pixels[row, column][which, direction])
     length = np.linalg.norm(end - local[which], axis=1)
     side = np.where(direction % 2 == 0, sign[which], -sign[which])
-    aside = np.clip(ASIDE_LENGTHS * length, MIN_ASIDE_PX, MAX_ASIDE_PX)
-    difference = edge_contrast(level.smooth, local[which], end, side, aside)
+    lateral = np.clip(LATERAL_LENGTHS * length, MIN_LATERAL_PX, MAX_LATERAL_PX)
+    difference = edge_contrast(level.smooth, local[which], end, side, lateral)
     weakest = CONTRAST_RATIO * np.minimum(lattice.contrast[row, column][which, direction], contrast[which])
     seen = np.ones(len(cell), np.bool_)
     seen[which[(difference > weakest[:, None]).sum(axis=1) < MIN_EDGE_PLACES]] = False

@@ -11,12 +11,12 @@ from rigkit.detection.subpixel.shadows import (
     LIGHT_RANGE,
     LIGHT_RULES,
     MAX_LIGHT_STEP,
-    MIN_SHADOW_ASIDE_PX,
-    SEEN_ALONG,
-    SEEN_ASIDE,
+    MIN_SHADOW_LATERAL_PX,
+    SAMPLED_ALONG,
+    SAMPLED_LATERAL,
     UNEVEN_LIGHT,
 )
-from rigkit.kernels.light import LIGHT_ASIDE
+from rigkit.kernels.light import LIGHT_LATERAL
 
 RADIUS_PX, LIGHT_REACH_CELLS, WIDTH_RANGE_PX = (
     LIGHT_RULES.radius_px,
@@ -36,15 +36,15 @@ ON_EDGE = 1e-9
 
 
 def beside_shadows(
-    image: GreyImage, pixels: FloatArray, sides: FloatArray, aside: FloatArray, ends: BoolArray
+    image: GreyImage, pixels: FloatArray, sides: FloatArray, lateral: FloatArray, ends: BoolArray
 ) -> BoolArray:
     """Return what `shadows.beside_shadows` does."""
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1e-9)
-    off = np.minimum(SEEN_ASIDE, aside[:, None] / lengths)
-    seen = (off * lengths).min(axis=1) > MIN_SHADOW_ASIDE_PX
+    off = np.minimum(SAMPLED_LATERAL, lateral[:, None] / lengths)
+    seen = (off * lengths).min(axis=1) > MIN_SHADOW_LATERAL_PX
     lines = np.eye(2)[:, None, :]
     cells = (
-        np.reshape(SEEN_ALONG, (-1, 1, 1, 1)) * lines
+        np.reshape(SAMPLED_ALONG, (-1, 1, 1, 1)) * lines
         + np.array([-1.0, 1.0])[:, None] * lines[::-1] * off[:, None, None, None, :]
     )
     # What is mirrored at the corner has the same colour.
@@ -61,7 +61,7 @@ def beside_shadows(
 
 
 def light_steps(
-    image: GreyImage, start: FloatArray, sides: FloatArray, curvature: FloatArray, blur: float, aside: FloatArray
+    image: GreyImage, start: FloatArray, sides: FloatArray, curvature: FloatArray, blur: float, lateral: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return u, v, sigma, direction, place, width, light left (N, 7) of `shadows.light_steps`, and which were found."""
     first = np.rint(start)
@@ -72,7 +72,7 @@ def light_steps(
     inside = np.abs(cells) < LIGHT_REACH_CELLS
     at = first[:, None] + OFFSETS
     seen = ((at >= 0.0) & (at <= np.array(image.shape[::-1]) - 1.0)).all(axis=2)
-    used = seen & inside.all(axis=2) & (np.abs(across) < aside[:, None, None]).any(axis=2)
+    used = seen & inside.all(axis=2) & (np.abs(across) < lateral[:, None, None]).any(axis=2)
     column, row = np.moveaxis(at.clip(0.0, np.array(image.shape[::-1]) - 1.0).astype(np.int64), 2, 0)
     values, weight = image[row, column].astype(np.float64), used.astype(np.float64)
     pattern = edge_at(across[..., 0] / blur)[0] * edge_at(across[..., 1] / blur)[0]
@@ -96,7 +96,7 @@ def hard_steps(values: FloatArray, pattern: FloatArray, weight: FloatArray) -> t
 
     For each direction the two sides are fitted apart, with sums over strips between one place and the next.
     """
-    count, places = len(values), np.arange(-LIGHT_ASIDE, LIGHT_ASIDE + 1.0)
+    count, places = len(values), np.arange(-LIGHT_LATERAL, LIGHT_LATERAL + 1.0)
     products = [weight * part for part in (1.0 + 0.0 * pattern, pattern, pattern**2)]
     products += [products[0] * values, products[1] * values, products[0] * values**2]
     out, best = np.zeros((count, 5)), np.full(count, np.inf)
@@ -116,10 +116,10 @@ def hard_steps(values: FloatArray, pattern: FloatArray, weight: FloatArray) -> t
         at = total.argmin(axis=1)
         better = total[mine, at] < best
         best = np.where(better, total[mine, at], best)
-        told = np.stack(
+        projected = np.stack(
             [np.full(count, angle), places[at], *(part[mine, at] for part in (level, contrast, left))], axis=1
         )
-        out[better] = told[better]
+        out[better] = projected[better]
     return out, np.isfinite(best)
 
 
@@ -184,12 +184,12 @@ def picture(unknowns: FloatArray, curvature: FloatArray) -> tuple[FloatArray, Fl
         turned, bend = unknowns[:, 2 + line, None], curvature[:, line, None]
         c, s = np.cos(turned), np.sin(turned)
         along = c * (OFFSETS[:, 0] - u) + s * (OFFSETS[:, 1] - v)
-        aside = c * (OFFSETS[:, 1] - v) - s * (OFFSETS[:, 0] - u)
-        distance = aside - 0.5 * bend * along**2
+        lateral = c * (OFFSETS[:, 1] - v) - s * (OFFSETS[:, 0] - u)
+        distance = lateral - 0.5 * bend * along**2
         edge, slope = edge_at(distance / across)
         edges.append(edge)
         moves.append([slope / across * part for part in (s + bend * along * c, bend * along * s - c)])
-        moves[-1] += [slope / across * (-along - bend * along * aside), -slope * distance / across]
+        moves[-1] += [slope / across * (-along - bend * along * lateral), -slope * distance / across]
     c, s = np.cos(towards), np.sin(towards)
     beyond = (c * OFFSETS[:, 0] + s * OFFSETS[:, 1] - place) / width
     step, slope = edge_at(beyond)

@@ -8,13 +8,13 @@ from scipy.spatial import cKDTree
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.detection.lattice.links import (
     ARM_COSINE,
-    ASIDE_LENGTHS,
     CONTRAST_RATIO,
     EDGE_PLACES,
+    LATERAL_LENGTHS,
     LENGTH_RATIO,
-    MAX_ASIDE_PX,
-    MIN_ASIDE_PX,
+    MAX_LATERAL_PX,
     MIN_EDGE_PLACES,
+    MIN_LATERAL_PX,
     NEIGHBOURS,
     Links,
     _bounds,
@@ -41,7 +41,7 @@ def links(
 ) -> IntArray:
     assert np.array_equal(bounds, _bounds(contrast)) and rules.neighbours == NEIGHBOURS
     angles = np.arctan2(lines[..., 1], lines[..., 0])
-    given = Corners(pixels, angles, contrast, reach * scale / MAX_ASIDE_PX)
+    given = Corners(pixels, angles, contrast, reach * scale / MAX_LATERAL_PX)
     return _without_long(_mutual(given, Level(image, NO_THRESHOLDS, scale, offset)), pixels).reshape(-1, 4)
 
 
@@ -57,8 +57,8 @@ def edge_contrast(
     length = np.maximum(np.linalg.norm(chord, axis=1), 1e-9)
     normal = np.stack([-chord[:, 1], chord[:, 0]], axis=1) / length[:, None]
     along = start[:, None] + EDGE_PLACES[:, None] * chord[:, None]
-    aside = (sign * offset_px)[:, None, None] * normal[:, None]
-    return np.asarray(sample(image, along + aside) - sample(image, along - aside), dtype=np.float64)
+    lateral = (sign * offset_px)[:, None, None] * normal[:, None]
+    return np.asarray(sample(image, along + lateral) - sample(image, along - lateral), dtype=np.float64)
 
 
 def _mutual(corners: Corners, level: Level) -> IntArray:
@@ -136,7 +136,7 @@ def _edge_seen(corners: Corners, level: Level, start: IntArray, arm: IntArray, e
     """Return whether the edge between the corners is there, with the polarity of the arm."""
     first, last = to_level(level, corners.pixels[start]), to_level(level, corners.pixels[end])
     length = np.linalg.norm(last - first, axis=1)
-    offset = np.clip(ASIDE_LENGTHS * length, MIN_ASIDE_PX, MAX_ASIDE_PX * corners.scale[start] / level.scale)
+    offset = np.clip(LATERAL_LENGTHS * length, MIN_LATERAL_PX, MAX_LATERAL_PX * corners.scale[start] / level.scale)
     sign = np.where(arm % 2 == 0, 1.0, -1.0)
     difference = edge_contrast(level.smooth, first, last, sign, offset)
     weakest = CONTRAST_RATIO * np.minimum(corners.contrast[start], corners.contrast[end])

@@ -13,13 +13,13 @@ from rigkit.detection.saddles.response import GreyImage, sample
 from rigkit.detection.subpixel.edge_fit import EdgeFit
 from rigkit.detection.subpixel.edge_model import Geometry
 from rigkit.detection.subpixel.outer_squares import (
-    ASIDE_SQUARES,
     CUT,
     FIRST,
     GOES_ON,
     LAST,
+    LATERAL_SQUARES,
     MAX_PAPER,
-    NEAR_WITNESS,
+    MAX_REFERENCE_RATIO,
     SEEN,
     STEPS_SQUARES,
 )
@@ -62,7 +62,7 @@ def _left(geometry: Geometry, who: IntArray, which: IntArray, blur: FloatArray) 
     """Return (M,) what blur leaves of the difference of the two squares beside each way out."""
     # Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares.
     across = geometry.gaps[who, 1 - which // 2].mean(axis=1) / (np.sqrt(2.0) * blur)
-    return np.array([erf(ASIDE_SQUARES * x) + erf((1.0 - ASIDE_SQUARES) * x) - 1.0 for x in across.tolist()])
+    return np.array([erf(LATERAL_SQUARES * x) + erf((1.0 - LATERAL_SQUARES) * x) - 1.0 for x in across.tolist()])
 
 
 def _beside(geometry: Geometry, pixels: FloatArray, owner: IntArray, who: IntArray, which: IntArray) -> BoolArray:
@@ -71,7 +71,7 @@ def _beside(geometry: Geometry, pixels: FloatArray, owner: IntArray, who: IntArr
     The way out from the corner of a board has different things on either side: it tells nothing where others do.
     """
     apart = np.linalg.norm(pixels[who, None] - pixels[who], axis=2)
-    near: BoolArray = apart < NEAR_WITNESS * np.linalg.norm(geometry.sides[who], axis=2).max(axis=1)[:, None]
+    near: BoolArray = apart < MAX_REFERENCE_RATIO * np.linalg.norm(geometry.sides[who], axis=2).max(axis=1)[:, None]
     near &= (which[:, None] == which) & (owner[who, None] == owner[who])
     single = geometry.ends.reshape(-1, 4)[who].sum(axis=1) == 1
     witnessed = near & single
@@ -94,7 +94,7 @@ def _beside_the_way_out(
     """Return the brightness on both sides of the way out from corner `who` at its end `which`, (M, steps) each, NaN
     outside the image."""
     outwards = OUTWARDS[which][:, None] * STEPS_SQUARES[:, None]
-    across = ASIDE_SQUARES * OUTWARDS[which][:, None, ::-1]
+    across = LATERAL_SQUARES * OUTWARDS[which][:, None, ::-1]
     cells = np.stack([outwards + across, outwards - across])
     places = fit.pixels[who, None] + np.einsum("ankc,ncp->ankp", cells, geometry.sides[who])
     inside = ((places >= 0.0) & (places <= np.array(image.shape[::-1]) - 1.0)).all(axis=3)

@@ -41,33 +41,33 @@ class Polynomials:
     def __init__(self, places: FloatArray, values: FloatArray, middle: FloatArray, size: float, degree: int) -> None:
         self.middle, self.size = middle, size
         self.basis, self.triangle = np.linalg.qr(_terms((places - middle) / size, POWERS[: TERMS_OF_DEGREE[degree]]))
-        self.told = self.basis.T @ values
+        self.basis_values = self.basis.T @ values
         self.leverage = np.cumsum(self.basis**2, axis=1)
-        self.foretold = [
-            (values - self.basis[:, :k] @ self.told[:k]) / (1.0 - self.leverage[:, k - 1, None])
+        self.predicted = [
+            (values - self.basis[:, :k] @ self.basis_values[:k]) / (1.0 - self.leverage[:, k - 1, None])
             for k in TERMS_OF_DEGREE[: degree + 1]
         ]
-        self.misses = np.array([np.median(np.hypot(*left.T)) for left in self.foretold])
+        self.misses = np.array([np.median(np.hypot(*left.T)) for left in self.predicted])
 
     def at(self, wanted: FloatArray, degree: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return values and first and second derivatives along x and y at `wanted` (M, 2)."""
         here, end = (wanted - self.middle) / self.size, TERMS_OF_DEGREE[degree]
-        factors = np.linalg.solve(self.triangle[:end, :end], self.told[:end])
+        factors = np.linalg.solve(self.triangle[:end, :end], self.basis_values[:end])
         out = [
             _terms(here, POWERS[:end], along) @ factors / self.size ** sum(along)
             for along in ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2))
         ]
         return out[0], np.stack(out[1:3], axis=1), np.stack(out[3:], axis=1)
 
-    def surest(self, wanted: FloatArray, degrees: int) -> tuple[FloatArray, FloatArray]:
+    def most_certain(self, wanted: FloatArray, degrees: int) -> tuple[FloatArray, FloatArray]:
         """Return values (M, 2) and gains (M,) by that of the first `degrees` that misses times the gain least."""
-        rows = _terms((wanted - self.middle) / self.size, POWERS[: len(self.told)])
+        rows = _terms((wanted - self.middle) / self.size, POWERS[: len(self.basis_values)])
         parts, ends = np.linalg.solve(self.triangle.T, rows.T), np.array(TERMS_OF_DEGREE[:degrees]) - 1
         gains = np.sqrt(np.cumsum(parts**2, axis=0)[ends])
-        values = np.cumsum(parts[:, :, None] * self.told[:, None], axis=0)[ends]
-        surest = (self.misses[:degrees, None] * np.maximum(gains, 1.0)).argmin(axis=0)
+        values = np.cumsum(parts[:, :, None] * self.basis_values[:, None], axis=0)[ends]
+        most_certain = (self.misses[:degrees, None] * np.maximum(gains, 1.0)).argmin(axis=0)
         each = np.arange(len(wanted))
-        return values[surest, each], gains[surest, each]
+        return values[most_certain, each], gains[most_certain, each]
 
 
 def _terms(places: FloatArray, powers: IntArray, along: tuple[int, int] = (0, 0)) -> FloatArray:

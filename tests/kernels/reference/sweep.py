@@ -51,21 +51,21 @@ def total_costs(costs: np.ndarray, samples1: np.ndarray, *, bend: int, jump: int
         # Paths along columns, downwards and upwards, then along rows; diagonals go with the first.
         there, image, here = (np.swapaxes(x, 0, 1) if turned else x for x in (costs, samples1, total))
         for lines in (range(len(there)), range(len(there) - 1, -1, -1)):
-            for aside in (0,) if turned else (-1, 0, 1):
+            for lateral in (0,) if turned else (-1, 0, 1):
                 before, last = there[lines[0]].astype(np.int64), lines[0]
                 here[last] += before
                 for line in lines[1:]:
-                    came = np.roll(before, aside, axis=0)
+                    came = np.roll(before, lateral, axis=0)
                     least = came.min(axis=1, keepdims=True)
-                    change = np.nan_to_num(np.abs(image[line] - np.roll(image[last], aside)))
+                    change = np.nan_to_num(np.abs(image[line] - np.roll(image[last], lateral)))
                     far = least + (bend + (jump - bend) / (1.0 + change / even)).astype(int)[:, None]
                     best = np.minimum(came, far)
                     best[:, 1:] = np.minimum(best[:, 1:], came[:, :-1] + bend)
                     best[:, :-1] = np.minimum(best[:, :-1], came[:, 1:] + bend)
                     best -= least
-                    if aside:
+                    if lateral:
                         # Nothing comes from beyond the border.
-                        best[0 if aside > 0 else -1] = 0
+                        best[0 if lateral > 0 else -1] = 0
                     before, last = there[line] + best, line
                     here[line] += before
     return total

@@ -29,18 +29,18 @@ from rigkit.detection.subpixel.edge_fit import EdgeFit, edge_rules
 from rigkit.detection.subpixel.edge_model import WINDOW_REACH
 from rigkit.detection.subpixel.scatter import UNEXPLAINED
 from rigkit.detection.subpixel.subpixel import FIRST_BLUR, FIRST_PASS, LAST_PASS
-from rigkit.detection.tags.codes import MIN_FORETOLD_LIKENESS, read_tags
+from rigkit.detection.tags.codes import MIN_PREDICTED_LIKENESS, read_tags
 from rigkit.detection.tags.corners import (
-    BENT_SIGMAS,
     BETTER_KNOWN,
+    CURVED_SIGMAS,
     FEW_CORNERS,
-    JUDGING_GAIN,
     MAX_PREDICTED_GAIN,
     MAX_TAG_ROUNDS,
     MIN_EDGE_CONTRAST,
-    MIN_FORETELLING_CORNERS,
+    MIN_PREDICTING_CORNERS,
     MIN_TAG_CORNERS,
     NOTHING_NEAR_PX,
+    OUTLIER_TEST_GAIN,
     ROUGH_PX,
     TAG_OUTLIER,
     WIDE_BLUR,
@@ -134,7 +134,7 @@ class _Fitter:
         return edge_rules(*stage, mirrored and self.tags.pattern.corner_squares, self.image.dtype == np.uint8)
 
     def _corners(self, cells: BoolArray, surface: TagSurface, start: FloatArray) -> TagCorners:
-        """Return what `kernels.edges.fit_tag_corners` is told of the corners at `cells`."""
+        """Return what `kernels.edges.fit_tag_corners` is packed of the corners at `cells`."""
         if self.tags.pattern.corner_squares:
             single, contrast = np.zeros((len(start), 2)), np.full(len(start), np.nan)
         else:
@@ -210,7 +210,7 @@ class _Fitter:
         curvatures = np.abs(surface.curvature - rows_where(self.curvature, cells))
         # Of two columns; max(axis=1) takes ten times as long.
         off = np.maximum(curvatures[:, 0], curvatures[:, 1]) * np.maximum(half[:, 0], half[:, 1]) ** 2 / 6.0
-        bent = (before > ROUGH_PX) | ~(off < BENT_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
+        bent = (before > ROUGH_PX) | ~(off < CURVED_SIGMAS * np.maximum(state.sigma_px[cells], scatter))
         if not bent.any():
             return state
         blur = known_median(state.blur)
@@ -224,7 +224,7 @@ class _Fitter:
         """Return the state with those missing corners that can be added now, None where there are none; `smooth`
         foretells them, by default the state's own map."""
         missing = ~(state.known | self._vain | self._waiting)
-        if not missing.any() or np.count_nonzero(state.known) < MIN_FORETELLING_CORNERS:
+        if not missing.any() or np.count_nonzero(state.known) < MIN_PREDICTING_CORNERS:
             return None
         smooth = smooth or self.map_of(state)
         surface = smooth.beyond(rows_where(self.places, missing))
@@ -280,7 +280,7 @@ class _Fitter:
         whole = np.asarray(np.isfinite(quads).all(axis=(2, 3)))
         tags = read_tags(self.image, quads[whole], self.tags.codes)
         own = (tags.number == self.tags.numbers[whole]) & (tags.turns == 0)
-        whole[whole] = own & (tags.likeness >= MIN_FORETOLD_LIKENESS)
+        whole[whole] = own & (tags.likeness >= MIN_PREDICTED_LIKENESS)
         return whole.repeat(2, axis=0).repeat(2, axis=1)
 
     def without_outliers(self, state: BoardState) -> BoardState:
@@ -292,14 +292,14 @@ class _Fitter:
             smooth = self.map_of(state)
             off, gain = smooth.left_out()
             off = np.nan_to_num(off) / gain
-            usual = max(known_median(off), SCATTER_FLOOR_PX)
-            usual_sigma = known_median(state.sigma_px[cells])
-            sigma = np.minimum(state.sigma_px[cells], 3.0 * usual_sigma)
-            allowed = TAG_OUTLIER * np.hypot(usual, sigma)
-            if not ((gain < JUDGING_GAIN) & (off > allowed)).any():
+            typical = max(known_median(off), SCATTER_FLOOR_PX)
+            typical_sigma = known_median(state.sigma_px[cells])
+            sigma = np.minimum(state.sigma_px[cells], 3.0 * typical_sigma)
+            allowed = TAG_OUTLIER * np.hypot(typical, sigma)
+            if not ((gain < OUTLIER_TEST_GAIN) & (off > allowed)).any():
                 return state
             gap = self.tags.pattern.spacing * smooth.at(rows_where(self.places, cells)).height
-            excess = np.where(gain < JUDGING_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
+            excess = np.where(gain < OUTLIER_TEST_GAIN, off / np.maximum(allowed, DISPLACED_CELLS * gap), 0.0)
             # Those that contradict the most go first: they may be all that speaks against their neighbours.
             worst = excess > max(1.0, 0.5 * float(excess.max()))
             if not worst.any():

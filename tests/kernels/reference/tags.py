@@ -23,7 +23,8 @@ def picture(
     paper: float,
     contrast: float,
 ) -> FloatArray:
-    """Return the brightness (height, width) of what `kernels.tags.fit_tags` is told of, corners off by `moves` (4, 2).
+    """Return the brightness (height, width) of what `kernels.tags.fit_tags` is projected of, corners off by `moves`
+    (4, 2).
 
     `blur_px` is of lens and pixel together.
     """

@@ -46,11 +46,11 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
         try:
             turns = _turns(here, start, rays, sigmas, joint)[1]
             there = solve_rig(joint.observations, _turned(start, turns), joint.sigma_px, FROM_OPTIMUM).state
-            way = _way(here, there, rays, sigmas, joint)
+            global_step = _global_step(here, there, rays, sigmas, joint)
         except (InputError, DegenerateError):
             continue
         likely = [r.likely for r in own if r is not None]
-        out += np.mean(likely) * np.outer(way, way)
+        out += np.mean(likely) * np.outer(global_step, global_step)
     return out
 
 
@@ -89,14 +89,16 @@ def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
     )
 
 
-def _way(here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig) -> FloatArray:
+def _global_step(
+    here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
+) -> FloatArray:
     """Return how far the globals (G,) must move for the rig to be as it is there."""
     layout = here.layout(joint.observations)
     steps, turns = _turns(here, there, rays, sigmas, joint)
     back = _turned(there, [turn.T for turn in turns])
-    way = np.zeros(layout.count)
+    global_step = np.zeros(layout.count)
     for lens, step in zip(layout.cameras, steps, strict=True):
-        way[lens] = step
+        global_step[lens] = step
     for runs, before, after in (
         (layout.mounts, (here.mount_rotation, here.mount_mm), (back.mount_rotation, back.mount_mm)),
         (layout.boards, (here.board_rotation, here.board_mm), (back.board_rotation, back.board_mm)),
@@ -104,8 +106,8 @@ def _way(here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArr
         moved = steps_between(before, after)
         for k, run in enumerate(runs):
             if run is not None:
-                way[run] = moved[k]
+                global_step[run] = moved[k]
     if here.moments is not None and there.moments is not None:
-        way[layout.lags] = (there.moments.lags - here.moments.lags)[1:]
-    way[layout.shape] = there.unknowns - here.unknowns
-    return way
+        global_step[layout.lags] = (there.moments.lags - here.moments.lags)[1:]
+    global_step[layout.shape] = there.unknowns - here.unknowns
+    return global_step

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rigkit.calibration.certainty.displaced import LensModes, telling_modes
+from rigkit.calibration.certainty.displaced import LensModes, significant_modes
 from rigkit.calibration.certainty.uncertainty import FarProjection
 from rigkit.calibration.rig.solving.pose_jacobians import gone_in_cam, pose_jacobians
 from rigkit.calibration.rig.solving.state import RigObservations, RigState
@@ -25,24 +25,29 @@ from rigkit.kernels.departures import displacements
 
 
 def lens_modes(
-    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], told: IntArray
+    observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], reported: IntArray
 ) -> tuple[LensModes, ...]:
-    """Return what each lens may do beyond its model, and how the globals `told` (G,), intrinsics and mounts, are off;
-    `far` are the cameras' projections as the rig has them."""
+    """Return what each lens may do beyond its model, and how the globals `reported` (G,), intrinsics and mounts, are
+    off; `far` are the cameras' projections as the rig has them."""
     n, normal = solution.state.layout(observations).shape.start, solution.normal
     if n < len(normal.g):
         normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
-    each = (telling_modes(one) for one in far)
-    return tuple(_of_camera(observations, solution.state, normal, c, modes, told) for c, modes in enumerate(each))
+    each = (significant_modes(one) for one in far)
+    return tuple(_of_camera(observations, solution.state, normal, c, modes, reported) for c, modes in enumerate(each))
 
 
 def _of_camera(
-    observations: RigObservations, state: RigState, normal: NormalEquations, c: int, modes: FloatArray, told: IntArray
+    observations: RigObservations,
+    state: RigState,
+    normal: NormalEquations,
+    c: int,
+    modes: FloatArray,
+    reported: IntArray,
 ) -> LensModes:
-    """Return how the globals `told` are off with the modes (J, M) of the lens of camera `c`; `normal` are the
+    """Return how the globals `reported` are off with the modes (J, M) of the lens of camera `c`; `normal` are the
     rig's equations without the boards' shape."""
     if not modes.size:
-        return LensModes(modes, np.zeros((len(told), 0)))
+        return LensModes(modes, np.zeros((len(reported), 0)))
     layout = state.layout(observations)
     alone, own = state.of_camera(c, observations), observations.cameras[c]
     n = layout.shape.start
@@ -59,7 +64,7 @@ def _of_camera(
         by_pose[part.poses] += np.swapaxes(part.target, -1, -2) @ shown
     inverse, back, _ = normal.covariance
     moves = -inverse @ (by_globals - np.tensordot(back, by_pose, axes=((0, 1), (0, 1))))
-    return LensModes(modes, moves[told])
+    return LensModes(modes, moves[reported])
 
 
 def _products(

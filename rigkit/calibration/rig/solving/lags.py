@@ -52,8 +52,8 @@ def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
     numbers = np.array([float(n) if n.isdecimal() else 0.0 for n in told])
     if not (np.diff(numbers) > 0.0).all():
         numbers = np.arange(float(len(names)))
-    usual = np.median(np.diff(numbers)) if len(names) > 1 else 1.0
-    time = dict(zip(names, ((numbers - numbers[:1]) / usual).tolist(), strict=True))
+    typical = np.median(np.diff(numbers)) if len(names) > 1 else 1.0
+    time = dict(zip(names, ((numbers - numbers[:1]) / typical).tolist(), strict=True))
     return np.array([time[key[0]] if frames[key] == key[0] else np.nan for key in keys])
 
 

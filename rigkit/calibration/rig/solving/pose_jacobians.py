@@ -58,8 +58,8 @@ def at_own_moment(
         onto = turn @ rotation[views]
         place = np.zeros((len(views), 6, 6))
         place[:, :3, :3] = place[:, 3:, 3:] = onto
-        target = _swung(onto @ state.board_mm[b]) @ _turned(turn)
-        free = _free([(layout.mounts[c], _swung(lever[views])), (layout.boards[b], place)], len(views))
+        target = _rotated_lever(onto @ state.board_mm[b]) @ _turned(turn)
+        free = _free([(layout.mounts[c], _rotated_lever(lever[views])), (layout.boards[b], place)], len(views))
         out.append(PoseJacobians(views, frame[views], target, *free))
     return out
 
@@ -67,7 +67,9 @@ def at_own_moment(
 def pose_jacobians_of_mount(rotation: Mat3, mount: slice | None, poses: IntArray, lever: Points) -> PoseJacobians:
     """Return how V boards, targets all, follow their `poses` (V,) in the rig and the `mount` of a camera, None where
     that is not free: it has this `rotation`, and the boards lie at `lever` (V, 3) from where it has the rig."""
-    return PoseJacobians(np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _swung(lever))], len(poses)))
+    return PoseJacobians(
+        np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _rotated_lever(lever))], len(poses))
+    )
 
 
 def pose_products(observations: RigObservations, state: RigState, products: Sequence[FloatArray]) -> FloatArray:
@@ -111,7 +113,7 @@ def _turned(rotation: Mat3) -> FloatArray:
     return out
 
 
-def _swung(lever: Points) -> FloatArray:
+def _rotated_lever(lever: Points) -> FloatArray:
     """Return how a turn about a point, and a shift, move what is at `lever` (N, 3) from it, (N, 6, 6)."""
     out = np.zeros((len(lever), 6, 6))
     out[:] = np.eye(6)

@@ -75,10 +75,10 @@ def board_places(
                 f"rigid boards {', '.join(group)}: no image shows two of them; take images that show several at once"
             )
         known, readings = found
-        lonely = _never_read(group, known, scenes, readings)
-        if lonely is not None:
+        single = _never_read(group, known, scenes, readings)
+        if single is not None:
             raise InputError(
-                f"rigid boards {', '.join(group)}: '{lonely}' is never seen together with the others; take images that "
+                f"rigid boards {', '.join(group)}: '{single}' is never seen together with the others; take images that "
                 "show it beside one of them"
             )
         first = next(name for name in group if name in known)
@@ -238,8 +238,8 @@ def _named(
     most = max(len(chosen) for _, chosen, _ in tried)
     if most < 2 and len(scene) > 1 and len(known) > 1:
         # Boards of the group that fit no arrangement: they moved, or the scene shows none that is known.
-        unsure = len({tuple(c.items()) for _, c, _ in tried}) > 1
-        if unsure:
+        ambiguous = len({tuple(c.items()) for _, c, _ in tried}) > 1
+        if ambiguous:
             return None, np.inf
     tried = sorted((t for t in tried if len(t[1]) == most), key=lambda t: t[0])
     total, chosen, scene_from_target = tried[0]

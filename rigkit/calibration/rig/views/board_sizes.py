@@ -19,13 +19,13 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_FRAMES_OF_BOARD = 3
 """With fewer frames of a board nobody knows how far what it says scatters."""
-MIN_SIZES_APART = 0.01
+MIN_SIZE_DIFFERENCE = 0.01
 """Printed boards are a few parts in a thousand off; a size that was mistaken for another is off by parts in ten."""
 SIZES_ERRORS = 6.0
 """So many standard errors apart, as the frames of both boards scatter."""
 
 
-def sizes_apart(views: RigViews) -> tuple[Finding, ...]:
+def board_size_conflicts(views: RigViews) -> tuple[Finding, ...]:
     """Return a finding where two boards contradict each other on how far apart two of the cameras are."""
     names, seen, places = views.names, views.seen, views.places
     for i, j in combinations(range(len(seen)), 2):
@@ -41,13 +41,13 @@ def sizes_apart(views: RigViews) -> tuple[Finding, ...]:
         of_board = defaultdict(list)
         for (_, target), value in zip(pairs, length.tolist(), strict=True):
             of_board[target].append(value)
-        told = {name: np.array(values) for name, values in of_board.items() if len(values) >= MIN_FRAMES_OF_BOARD}
-        for one, other in combinations(sorted(told, key=lambda name: -len(told[name])), 2):
-            usual = [float(np.median(told[name])) for name in (one, other)]
-            chance = float(np.hypot(_error(told[one]), _error(told[other])))
-            apart = abs(usual[1] - usual[0])
-            if min(usual) > 0.0 and apart > max(MIN_SIZES_APART * min(usual), SIZES_ERRORS * chance):
-                return (_finding((names[i], names[j]), (one, other), (usual[0], usual[1])),)
+        measured = {name: np.array(values) for name, values in of_board.items() if len(values) >= MIN_FRAMES_OF_BOARD}
+        for one, other in combinations(sorted(measured, key=lambda name: -len(measured[name])), 2):
+            typical = [float(np.median(measured[name])) for name in (one, other)]
+            chance = float(np.hypot(_error(measured[one]), _error(measured[other])))
+            separation = abs(typical[1] - typical[0])
+            if min(typical) > 0.0 and separation > max(MIN_SIZE_DIFFERENCE * min(typical), SIZES_ERRORS * chance):
+                return (_finding((names[i], names[j]), (one, other), (typical[0], typical[1])),)
     return ()
 
 
@@ -57,9 +57,9 @@ def _error(values: FloatArray) -> float:
     return float(np.sqrt(0.5 * np.pi / len(values))) * spread
 
 
-def _finding(cameras: tuple[str, str], boards: tuple[str, str], usual_mm: tuple[float, float]) -> Finding:
+def _finding(cameras: tuple[str, str], boards: tuple[str, str], typical_mm: tuple[float, float]) -> Finding:
     return Finding.bad(
         f"boards '{boards[0]}' and '{boards[1]}' are not of the sizes that are stated: by the one cameras "
-        f"'{cameras[0]}' and '{cameras[1]}' are {usual_mm[0]:.4g} mm apart, by the other {usual_mm[1]:.4g} mm",
+        f"'{cameras[0]}' and '{cameras[1]}' are {typical_mm[0]:.4g} mm apart, by the other {typical_mm[1]:.4g} mm",
         "measure the squares of both (are the two sizes swapped?), and calibrate again",
     )

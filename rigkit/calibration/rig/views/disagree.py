@@ -20,7 +20,7 @@ from rigkit.calibration.rig.views.observations import FrameObservations
 from rigkit.calibration.solving.solver import Solution
 from rigkit.core.printing import digits
 
-FAR_APART = 12.0
+MAX_DISTANCE_RATIO = 12.0
 """Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
 times the usual distance is a board that moved. Less is left to the joint solve, which sees it better."""
 DISAGREES = 3.5
@@ -55,7 +55,7 @@ def cost_of_sharing(
     return {key: float(e) for key, e, n in zip(observations.keys, excess, views, strict=True) if n > 1.0}
 
 
-def usual_distance_px(observations: RigObservations, cost: Mapping[Key, float]) -> float:
+def typical_distance_px(observations: RigObservations, cost: Mapping[Key, float]) -> float:
     """Return how far apart, rms over corners, views that share a pose usually see them, px, from what sharing costs."""
     poses = len(observations.keys)
     corners, views = np.zeros(poses), np.zeros(poses)
@@ -70,18 +70,18 @@ def usual_distance_px(observations: RigObservations, cost: Mapping[Key, float]) 
     return float(np.sqrt(np.median(squared))) if squared else 0.0
 
 
-def usual_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = False) -> float:
+def typical_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = False) -> float:
     """Return the usual cost, px^2: the lower of two in the middle, so that of two targets the worse is the bad one; or
     the mean, where all are taken for good."""
     ordered = sorted(cost.values()) or [0.0]
-    usual = float(np.mean(ordered)) if mean else ordered[(len(ordered) - 1) // 2]
-    return max(usual, max(sigma_px, MIN_PX) ** 2)
+    typical = float(np.mean(ordered)) if mean else ordered[(len(ordered) - 1) // 2]
+    return max(typical, max(sigma_px, MIN_PX) ** 2)
 
 
-def bad_ones(cost: Mapping[Key, float], usual: float) -> list[Key]:
+def bad_ones(cost: Mapping[Key, float], typical: float) -> list[Key]:
     """Return the targets that cost more than chance; of several the worst: they may be why the others look bad."""
     worst = max(cost.values(), default=0.0)
-    return [key for key in sorted(cost) if cost[key] > max(DISAGREES**2 * usual, 0.25 * worst)]
+    return [key for key in sorted(cost) if cost[key] > max(DISAGREES**2 * typical, 0.25 * worst)]
 
 
 def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
@@ -93,12 +93,12 @@ def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
 def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
     """Part the targets whose views put them far apart, by `off_px`; return (frame, target, reason)."""
     shared = shared_keys(seen)
-    usual = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
+    typical = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
     worst = max((off_px[key] for key in shared), default=0.0)
     out = []
     for key in sorted(shared):
-        if off_px[key] > max(FAR_APART * usual, 0.5 * worst):
-            words = f"by {digits(off_px[key])} px, {off_px[key] / usual:.0f} times the usual"
+        if off_px[key] > max(MAX_DISTANCE_RATIO * typical, 0.5 * worst):
+            words = f"by {digits(off_px[key])} px, {off_px[key] / typical:.0f} times the usual"
             out.append((*key, why(seen, key, words)))
             part(seen, key)
     return out

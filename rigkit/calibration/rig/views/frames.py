@@ -150,17 +150,17 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     tried = np.arange(0, len(owner), -(-len(owner) // MAX_TRIED))
     apart_mm = np.einsum("hij,ncj->hnci", rotation[tried], x1) + shift[tried, None, None] - x2
     offs = np.sqrt(np.einsum("hnci,hnci->hnc", apart_mm, apart_mm)).mean(axis=-1) / distance
-    usual = np.median(np.minimum.reduceat(offs, starts, axis=1), axis=1)
+    typical = np.median(np.minimum.reduceat(offs, starts, axis=1), axis=1)
     angle = rotation_angle(rotation[tried])
     # Of those that fit alike, cameras are more likely mounted alike than turned against each other.
-    best = int(np.argmin(usual))
-    alike = np.flatnonzero(usual <= RIVAL * usual[best] + 1e-9)
+    best = int(np.argmin(typical))
+    alike = np.flatnonzero(typical <= RIVAL * typical[best] + 1e-9)
     turned = rotation_angle(rotation[tried[alike]] @ rotation[tried[best]].T)
     rivals = alike[turned > OTHER_RAD]
     ambiguous = len(rivals) > 0 and any(len(b.orientations) > 1 for _, b in pairs)
     if ambiguous:
         best = int(min([best, *rivals.tolist()], key=lambda m: angle[m]))
-    near = offs[best] <= AGREE * usual[best] + 1e-12
+    near = offs[best] <= AGREE * typical[best] + 1e-12
     middle = Rigid3(nearest_rotation(np.median(rotation[near], axis=0)), np.median(shift[near], axis=0))
     if not ambiguous:
         return middle, None
@@ -188,7 +188,7 @@ def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
     return views.with_seen(out)
 
 
-def apart(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
+def separation(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
     """Return how far apart the boards that share a pose put each other, in px: of two cameras the better of the two
     directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
     out: dict[Key, float] = {}

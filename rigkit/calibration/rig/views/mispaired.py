@@ -21,7 +21,7 @@ import numpy as np
 
 from rigkit.calibration.rig.solving.state import Key
 from rigkit.calibration.rig.views.disagree import shared_keys
-from rigkit.calibration.rig.views.frames import apart, mounts_of, turned_alike
+from rigkit.calibration.rig.views.frames import mounts_of, separation, turned_alike
 from rigkit.calibration.rig.views.observations import FrameObservations, Observation, RigViews
 from rigkit.cameras.base import Camera
 from rigkit.core.detections import BoardView
@@ -110,14 +110,14 @@ def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, flo
     seen = views.seen
     # A frame that only one camera has may be where the other one's image belongs.
     agree = {frame for frame, _ in shared_keys(seen)} - now.keys()
-    usual = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
+    typical = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
     for k in range(1, len(seen)):
         for step in STEPS:
-            trial = [_of_frames(own, usual.keys() - agree) for own in seen]
-            trial[k] = _of_frames(_counted(seen, k, step), usual.keys() - agree)
-            right = _put_right(usual, _by_frame(_off(views.with_seen(trial), mounts)))
+            trial = [_of_frames(own, typical.keys() - agree) for own in seen]
+            trial[k] = _of_frames(_counted(seen, k, step), typical.keys() - agree)
+            right = _put_right(typical, _by_frame(_off(views.with_seen(trial), mounts)))
             if len(right) >= max(MIN_PUT_RIGHT, MIN_SHARE_PUT_RIGHT * len(now)):
-                moments = _in_order(usual)
+                moments = _in_order(typical)
                 called = [moments[moments.index(frame) + step] for frame in right]
                 message = (
                     f"the images of '{views.names[k]}' in {_named(called)} are of {_steps(step)}: counted so, the "
@@ -130,10 +130,10 @@ def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, flo
 def why_nothing_agrees(views: RigViews) -> Finding | None:
     """Return with which mistake put right the frames agree, where most of them do not; None with none."""
     names, seen = views.names, views.seen
-    limit = PUT_RIGHT * _usual_px(views)
+    limit = PUT_RIGHT * _typical_px(views)
     for k, camera in enumerate(views.cameras):
         for step in STEPS if k else ():
-            if _usual_px(views.with_camera(k, _counted(seen, k, step))) <= limit:
+            if _typical_px(views.with_camera(k, _counted(seen, k, step))) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' are of {_steps(step)} in all frames: counted so, the cameras agree; "
                     "an image is missing, or they did not begin together",
@@ -141,7 +141,7 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
                 )
         for axis in (0, 1):
             mirrored = {key: _mirrored(entry, camera, axis) for key, entry in seen[k].items()}
-            if _usual_px(views.with_camera(k, mirrored)) <= limit:
+            if _typical_px(views.with_camera(k, mirrored)) <= limit:
                 # Of two cameras either may be the mirrored one.
                 who = f"'{names[k]}'" if len(seen) > 2 else f"'{names[0]}' or those of '{names[1]}'"
                 return Finding.bad(
@@ -151,7 +151,7 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
         turned = _turned(seen[k], camera)
         for sides in _as_one_frame_has_it(views, k, turned):
             some = {key: turned[key] if key[0] in sides else entry for key, entry in seen[k].items()}
-            if sides and _usual_px(views.with_camera(k, some)) <= limit:
+            if sides and _typical_px(views.with_camera(k, some)) <= limit:
                 return Finding.bad(
                     f"the images of '{names[k]}' are turned by half a turn in {_named(_in_order(sides))}, or in all "
                     "others: turned back, the cameras agree",
@@ -160,7 +160,7 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
     return None
 
 
-def _usual_px(views: RigViews) -> float:
+def _typical_px(views: RigViews) -> float:
     """Return how far apart views usually are by the mounts that they tell, px; infinite where they tell none."""
     try:
         mounts, _ = mounts_of(views)
@@ -183,7 +183,7 @@ def _as_one_frame_has_it(views: RigViews, k: int, changed: FrameObservations) ->
 
 
 def _off(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
-    return apart(turned_alike(views, mounts), mounts)
+    return separation(turned_alike(views, mounts), mounts)
 
 
 def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:

@@ -18,25 +18,25 @@ from rigkit.detection.tags.in_squares import marker_codes
 from rigkit.detection.tags.markers import MIN_MARKER_LIKENESS
 from rigkit.detection.tags.quads import quadrilaterals
 
-ALIKE_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
+DUPLICATES_REMEDY = "print one with other numbers (first_marker, first_tag), or show one at a time"
 """What is to be done about boards that nothing tells apart."""
 
-MIN_TWINS, MIN_SHARE_OF_TWINS = 3, 0.05
+MIN_DUPLICATES, MIN_SHARE_OF_DUPLICATES = 3, 0.05
 """Marks that are seen twice, and of all that are seen: some may be misread, of hundreds in REAL images up to three."""
 
-APART_SIDES = 1.5
+MIN_SEPARATION_SIDES = 1.5
 """The same mark is not seen in two places so far apart, in sides of it: at its outer and inner border it is."""
 
 
-def alike_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | None:
+def duplicate_boards(image: NDArray[np.generic], boards: Sequence[Board]) -> str | None:
     """Return what is said of the first of `boards` whose marks are seen twice in an image, of which one is taken; None
     without one."""
     grey = without_mosaic(grey_image(image))
     for board in boards:
-        if board.identified and _are_alike(*_marks(grey, board)):
+        if board.identified and _have_duplicates(*_marks(grey, board)):
             return (
                 f"the marks of '{board.board_id}' are seen twice: of boards alike in one image only one is found; "
-                f"{ALIKE_REMEDY}"
+                f"{DUPLICATES_REMEDY}"
             )
     return None
 
@@ -55,9 +55,9 @@ def _marks(grey: GreyImage, board: Board) -> tuple[FloatArray, IntArray]:
     return quads[seen], tags.number[seen]
 
 
-def _are_alike(quads: FloatArray, numbers: IntArray) -> bool:
+def _have_duplicates(quads: FloatArray, numbers: IntArray) -> bool:
     """Return whether so many marks are seen in two places that they are of two boards."""
     middle, side = quads.mean(axis=1), np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1)
-    away = np.linalg.norm(middle[:, None] - middle, axis=2) > APART_SIDES * np.maximum(side[:, None], side)
+    away = np.linalg.norm(middle[:, None] - middle, axis=2) > MIN_SEPARATION_SIDES * np.maximum(side[:, None], side)
     twins = len(np.unique(numbers[((numbers[:, None] == numbers) & away).any(axis=1)]))
-    return twins >= max(MIN_TWINS, MIN_SHARE_OF_TWINS * len(np.unique(numbers)))
+    return twins >= max(MIN_DUPLICATES, MIN_SHARE_OF_DUPLICATES * len(np.unique(numbers)))

@@ -21,7 +21,7 @@ from rigkit.core.errors import InputError
 from rigkit.planning.candidates import Reach
 from rigkit.planning.information import CornerError, Knowledge
 from rigkit.planning.plan import Plan, choose_views, covariance_of
-from rigkit.validation.sentinel.evidence import FreshEvidence, Watched
+from rigkit.validation.sentinel.evidence import FreshEvidence, Monitored
 from rigkit.validation.sentinel.frames import Frames
 from rigkit.validation.sentinel.hypotheses import Hypothesis, hypotheses_of, lens_goals, turn_weight
 from rigkit.validation.sentinel.judge import ALARM_CHANCE
@@ -44,20 +44,20 @@ class ChangeAim:
     unit: str = "px"
 
     @classmethod
-    def of(cls, watched: Watched, inverse: FloatArray, of_all: FloatArray) -> ChangeAim:
+    def of(cls, monitored: Monitored, inverse: FloatArray, of_all: FloatArray) -> ChangeAim:
         """Return the aim for all lenses and mounts, whose covariance has the `inverse` (T, T); hypotheses of which even
         `of_all` (T, T), what all frames say that could be taken, tells nothing are left out."""
-        several = len(watched.cameras) > 1
+        several = len(monitored.cameras) > 1
         by_all, shown = covariance_of(inverse + of_all), []
-        for hypothesis in hypotheses_of(watched):
-            metric = _metric(watched, hypothesis)
+        for hypothesis in hypotheses_of(monitored):
+            metric = _metric(monitored, hypothesis)
             if metric is None:
                 continue
             size, axes = np.linalg.eigh(metric)
             seen = size > NULL_RANK * size[-1]
             by_px = hypothesis.directions @ (axes[:, seen] / np.sqrt(size[seen]))
             one = (inverse @ by_px, by_px.T @ inverse @ by_px)
-            if _told(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
+            if _explained_variances(*one, by_all).min() > NULL_RANK * np.trace(one[1]):
                 shown.append(one)
         changes = "focus, principal point, distortion or mount" if several else "focus, principal point or distortion"
         return cls(tuple(shown), f"standard error of a change of {changes}, over the image")
@@ -67,27 +67,27 @@ class ChangeAim:
         none is told at the cost of all others; huge where there is one of which the frames say nothing."""
         variance = np.zeros(covariance.shape[:-2])
         for by_theta, whole in self.shown:
-            told = np.maximum(_told(by_theta, whole, covariance), NULL_RANK * np.trace(whole))
-            variance = variance + np.exp(-np.log(told).mean(axis=-1))
+            gained = np.maximum(_explained_variances(by_theta, whole, covariance), NULL_RANK * np.trace(whole))
+            variance = variance + np.exp(-np.log(gained).mean(axis=-1))
         return np.asarray(np.sqrt(variance))
 
 
-def _told(by_theta: FloatArray, whole: FloatArray, covariance: FloatArray) -> FloatArray:
+def _explained_variances(by_theta: FloatArray, whole: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the eigenvalues (..., m) of N, with P the `covariance` (..., T, T)."""
     return np.asarray(np.linalg.eigvalsh(whole - by_theta.T @ covariance @ by_theta))
 
 
-def _metric(watched: Watched, hypothesis: Hypothesis) -> FloatArray | None:
+def _metric(monitored: Monitored, hypothesis: Hypothesis) -> FloatArray | None:
     """Return the mean square over the image, px^2, that amounts of a hypothesis move it by, (m, m): of a lens after the
     best rotation, of a mount's turn what is far away; None for what is not looked for."""
-    c = watched.names.index(hypothesis.camera or watched.names[0])
+    c = monitored.names.index(hypothesis.camera or monitored.names[0])
     if hypothesis.kind in LENS_KINDS:
-        return np.asarray(hypothesis.directions.T @ lens_goals(watched)[c].weight @ hypothesis.directions)
-    return np.radians(1.0) ** 2 * turn_weight(watched.cameras[c]) if hypothesis.kind == "rotation" else None
+        return np.asarray(hypothesis.directions.T @ lens_goals(monitored)[c].weight @ hypothesis.directions)
+    return np.radians(1.0) ** 2 * turn_weight(monitored.cameras[c]) if hypothesis.kind == "rotation" else None
 
 
-def views_that_tell(
-    watched: Watched, boards: Sequence[Board], count: int, reach: Reach | None = None
+def informative_views(
+    monitored: Monitored, boards: Sequence[Board], count: int, reach: Reach | None = None
 ) -> tuple[Plan, tuple[Power, ...]]:
     """Return the pictures to check a camera or a rig with, and how well they would find what changed. Of a rig a
     picture is one of every camera at one moment, of one board.
@@ -97,24 +97,24 @@ def views_that_tell(
     """
     if not boards or count < 1:
         raise InputError("plan: at least one board and one picture are needed")
-    frames, sigma = Frames.of(watched, boards, reach or Reach()), watched.fresh_sigma_px
-    inverse, told = covariance_of(watched.covariance), frames.information / sigma**2
-    aim = ChangeAim.of(watched, inverse, told.sum(axis=0))
-    taken, errors = choose_views(inverse, told, aim, count)
-    views = frames.proposals(watched, boards, taken, errors)
+    frames, sigma = Frames.of(monitored, boards, reach or Reach()), monitored.fresh_sigma_px
+    inverse, gained = covariance_of(monitored.covariance), frames.information / sigma**2
+    aim = ChangeAim.of(monitored, inverse, gained.sum(axis=0))
+    taken, errors = choose_views(inverse, gained, aim, count)
+    views = frames.proposals(monitored, boards, taken, errors)
     evidence = FreshEvidence(
         information=frames.information[taken],
-        score=np.zeros((len(taken), watched.layout.count)),
+        score=np.zeros((len(taken), monitored.layout.count)),
         variance_px2=sigma**2,
         rms_px=float(np.sqrt(2.0) * sigma),
         expected_px=float(np.sqrt(2.0) * sigma),
         corners=sum(view.board.corner_count for view in views),
         left_out=0,
-        overdispersion=watched.overdispersion,
-        freedom=watched.freedom,
+        overdispersion=monitored.overdispersion,
+        freedom=monitored.freedom,
     )
     # Without any picture nothing is told.
-    knowledge = Knowledge(watched.cameras[0], inverse, CornerError(sigma))
+    knowledge = Knowledge(monitored.cameras[0], inverse, CornerError(sigma))
     return Plan(knowledge, aim, float("inf"), tuple(views)), powers_of(
-        watched, evidence, hypotheses_of(watched), ALARM_CHANCE
+        monitored, evidence, hypotheses_of(monitored), ALARM_CHANCE
     )

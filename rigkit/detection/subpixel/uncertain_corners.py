@@ -6,7 +6,7 @@ import numpy as np
 
 from rigkit.core.arrays import BoolArray, FloatArray, known_median
 
-UNSURE_TIMES, NEARBY_CELLS = 6.0, 2
+UNCERTAIN_FACTOR, NEARBY_CELLS = 6.0, 2
 """A corner with so many times the sigma that is usual on its board, and so near to it, in cells (where a board is seen
 aslant, or in the dark, many are less sure), mostly has something else in its window."""
 
@@ -24,23 +24,23 @@ def strays(sigma_px: FloatArray, off_cells: FloatArray, gain: FloatArray) -> Boo
     off_cells : (R, C) how far each lies from where the others foretell it, in sides of its cell; NaN likewise.
     gain : (R, C) standard deviation of that prediction for corners of standard deviation 1.
     """
-    out = unsure(sigma_px)
+    out = uncertain(sigma_px)
     if not out.any():
         return out
     spread = np.hypot(1.0, gain)
-    usual = known_median((off_cells / spread)[np.isfinite(off_cells) & ~out])
+    typical = known_median((off_cells / spread)[np.isfinite(off_cells) & ~out])
     with np.errstate(invalid="ignore"):
-        return np.asarray(out & ~(off_cells < np.maximum(IN_PLACE_CELLS, IN_PLACE_TIMES * usual * spread)))
+        return np.asarray(out & ~(off_cells < np.maximum(IN_PLACE_CELLS, IN_PLACE_TIMES * typical * spread)))
 
 
-def unsure(sigma_px: FloatArray) -> BoolArray:
+def uncertain(sigma_px: FloatArray) -> BoolArray:
     """Return which corners of a board are much less sure than others, and those around them; `sigma_px` (R, C), NaN
     where unknown."""
     with np.errstate(invalid="ignore"):
-        out = np.asarray(sigma_px > UNSURE_TIMES * known_median(sigma_px))
+        out = np.asarray(sigma_px > UNCERTAIN_FACTOR * known_median(sigma_px))
     if out.any():
         reach = 2 * NEARBY_CELLS + 1
         padded = np.pad(sigma_px, NEARBY_CELLS, constant_values=np.nan)
         around = np.lib.stride_tricks.sliding_window_view(padded, (reach, reach))[out]
-        out[out] = sigma_px[out] > UNSURE_TIMES * np.nanmedian(around, axis=(1, 2))
+        out[out] = sigma_px[out] > UNCERTAIN_FACTOR * np.nanmedian(around, axis=(1, 2))
     return out

@@ -39,7 +39,7 @@ MIN_WIDTH_PX, MAX_WIDTH_CELLS = 0.5, 0.3
 this, in squares, while these can be told: what is measured of a motion along the squares may be anything above."""
 
 
-def evened(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resampled | None:
+def with_uniform_blur(image: GreyImage, lattice: Lattice, refined: RefinedLattice) -> Resampled | None:
     """Return the part of `image` around a board with its blur made even; None where that is so, or nearly.
 
     `lattice` : its corners as they were found; `refined` : what the fit with even blur made of them.
