@@ -11,7 +11,8 @@ enum { TAPS = 4, LANES = 16 };
  * straight line. Beyond the first and the last ones, so far as `most`, they go on as these three, or two, do. */
 INLINE int64_t node_shares(double at, int64_t count, double most, int cubic, float out[TAPS])
 {
-    at = at < -most ? -most : at > (double)(count - 1) + most ? (double)(count - 1) + most : at;
+    const double highest = (double)(count - 1) + most;
+    at = -most > at ? -most : at > highest ? highest : at;
     const int64_t before = (int64_t)floor(at);
     const double t = at - (double)before, r = 1.0 - t;
     double weights[TAPS] = {0.0, r, t, 0.0};
@@ -46,8 +47,8 @@ INLINE int64_t node_shares(double at, int64_t count, double most, int cubic, flo
 }
 
 void board_shares(
-    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing, double most,
-    int64_t cubic, int64_t margin, int32_t *nodes, float *weights, int64_t *boxes)
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, double spacing, double most, int64_t cubic,
+    int64_t margin, int32_t *nodes, float *weights, int64_t *boxes)
 {
     for (int64_t n = 0; n < rows * columns; n++) {
         boxes[4 * n] = width;
@@ -104,8 +105,8 @@ INLINE void shares(
 }
 
 void board_values(
-    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns,
-    const double *values, int64_t count, float *out)
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *values,
+    int64_t count, float *out)
 {
     const int64_t area = width * height;
     for (int64_t k = 0; k < area; k++) {
@@ -149,8 +150,8 @@ static void blur_box(const float *from, int64_t wide, int64_t high, const float 
 }
 
 void move_blocks(
-    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns,
-    const float *gradient, const float *weight, const float *taps, int64_t radius, const int64_t *boxes, const int64_t *starts, int64_t room,
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *gradient,
+    const float *weight, const float *taps, int64_t radius, const int64_t *boxes, const int64_t *starts, int64_t room,
     float *scratch, int64_t size, float *data)
 {
     (void)size;
@@ -179,8 +180,8 @@ void move_blocks(
 }
 
 void share_blocks(
-    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *planes, int64_t wide_by, const int64_t *boxes, const int64_t *starts, int64_t room, float *scratch,
-    int64_t size, float *data)
+    const int32_t *nodes, const float *weights, int64_t width, int64_t height, int64_t rows, int64_t columns, const float *planes,
+    int64_t wide_by, const int64_t *boxes, const int64_t *starts, int64_t room, float *scratch, int64_t size, float *data)
 {
     (void)size;
     for (int64_t n = 0; n < rows * columns; n++) {
@@ -231,8 +232,8 @@ void block_products(
     for (int64_t n = 0; n < count; n++) {
         const int64_t *a = boxes + 4 * n, wide_a = a[2] - a[0] + 1, high_a = a[3] - a[1] + 1;
         for (int64_t p = 0; p < wide_by[n]; p++)
-            right[first[n] + p] = box_product(
-                data + starts[n] + p * high_a * wide_a, wide_a, rest + a[1] * width + a[0], width, wide_a, high_a);
+            right[first[n] + p] =
+                box_product(data + starts[n] + p * high_a * wide_a, wide_a, rest + a[1] * width + a[0], width, wide_a, high_a);
         for (int64_t m = 0; m <= n; m++) {
             const int64_t *b = boxes + 4 * m, wide_b = b[2] - b[0] + 1, high_b = b[3] - b[1] + 1;
             const int64_t left = a[0] > b[0] ? a[0] : b[0], end = a[2] < b[2] ? a[2] : b[2];

@@ -126,8 +126,7 @@ INLINE int in_square(const found_t *found, int k)
 }
 
 /* Set the `places` of `count` pixels of a row, of those in no square before, that are in the square at (column, row). */
-INLINE void fill_lanes(
-    const square_t *square, found_t *found, double v, int64_t count, double column, double row, double *places)
+INLINE void fill_lanes(const square_t *square, found_t *found, double v, int64_t count, double column, double row, double *places)
 {
     const lanes_t x = found->x - 0.5, y = found->y - 0.5;
     const mask_t near = ~(found->off < PLACED_PX) | ((SIZE(x) < NEAR_BY) & (SIZE(y) < NEAR_BY));
@@ -167,8 +166,8 @@ static void fill_box(
         for (int64_t v = box[1]; v <= box[3]; v++)
             for (int64_t first = 0; first < pixels; first += LANES)
                 fill_lanes(
-                    square, across + first / LANES, (double)(v + top), pixels - first < LANES ? pixels - first : LANES, column,
-                    row, places + 2 * (v * width + start + first));
+                    square, across + first / LANES, (double)(v + top), pixels - first < LANES ? pixels - first : LANES, column, row,
+                    places + 2 * (v * width + start + first));
     }
 }
 
@@ -210,8 +209,8 @@ void board_places(
 }
 
 void sheet_places(
-    const double *places, int64_t width, int64_t height, const uint8_t *corners, int64_t rows, int64_t columns,
-    const double *first, double each, const double *reach, float *on_sheet, truth_t *near)
+    const double *places, int64_t width, int64_t height, const uint8_t *corners, int64_t rows, int64_t columns, const double *first,
+    double each, const double *reach, float *on_sheet, truth_t *near)
 {
     const int64_t area = width * height;
     for (int64_t k = 0; k < area; k++) {

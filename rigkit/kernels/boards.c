@@ -44,8 +44,7 @@ INLINE double add_line(double place, double line, const growth_t *grow, double s
 
 /* Set `out` to the picture along one axis at the place `at`; how far on its neighbours before and after it are, along u and
  * along v, is in `next`. */
-INLINE void look_along(
-    const double *at, const int64_t next[2][2], int64_t lines, const double ends[2], double sharp, along_t *out)
+INLINE void look_along(const double *at, const int64_t next[2][2], int64_t lines, const double ends[2], double sharp, along_t *out)
 {
     for (int order = 0; order < ORDERS; order++)
         out->squares[order] = out->before[order] = out->beyond[order] = 0.0;
@@ -65,8 +64,8 @@ INLINE void look_along(
         return;
     }
     const double uu = after_u - 2.0 * place + before_u, vv = after_v - 2.0 * place + before_v;
-    const double uv = 0.25 * (at[next[0][1] + next[1][1]] - at[next[0][0] + next[1][1]] - at[next[0][1] + next[1][0]]
-                              + at[next[0][0] + next[1][0]]);
+    const double uv = 0.25
+        * (at[next[0][1] + next[1][1]] - at[next[0][0] + next[1][1]] - at[next[0][1] + next[1][0]] + at[next[0][0] + next[1][0]]);
     slope = slope > 1e-6 ? slope : 1e-6;
     const double per = 1.0 / slope, nu = gu * per, nv = gv * per;
     const double bend = limited((uu * nu * nu + 2.0 * uv * nu * nv + vv * nv * nv) * per, 0.5 / sharp);
@@ -100,8 +99,8 @@ INLINE void multiply(const double a[ORDERS], const double b[ORDERS], double rho,
 
 /* As `board_picture`. */
 INLINE void draw(
-    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends,
-    const double *paper, double sharp, const int64_t planes, float *out)
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends, const double *paper,
+    double sharp, const int64_t planes, float *out)
 {
     const int64_t area = width * height;
     const double mean = 0.25 * (paper[0] + paper[1] + paper[2] + paper[3]);
@@ -130,8 +129,7 @@ INLINE void draw(
                 rest1[order] = (order ? 0.0 : 1.0) - 0.5 * (one.before[order] + one.beyond[order]);
                 rest2[order] = (order ? 0.0 : 1.0) - 0.5 * (two.before[order] + two.beyond[order]);
             }
-            const double *parts[4][2] = {
-                {one.before, rest2}, {one.beyond, rest2}, {rest1, two.before}, {rest1, two.beyond}};
+            const double *parts[4][2] = {{one.before, rest2}, {one.beyond, rest2}, {rest1, two.before}, {rest1, two.beyond}};
             double all[3] = {0.0};
             multiply(one.squares, two.squares, rho, 1.0, all);
             for (int side = 0; side < 4; side++) {
@@ -162,8 +160,8 @@ INLINE void draw(
 
 FOR_EACH_PROCESSOR
 void board_picture(
-    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends,
-    const double *paper, double sharp, int64_t planes, float *out)
+    const double *places, int64_t width, int64_t height, int64_t rows, int64_t columns, const double *ends, const double *paper,
+    double sharp, int64_t planes, float *out)
 {
     if (planes == 1)
         draw(places, width, height, rows, columns, ends, paper, sharp, 1, out);

@@ -195,7 +195,8 @@ INLINE void add_beside(
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
         const double per_r = 1.0 / (places.r[k] > 1e-9 ? places.r[k] : 1e-9), c = places.x[k] * per_r, s = places.y[k] * per_r;
-        const double grown = slope[k] * blur.per_s[k] * places.per_radius[k], bent = 0.5 * slope[k] * places.curvature[k] * blur.s[k];
+        const double grown = slope[k] * blur.per_s[k] * places.per_radius[k],
+                     bent = 0.5 * slope[k] * places.curvature[k] * blur.s[k];
         const double wider = slope[k] * (places.d[k] * blur.per_s[k] * blur.per_s[k] - 0.5 * places.curvature[k]);
         total[k] += share[k];
         rows[E1][k] += grown + bent;

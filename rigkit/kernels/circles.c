@@ -88,8 +88,7 @@ INLINE void add_harmonics(const places_t *places, const double grown[BLOCK], con
 }
 
 /* Write the products of rows, the lower triangle of `sums`; where `all` of them are wanted, the harmonics of residuals, too. */
-INLINE void sum_products(
-    const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[8])
+INLINE void sum_products(const group_t *at, const spots_t *spots, const int all, double sums[ROWS][ROWS], double harmonics[8])
 {
     const int count = all ? ROWS : COLUMNS;
     double du[BLOCK], dv[BLOCK], value[BLOCK], rows[ROWS][BLOCK];
@@ -275,8 +274,8 @@ static group_t grouped(
 FOR_EACH_PROCESSOR
 void fit_circles(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *maps,
-    const double *curvatures, const double *blur, const double *uneven, const double *reach, const int64_t *beside, const circle_rules_t *rules, int64_t capacity,
-    double *scratch, double *out)
+    const double *curvatures, const double *blur, const double *uneven, const double *reach, const int64_t *beside,
+    const circle_rules_t *rules, int64_t capacity, double *scratch, double *out)
 {
     spots_t spots = {.u = scratch, .v = scratch + capacity, .value = scratch + 2 * capacity};
     for (int64_t n = 0; n < count; n++) {

@@ -9,8 +9,8 @@ static int are_close(const double *one, const double *other, int64_t axes, doubl
     return 1;
 }
 
-EXPORT int64_t close_pairs(
-    const double *points, int64_t count, int64_t axes, double reach, const int64_t *ends, int64_t *pairs, int64_t capacity)
+EXPORT int64_t
+close_pairs(const double *points, int64_t count, int64_t axes, double reach, const int64_t *ends, int64_t *pairs, int64_t capacity)
 {
     int64_t found = 0;
     for (int64_t i = 0; i < count; i++)

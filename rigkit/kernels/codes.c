@@ -73,7 +73,8 @@ FOR_EACH_PROCESSOR void read_codes(
     const int64_t modules = side * side, last = codes - 1;
     for (int64_t n = 0; n < count; n++) {
         best[n] = 0;
-        likeness[n] = read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? -INFINITY : 0.0;
+        likeness[n] =
+            read_tag(grey, bytes, width, height, quads + 8 * n, side, bright + modules * n) >= min_contrast ? -INFINITY : 0.0;
     }
     /* Four codes at once, as the sum of one waits for itself, with all tags: the codes of a board are more than the first cache. */
     for (int64_t c = 0; c < codes; c += 4) {

@@ -119,8 +119,7 @@ static int64_t walk(
 /* reference.growth.components_of: the lattices of the links `to` (count, 4), which are changed. Returns how many; label, grid (count, 2),
  * turn and members as in `walk`. `queue` (2 * count) and `bound` (4 * count) are scratch. */
 int64_t find_components(
-    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue,
-    uint8_t *bound)
+    int64_t count, int64_t *to, int64_t *label, int64_t *grid, int64_t *turn, int64_t *members, int64_t *queue, uint8_t *bound)
 {
     keep_quads(count, to, bound);
     return walk(count, to, label, grid, turn, members, queue);

@@ -21,8 +21,7 @@ INLINE int saddle_near(const float *smooth, int64_t width, int64_t u, int64_t v,
 
 /* Return whether every fourth sample of the ring around (u, v) leaves it possible that there is a corner
  * (reference.front.may_be_corners). */
-INLINE int may_be_corner(
-    const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
+INLINE int may_be_corner(const image_t image, const ring_rules_t *rules, float u, float v, float radius, float response)
 {
     enum { EVERY = 4, PAIRS = HALF / EVERY, SAMPLES = 2 * PAIRS };
     float even[PAIRS], mean = 0.0f, energy = 0.0f, odd_energy = 0.0f, seen[SAMPLES];
@@ -37,9 +36,8 @@ INLINE int may_be_corner(
         energy += (even[k] - mean) * (even[k] - mean);
     const float centre = brightness_at(image, u, v) - mean, variance = energy / (float)PAIRS;
     const double max_centre = odd_energy < (float)rules->even_odd * energy ? rules->quick_even : rules->quick_centre;
-    return odd_energy < (float)rules->quick_odd * energy &&
-           centre * centre < (float)(max_centre * max_centre) * variance &&
-           response < (float)rules->quick_sharp * variance;
+    return odd_energy < (float)rules->quick_odd * energy && centre * centre < (float)(max_centre * max_centre) * variance
+        && response < (float)rules->quick_sharp * variance;
 }
 
 /* Ask for what the ring around pixel (u, v) is read from: peaks lie all over an image that no near cache holds. */
@@ -102,8 +100,7 @@ int64_t find_corners(
 }
 
 /* Mark those of `fresh` (count, 2) that lie within `reach` of one of `known`. Returns 0 without memory. */
-int64_t mark_known(
-    const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
+int64_t mark_known(const double *fresh, int64_t count, const double *known, int64_t known_count, double reach, uint8_t *mark)
 {
     squares_t squares;
     int32_t *scratch = malloc((size_t)SQUARES_MEMORY(known_count) * sizeof(int32_t));

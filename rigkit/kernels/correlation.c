@@ -180,8 +180,7 @@ void sigma_factors(
         memset(&known, 0, sizeof known);
         for (int64_t i = 0; i < count; i++)
             if (owner[i] == board && good[i] && pairs[LAGS * i] > 0.0 && noise[i] <= rules->covered_times * typical) {
-                add_known(
-                    products + LAGS * i, pairs + LAGS * i, noise[i], pixels + 2 * i, sides + 4 * i, blur[i], used[i], &known);
+                add_known(products + LAGS * i, pairs + LAGS * i, noise[i], pixels + 2 * i, sides + 4 * i, blur[i], used[i], &known);
                 clear++;
             }
         double *values = (double *)&known;

@@ -95,8 +95,17 @@ static double clipped(double value, double low, double high)
 static void move(double *values, const double *step, int n, const edge_rules_t *rules)
 {
     const double limits[PARAMETERS] = {
-        rules->max_move_px, rules->max_move_px, rules->max_turn, rules->max_turn, rules->max_blur_change * values[S],
-        INFINITY, INFINITY, rules->max_light_change, rules->max_light_change, INFINITY, INFINITY};
+        rules->max_move_px,
+        rules->max_move_px,
+        rules->max_turn,
+        rules->max_turn,
+        rules->max_blur_change * values[S],
+        INFINITY,
+        INFINITY,
+        rules->max_light_change,
+        rules->max_light_change,
+        INFINITY,
+        INFINITY};
     for (int k = 0; k < n; k++)
         values[k] += clipped(step[k], -limits[k], limits[k]);
     values[S] = clipped(values[S], rules->min_blur, rules->max_blur);
@@ -108,19 +117,20 @@ typedef struct {
     int count, papered, levelled;
 } prior_t;
 
-static prior_t prior_of(
-    const window_t *window, const geometry_t at, double blur, double contrast, const edge_rules_t *rules)
+static prior_t prior_of(const window_t *window, const geometry_t at, double blur, double contrast, const edge_rules_t *rules)
 {
     const double turn = 1.0 / (rules->angle_sigma * rules->angle_sigma);
     const double width = 1.0 / (rules->log_blur_sigma * rules->log_blur_sigma * blur * blur);
     const double light = 1.0 / (rules->light_sigma * rules->light_sigma * window->size * window->size);
     const double bend1 = at.curvature_sigma[0], bend2 = at.curvature_sigma[1];
     prior_t prior = {
-        .mean = {0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0,
-                 at.curvature[0], at.curvature[1]},
+        .mean =
+            {0.0, 0.0, atan2(at.sides[1], at.sides[0]), atan2(at.sides[3], at.sides[2]), blur, 0.0, 0.0, 0.0, 0.0, at.curvature[0],
+             at.curvature[1]},
         .information = {0.0, 0.0, turn, turn, width, 0.0, 0.0, light, light, 1.0 / (bend1 * bend1), 1.0 / (bend2 * bend2)},
         .count = bend1 > 0.0 && bend2 > 0.0 ? PARAMETERS : FEWER,
-        .papered = at.single[0] != 0.0, .levelled = isfinite(contrast) != 0};
+        .papered = at.single[0] != 0.0,
+        .levelled = isfinite(contrast) != 0};
     for (int k = 0; k < 4; k++)
         prior.papered |= isfinite(at.paper[k]) != 0;
     return prior;
@@ -201,7 +211,8 @@ FOR_EACH_PROCESSOR static void fit_corner(
         noise = noise > rules->min_variance ? noise : rules->min_variance;
     }
     const double spread = found.solved
-        ? 0.5 * noise * (inverse_at(found.products, X, prior.count) + inverse_at(found.products, Y, prior.count)) : NAN;
+        ? 0.5 * noise * (inverse_at(found.products, X, prior.count) + inverse_at(found.products, Y, prior.count))
+        : NAN;
     const double u = window->centre_u + values[X], v = window->centre_v + values[Y];
     const double side1 = hypot(at.sides[0], at.sides[1]), side2 = hypot(at.sides[2], at.sides[3]);
     double most = rules->valid_move_cells * (side1 > side2 ? side1 : side2);
@@ -209,7 +220,14 @@ FOR_EACH_PROCESSOR static void fit_corner(
     const int valid = hypot(u - pixel[0], v - pixel[1]) < most && spread > 0.0 && isfinite(spread) && more > 0
         && is_surrounded(window, (float)values[X], (float)values[Y]);
     const double outcome[] = {
-        u, v, valid ? sqrt(spread) : 0.0, values[S], 2.0 * values[B] * sign, sqrt(variance), sqrt(noise), (double)valid,
+        u,
+        v,
+        valid ? sqrt(spread) : 0.0,
+        values[S],
+        2.0 * values[B] * sign,
+        sqrt(variance),
+        sqrt(noise),
+        (double)valid,
         (double)window->count};
     memcpy(out, outcome, sizeof outcome);
 }
@@ -244,9 +262,15 @@ static window_t window_in(float *scratch, const edge_rules_t *rules)
     if (rules->mirrored)
         memset(pictures + 2 * across * across, 0, 2 * (size_t)(across * across) * sizeof(float));
     return (window_t){
-        .u = scratch, .v = scratch + room, .value = scratch + 2 * room, .rows = scratch + 3 * room,
-        .square = pictures, .turned = pictures + across * across, .change = pictures + 2 * across * across,
-        .paired = pictures + 3 * across * across, .across = across,
+        .u = scratch,
+        .v = scratch + room,
+        .value = scratch + 2 * room,
+        .rows = scratch + 3 * room,
+        .square = pictures,
+        .turned = pictures + across * across,
+        .change = pictures + 2 * across * across,
+        .paired = pictures + 3 * across * across,
+        .across = across,
         .radius = (int64_t)floor(rules->radius_px)};
 }
 
@@ -255,16 +279,15 @@ static window_t window_in(float *scratch, const edge_rules_t *rules)
  * `grey` is of uint8_t if `bytes`, else of float. */
 void fit_edges(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach, const double *paper, const double *single,
-    const double *sign, const double *blur, const double *window_blur, const double *contrast, const uint8_t *ends, const edge_rules_t *rules,
-    float *scratch, double *out)
+    const double *curvature, const double *curvature_sigma, const double *gaps, const double *tilts, const double *reach,
+    const double *paper, const double *single, const double *sign, const double *blur, const double *window_blur,
+    const double *contrast, const uint8_t *ends, const edge_rules_t *rules, float *scratch, double *out)
 {
     const picture_t image = {grey, width, height, bytes};
     window_t window = window_in(scratch, rules);
     for (int64_t n = 0; n < count; n++) {
-        const geometry_t at = {
-            sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n, reach + 4 * n, paper + 4 * n, single + 2 * n,
-            ends + 4 * n};
+        const geometry_t at = {sides + 4 * n, curvature + 2 * n, curvature_sigma + 2 * n, gaps + 4 * n, tilts + 4 * n,
+                               reach + 4 * n, paper + 4 * n,     single + 2 * n,          ends + 4 * n};
         collect_window(&window, image, pixels + 2 * n, at, window_blur[n], rules);
         fit_corner(&window, pixels + 2 * n, at, sign[n], blur[n], contrast[n], rules, out + OUTCOMES * n);
     }
@@ -273,8 +296,9 @@ void fit_edges(
 /* Fit the corner of a tag from `pixel`, where the board lies as `seen` says (a row of a surface) and neighbours are `step` sides
  * of a tag away. Its window reaches half way to these, and is so narrow that it ends before the code, beyond the tag's border. */
 static void fit_tag_corner(
-    window_t *window, const picture_t image, const double pixel[2], const double *seen, const double step[4], const double single[2],
-    double sign, double blur, double contrast, const tag_window_t *tag, const edge_rules_t *rules, double *out)
+    window_t *window, const picture_t image, const double pixel[2], const double *seen, const double step[4],
+    const double single[2], double sign, double blur, double contrast, const tag_window_t *tag, const edge_rules_t *rules,
+    double *out)
 {
     static const double none[4] = {0.0}, unknown[4] = {NAN, NAN, NAN, NAN};
     static const uint8_t inside[4] = {0};

@@ -16,9 +16,9 @@ typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef int32_t mask_t __attribute__((vector_size(4 * LANES)));
 
 /* What the lattice says of a corner: its cell's sides, the curvature of its lines and how uncertain it is, where their
- * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is not by rule, which of these
- * have no corner of the lattice, and how bright it is beyond these, NaN where that is not known. Of a corner of one square
- * alone, on which side of its lines that lies, +1 or -1; of others 0. */
+ * neighbours are and by how much these are turned, how far its window goes towards these, in sides of the cell, where that is
+ * not by rule, which of these have no corner of the lattice, and how bright it is beyond these, NaN where that is not known.
+ * Of a corner of one square alone, on which side of its lines that lies, +1 or -1; of others 0. */
 typedef struct {
     const double *sides, *curvature, *curvature_sigma, *gaps, *tilts, *reach, *paper, *single;
     const uint8_t *ends;
@@ -39,10 +39,12 @@ typedef struct {
     int64_t width, height, bytes;
 } picture_t;
 
+typedef float block_row_t[BLOCK];
+
 /* The rows of the block of pixels that begins with `start`. */
-INLINE float (*rows_of(const window_t *window, int64_t start))[BLOCK]
+INLINE block_row_t *rows_of(const window_t *window, int64_t start)
 {
-    return (float(*)[BLOCK])(window->rows + start * ROWS);
+    return (block_row_t *)(window->rows + start * ROWS);
 }
 
 /* edges_window.c */
@@ -59,8 +61,7 @@ void normal_equations(
 void all_normal_equations(
     const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products);
 void papered_equations(
-    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
-    double *products);
+    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products);
 
 /* edges_noise.c */
 

@@ -40,7 +40,8 @@ INLINE int all_beyond(const int size, const float *x)
 }
 
 INLINE line_t line_of(
-    double angle, double curvature, const double gaps[2], const double tilts[2], const double paper[2], double blur, const edge_rules_t *rules)
+    double angle, double curvature, const double gaps[2], const double tilts[2], const double paper[2], double blur,
+    const edge_rules_t *rules)
 {
     const double cosine = cos(angle), sine = sin(angle), c2 = cosine * cosine, s2 = sine * sine, b2 = blur * blur;
     const double flat = rules->pixel_kurtosis * (c2 * c2 + s2 * s2);
@@ -49,14 +50,24 @@ INLINE line_t line_of(
     const double nearest = gaps[0] < gaps[1] ? gaps[0] : gaps[1];
     const int before = isfinite(paper[0]), after = isfinite(paper[1]);
     return (line_t){
-        .cosine = (float)cosine, .sine = (float)sine, .curvature = (float)curvature,
-        .before = (float)gaps[0], .after = (float)gaps[1],
-        .tilt_before = (float)tilts[0], .tilt_after = (float)tilts[1],
-        .blur = (float)blur, .width = (float)width, .stretch = (float)(blur / width), .apart = (float)apart,
+        .cosine = (float)cosine,
+        .sine = (float)sine,
+        .curvature = (float)curvature,
+        .before = (float)gaps[0],
+        .after = (float)gaps[1],
+        .tilt_before = (float)tilts[0],
+        .tilt_after = (float)tilts[1],
+        .blur = (float)blur,
+        .width = (float)width,
+        .stretch = (float)(blur / width),
+        .apart = (float)apart,
         .kurtosis = sharp ? 0.0f : (float)(flat / (b2 * b2)),
-        .paper_before = before ? (float)paper[0] : 0.0f, .paper_after = after ? (float)paper[1] : 0.0f,
-        .tight = before || after || nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur, .sharp = sharp,
-        .ends_before = before, .ends_after = after};
+        .paper_before = before ? (float)paper[0] : 0.0f,
+        .paper_after = after ? (float)paper[1] : 0.0f,
+        .tight = before || after || nearest * (1.0 - rules->reach) < rules->tail_sigmas * blur,
+        .sharp = sharp,
+        .ends_before = before,
+        .ends_after = after};
 }
 
 INLINE float cut(float at)
@@ -138,7 +149,8 @@ INLINE void along_line(const int size, const line_t line, const float *u, const 
 }
 
 /* Add what lies beyond the line `shift` back from `line`, turned by `tilt`, on the side where `way` times the distance grows. */
-INLINE void add_paper(const int size, const line_t line, float shift, float tilt, float way, float paper, const edge_t *at, beyond_t *out)
+INLINE void add_paper(
+    const int size, const line_t line, float shift, float tilt, float way, float paper, const edge_t *at, beyond_t *out)
 {
     edge_t edge;
     for (int i = 0; i < size; i++) {

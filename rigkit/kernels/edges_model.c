@@ -5,9 +5,11 @@
 /* reference.edges._mixed. */
 INLINE float mixed(const edge_t *one, const edge_t *two, float rho, int i)
 {
-    return -(one->value[i] * two->value[i]
-             + rho * (one->slope[i] * two->slope[i]
-                      + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
+    return -(
+        one->value[i] * two->value[i]
+        + rho
+            * (one->slope[i] * two->slope[i]
+               + rho * (0.5f * one->bow[i] * two->bow[i] + (1.0f / 6.0f) * rho * one->curl[i] * two->curl[i])));
 }
 
 /* What the rows of every block need of the parameters. */
@@ -20,16 +22,24 @@ INLINE model_t model_of(const double *values, const window_t *window, const geom
 {
     const float per_size = (float)(1.0 / window->size);
     return (model_t){
-        .x = (float)values[X], .y = (float)values[Y], .blur = (float)values[S], .base = (float)values[A],
-        .half = (float)values[B], .per_size = per_size, .light_u = (float)values[GX] * per_size,
-        .light_v = (float)values[GY] * per_size, .rho = (float)cos(values[T1] - values[T2]),
-        .single1 = (float)at.single[0], .single2 = (float)at.single[1],
+        .x = (float)values[X],
+        .y = (float)values[Y],
+        .blur = (float)values[S],
+        .base = (float)values[A],
+        .half = (float)values[B],
+        .per_size = per_size,
+        .light_u = (float)values[GX] * per_size,
+        .light_v = (float)values[GY] * per_size,
+        .rho = (float)cos(values[T1] - values[T2]),
+        .single1 = (float)at.single[0],
+        .single2 = (float)at.single[1],
         .line1 = line_of(values[T1], values[K1], at.gaps, at.tilts, at.paper, values[S], rules),
         .line2 = line_of(values[T2], values[K2], at.gaps + 2, at.tilts + 2, at.paper + 2, values[S], rules)};
 }
 
 /* The pattern at pixel i with what is beyond its outer squares, and what that adds to its derivatives. */
-INLINE float papered_pattern(const model_t *m, const edge_t *one, const edge_t *two, const beyond_t *past1, const beyond_t *past2, int i)
+INLINE float papered_pattern(
+    const model_t *m, const edge_t *one, const edge_t *two, const beyond_t *past1, const beyond_t *past2, int i)
 {
     float pattern = mixed(one, two, m->rho, i);
     pattern += past1->paper[i] * (1.0f - 0.5f * past2->seen[i]) + past2->paper[i] * (1.0f - 0.5f * past1->seen[i]);
@@ -55,7 +65,7 @@ INLINE void add_papered(
  * last to the residuals. */
 INLINE void fill_rows(
     const int parameters, const int papered, const int size, const model_t *m, const window_t *window, int64_t start,
-    float (*restrict rows)[BLOCK])
+    block_row_t *restrict rows)
 {
     const float *restrict u = window->u + start, *restrict v = window->v + start;
     const float *restrict value = window->value + start;
@@ -74,10 +84,10 @@ INLINE void fill_rows(
         const float plain = m->base + half * pattern;
         const float light = 1.0f + m->light_u * u[i] + m->light_v * v[i];
         const float scale = -light * half / blur;
-        float by_d1 = scale * (one.slope[i] * two.value[i]
-                               + rho * (one.bow[i] * two.slope[i] + half_rho * one.curl[i] * two.bow[i]));
-        float by_d2 = scale * (two.slope[i] * one.value[i]
-                               + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
+        float by_d1 =
+            scale * (one.slope[i] * two.value[i] + rho * (one.bow[i] * two.slope[i] + half_rho * one.curl[i] * two.bow[i]));
+        float by_d2 =
+            scale * (two.slope[i] * one.value[i] + rho * (two.bow[i] * one.slope[i] + half_rho * two.curl[i] * one.bow[i]));
         float grown = one.grown[i] * two.value[i] + two.grown[i] * one.value[i];
         if (papered)
             add_papered(m, &one, &two, &past1, &past2, i, scale, &by_d1, &by_d2, &grown);
@@ -101,7 +111,7 @@ INLINE void fill_rows(
 
 /* Add the products of the first `parameters` rows of `size` pixels, a block or half of it, and the last to `sum`, the lower half
  * row by row. */
-INLINE void add_block(const int parameters, const int size, float (*restrict rows)[BLOCK], lanes_t *sum)
+INLINE void add_block(const int parameters, const int size, block_row_t *restrict rows, lanes_t *sum)
 {
     for (int i = 0; i <= parameters; i++) {
         const lanes_t *left = (const lanes_t *)rows[i];
@@ -125,7 +135,7 @@ INLINE void add_block(const int parameters, const int size, float (*restrict row
 }
 
 /* Clear a block of the first `parameters` rows and the last from pixel `used` on. */
-INLINE void clear_behind(const int parameters, int64_t used, float (*restrict rows)[BLOCK])
+INLINE void clear_behind(const int parameters, int64_t used, block_row_t *restrict rows)
 {
     const int group = (int)(used / LANES), left = (int)(used % LANES);
     const mask_t numbers = {0, 1, 2, 3, 4, 5, 6, 7}, kept = numbers < left;
@@ -141,8 +151,8 @@ INLINE void clear_behind(const int parameters, int64_t used, float (*restrict ro
 /* Set the rows of the block of pixels that begins with `start` (fill_rows), nothing behind the last of `used`, and add their
  * products to `sums`. */
 INLINE void multiply_block(
-    const int parameters, const int papered, const int size, const model_t *model, const window_t *window, int64_t start, int64_t used,
-    float (*restrict rows)[BLOCK], lanes_t *sums)
+    const int parameters, const int papered, const int size, const model_t *model, const window_t *window, int64_t start,
+    int64_t used, block_row_t *restrict rows, lanes_t *sums)
 {
     fill_rows(parameters, papered, size, model, window, start, rows);
     if (used < BLOCK)
@@ -152,15 +162,15 @@ INLINE void multiply_block(
 
 /* Set the window's rows (fill_rows), and `products` (rows of ROWS, lower half) to those of these rows over all pixels. */
 INLINE void multiply_rows(
-    const int parameters, const int papered, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
-    double *products)
+    const int parameters, const int papered, const double *values, const window_t *window, const geometry_t at,
+    const edge_rules_t *rules, double *products)
 {
     const model_t model = model_of(values, window, at, rules);
     lanes_t sums[ROWS * (ROWS + 1) / 2];
     memset(sums, 0, sizeof sums);
     for (int64_t start = 0; start < window->count; start += BLOCK) {
         /* Where they are not asked for afterwards, in one place, which stays in the cache. */
-        float(*restrict rows)[BLOCK] = rows_of(window, rules->mirrored ? start : 0);
+        block_row_t *restrict rows = rows_of(window, rules->mirrored ? start : 0);
         const int64_t used = window->count - start;
         if (used > BLOCK / 2) {
             multiply_block(parameters, papered, BLOCK, &model, window, start, used, rows, sums);
@@ -194,8 +204,7 @@ void all_normal_equations(
 /* Beside paper of known brightness, and at corners of single squares. */
 FOR_EACH_PROCESSOR
 void papered_equations(
-    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules,
-    double *products)
+    const int n, const double *values, const window_t *window, const geometry_t at, const edge_rules_t *rules, double *products)
 {
     multiply_rows(n == FEWER ? FEWER : PARAMETERS, 1, values, window, at, rules, products);
 }

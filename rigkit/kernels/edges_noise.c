@@ -9,7 +9,7 @@ double leave_residuals(window_t *window, const double *step, int parameters)
 {
     lanes_t sums = {0.0f};
     for (int64_t start = 0; start < window->count; start += BLOCK) {
-        float(*restrict rows)[BLOCK] = rows_of(window, start);
+        block_row_t *restrict rows = rows_of(window, start);
         lanes_t *rest = (lanes_t *)rows[parameters];
         for (int k = 0; k < parameters; k++) {
             const lanes_t *row = (const lanes_t *)rows[k];

@@ -40,8 +40,7 @@ INLINE void take(window_t *window, const picture_t image, int64_t v, int32_t fir
     float *restrict us = window->u + window->count, *restrict vs = window->v + window->count;
     float *restrict values = window->value + window->count;
     /* In steps of known length: what is too much is written over, or not looked at. */
-    const bright_t steps = {
-        0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f, 8.0f, 9.0f, 10.0f, 11.0f, 12.0f, 13.0f, 14.0f, 15.0f};
+    const bright_t steps = {0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f, 8.0f, 9.0f, 10.0f, 11.0f, 12.0f, 13.0f, 14.0f, 15.0f};
     for (int32_t k = 0; k < count; k += STRETCH) {
         *(bright_t *)(us + k) = steps + (float)(first + k);
         *(bright_t *)(vs + k) = (bright_t){0.0f} + (float)v;

@@ -85,10 +85,9 @@ INLINE void polish(const double cubics[CUBICS][MONOMIALS], double place[3])
     const double terms[4][MONOMIALS] = {
         {3.0 * xx, 0.0, 2.0 * x * y, yy, 2.0 * x * z, 2.0 * x, 0.0, 0.0, y * z, y, zz, z, 1.0},
         {0.0, 3.0 * yy, xx, 2.0 * x * y, 0.0, 0.0, 2.0 * y * z, 2.0 * y, x * z, x, 0.0, 0.0, 0.0, zz, z, 1.0},
-        {0.0, 0.0, 0.0, 0.0, xx, 0.0, yy, 0.0, x * y, 0.0, 2.0 * x * z, x, 0.0, 2.0 * y * z, y, 0.0, 3.0 * zz, 2.0 * z,
-         1.0},
-        {x * xx, y * yy, xx * y, x * yy, xx * z, xx, yy * z, yy, x * y * z, x * y, x * zz, x * z, x, y * zz, y * z, y,
-         z * zz, zz, z, 1.0},
+        {0.0, 0.0, 0.0, 0.0, xx, 0.0, yy, 0.0, x * y, 0.0, 2.0 * x * z, x, 0.0, 2.0 * y * z, y, 0.0, 3.0 * zz, 2.0 * z, 1.0},
+        {x * xx, y * yy, xx * y, x * yy, xx * z, xx, yy * z, yy, x * y * z, x * y,
+         x * zz, x * z,  x,      y * zz, y * z,  y,  z * zz, zz, z,         1.0},
     };
     /* The normal equations, and in the last column their right hand side; solved by Cramer's rule. */
     double gram[3][4] = {{0.0}};

@@ -5,10 +5,9 @@
 #include "kernels.h"
 
 void typical_values(
-    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness,
-    float *room, float *out);
-void fill_thresholds(
-    const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest,
+    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness, float *room,
     float *out);
+void fill_thresholds(
+    const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest, float *out);
 
 #endif

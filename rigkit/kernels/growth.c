@@ -123,14 +123,17 @@ INLINE double gain_of(const surroundings_t *at, const int degree, double solved[
 /* Fit a polynomial of `degree` (known when compiling, so that all loops unroll) around the cell (row, column) of
  * `lattice` (rows, columns, 2), NaN where unknown. `bell` are the weights of steps 0, 1, ... along one direction. */
 INLINE void fit_polynomial(
-    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const int degree,
-    const fit_rules_t *rules, const double *bell, fit_t *out)
+    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const int degree, const fit_rules_t *rules,
+    const double *bell, fit_t *out)
 {
     const int terms = (degree + 1) * (degree + 2) / 2;
     const int64_t radius = rules->radius;
     surroundings_t at = {
-        .row = row, .column = column, .low_r = row - radius > 0 ? row - radius : 0,
-        .low_c = column - radius > 0 ? column - radius : 0, .high_r = row + radius < rows - 1 ? row + radius : rows - 1,
+        .row = row,
+        .column = column,
+        .low_r = row - radius > 0 ? row - radius : 0,
+        .low_c = column - radius > 0 ? column - radius : 0,
+        .high_r = row + radius < rows - 1 ? row + radius : rows - 1,
         .high_c = column + radius < columns - 1 ? column + radius : columns - 1};
     for (int64_t r = at.low_r; r <= at.high_r; r++)
         add_row(lattice, columns, r, degree, rules, bell, &at);
@@ -161,8 +164,8 @@ INLINE void fit_polynomial(
 }
 
 INLINE void fit_cell(
-    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const fit_rules_t *rules,
-    const double *bell, fit_t *out)
+    const double *lattice, int64_t rows, int64_t columns, int64_t row, int64_t column, const fit_rules_t *rules, const double *bell,
+    fit_t *out)
 {
     if (rules->degree == 1)
         fit_polynomial(lattice, rows, columns, row, column, 1, rules, bell, out);
@@ -199,7 +202,10 @@ FOR_EACH_PROCESSOR void sort_points(const double *points, int64_t count, int32_t
     fill_squares(points, count, 1.0, memory, out);
 }
 
-int64_t squares_memory(int64_t count) { return SQUARES_MEMORY(count); }
+int64_t squares_memory(int64_t count)
+{
+    return SQUARES_MEMORY(count);
+}
 
 /* Find the (at most `most`) nearest points within `reach` of (u, v), the nearest first; return how many. */
 static int64_t nearest_points(const squares_t *squares, double u, double v, double reach, int64_t most, int64_t *found)
@@ -246,8 +252,8 @@ INLINE int runs_along(double angle, const double *vector, double line_sine)
 
 /* Return whether the saddle at (u, v) can be the corner of the cell, and its contrast (reference.growth._fits). */
 INLINE int fits(
-    const sheet_t *sheet, const pyramid_level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row,
-    int64_t column, double height, const double *pixel, double *contrast)
+    const sheet_t *sheet, const pyramid_level_t *level, const growth_rules_t *rules, const fit_t *fit, int64_t row, int64_t column,
+    double height, const double *pixel, double *contrast)
 {
     const double u = (pixel[0] - level->offset) / level->scale, v = (pixel[1] - level->offset) / level->scale;
     const double sign = (row + column) % 2 ? -sheet->sign : sheet->sign;
@@ -256,8 +262,8 @@ INLINE int fits(
     radius = radius < rules->max_ring ? radius : rules->max_ring;
     if (!read_ring(level->image, *rules->ring, (float)u, (float)v, (float)radius, 0.0, angles, contrast))
         return 0;
-    if (!runs_along(angles[0], sign > 0.0 ? fit->along_column : fit->along_row, rules->line_sine) ||
-        !runs_along(angles[1], sign > 0.0 ? fit->along_row : fit->along_column, rules->line_sine))
+    if (!runs_along(angles[0], sign > 0.0 ? fit->along_column : fit->along_row, rules->line_sine)
+        || !runs_along(angles[1], sign > 0.0 ? fit->along_row : fit->along_column, rules->line_sine))
         return 0;
     static const int64_t step_c[4] = {1, 0, -1, 0}, step_r[4] = {0, 1, 0, -1};
     for (int direction = 0; direction < 4; direction++) {
@@ -289,8 +295,8 @@ INLINE int try_cell(
         return 0;
     const double place_u = (fit.pixel[0] - level->offset) / level->scale;
     const double place_v = (fit.pixel[1] - level->offset) / level->scale;
-    if (!(place_u > 0.0 && place_v > 0.0 && place_u < (double)(level->image.width - 1) &&
-          place_v < (double)(level->image.height - 1)))
+    if (!(place_u > 0.0 && place_v > 0.0 && place_u < (double)(level->image.width - 1)
+          && place_v < (double)(level->image.height - 1)))
         return 0;
     const double *a = fit.along_column, *b = fit.along_row;
     const double side_a = sqrt(a[0] * a[0] + a[1] * a[1]), side_b = sqrt(b[0] * b[0] + b[1] * b[1]);
@@ -299,8 +305,7 @@ INLINE int try_cell(
         return 0;
     int64_t near[MAX_TRIED];
     double off[MAX_TRIED];
-    const int64_t count =
-        nearest_points(saddles, fit.pixel[0], fit.pixel[1], rules->reach * longest, rules->tried, near);
+    const int64_t count = nearest_points(saddles, fit.pixel[0], fit.pixel[1], rules->reach * longest, rules->tried, near);
     for (int64_t k = 0; k < count; k++) {
         const double *at = saddles->points + 2 * near[k];
         const double du = at[0] - fit.pixel[0], dv = at[1] - fit.pixel[1];
@@ -327,8 +332,8 @@ INLINE int try_cell(
 
 INLINE int has_neighbour(const sheet_t *sheet, int64_t row, int64_t column)
 {
-    return is_known(sheet, row - 1, column) || is_known(sheet, row, column - 1) || is_known(sheet, row + 1, column) ||
-           is_known(sheet, row, column + 1);
+    return is_known(sheet, row - 1, column) || is_known(sheet, row, column - 1) || is_known(sheet, row + 1, column)
+        || is_known(sheet, row, column + 1);
 }
 
 static int touches_border(const sheet_t *sheet)
@@ -361,7 +366,8 @@ FOR_EACH_PROCESSOR int64_t grow_lattice(
             for (int64_t row = 0; row < rows; row++)
                 for (int64_t column = 0; column < columns; column++) {
                     const int64_t cell = row * columns + column;
-                    if (!sheet->due[way * rows * columns + cell] || is_known(sheet, row, column) || !has_neighbour(sheet, row, column))
+                    if (!sheet->due[way * rows * columns + cell] || is_known(sheet, row, column)
+                        || !has_neighbour(sheet, row, column))
                         continue;
                     sheet->due[way * rows * columns + cell] = 0;
                     if (try_cell(sheet, level, saddles, rules, prediction, bell, row, column, fresh + 3 * count))

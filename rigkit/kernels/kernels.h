@@ -79,8 +79,8 @@ INLINE double grey_level_at(const void *grey, int64_t bytes, int64_t width, int6
  * brighter (sign +1: where angles grow from u to v, seen from the start) is so by more than `weakest`
  * (reference.links.edge_contrast). */
 INLINE int edge_seen(
-    const image_t image, const double *along, int64_t places, int64_t min_places, double u, double v, double end_u,
-    double end_v, double sign, double offset, double weakest)
+    const image_t image, const double *along, int64_t places, int64_t min_places, double u, double v, double end_u, double end_v,
+    double sign, double offset, double weakest)
 {
     const double chord_u = end_u - u, chord_v = end_v - v;
     double length = sqrt(chord_u * chord_u + chord_v * chord_v);
@@ -130,8 +130,8 @@ INLINE void fill_squares(const double *points, int64_t count, double side, int32
     int32_t *first = squares.first, *order = squares.order, *square = order + count;
     memset(first, 0, (size_t)(size + 1) * sizeof(int32_t));
     for (int64_t i = 0; i < count; i++) {
-        square[i] = (int32_t)(square_at(points[2 * i + 1], top, side, rows) * columns +
-                              square_at(points[2 * i], left, side, columns));
+        square[i] =
+            (int32_t)(square_at(points[2 * i + 1], top, side, rows) * columns + square_at(points[2 * i], left, side, columns));
         first[square[i]]++;
     }
     /* The end of each square; filling it from there moves that to its start. */

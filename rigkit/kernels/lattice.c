@@ -34,8 +34,8 @@ static double uneven_columns(
 /* Set `typical` and `seen` to the above for the inner columns, then for the inner rows, and `every` to the two medians of
  * all (reference.lattice.uneven_steps). `scratch` has room for twice as many numbers as there are corners. */
 void uneven_steps(
-    const double *pixels, int64_t rows, int64_t columns, double *scratch, int64_t all, double *typical,
-    int64_t *seen, double *every)
+    const double *pixels, int64_t rows, int64_t columns, double *scratch, int64_t all, double *typical, int64_t *seen,
+    double *every)
 {
     (void)all;
     const int64_t inner = columns > 2 ? columns - 2 : 0;

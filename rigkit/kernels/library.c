@@ -4,9 +4,7 @@
 const char *instruction_set(void)
 {
 #if PROCESSORS
-    return __builtin_cpu_supports("x86-64-v4")   ? "x86-64-v4"
-           : __builtin_cpu_supports("x86-64-v3") ? "x86-64-v3"
-                                                 : "x86-64";
+    return __builtin_cpu_supports("x86-64-v4") ? "x86-64-v4" : __builtin_cpu_supports("x86-64-v3") ? "x86-64-v3" : "x86-64";
 #elif defined(__AVX512F__)
     return "x86-64-v4";
 #elif defined(__AVX2__)

@@ -47,8 +47,8 @@ INLINE double edge_at(double z)
 
 /* Gather the pixels that the cell of a corner at `start` has near its lines. */
 INLINE void gather(
-    const void *grey, int64_t bytes, int64_t width, int64_t height, const double start[2], const double sides[4],
-    double aside, double blur, const light_rules_t *rules, lit_t *out)
+    const void *grey, int64_t bytes, int64_t width, int64_t height, const double start[2], const double sides[4], double aside,
+    double blur, const light_rules_t *rules, lit_t *out)
 {
     const double det = sides[0] * sides[3] - sides[1] * sides[2], square = rules->radius_px * rules->radius_px;
     const double length[2] = {hypot(sides[0], sides[1]), hypot(sides[2], sides[3])};
@@ -66,8 +66,8 @@ INLINE void gather(
             const double x = (double)u - start[0], y = (double)v - start[1];
             const double first = (sides[3] * x - sides[2] * y) / det, second = (sides[0] * y - sides[1] * x) / det;
             const double one = (y * sides[0] - x * sides[1]) / length[0], two = (y * sides[2] - x * sides[3]) / length[1];
-            if (!(fabs(first) < rules->reach_cells && fabs(second) < rules->reach_cells) ||
-                !(fabs(one) < aside || fabs(two) < aside))
+            if (!(fabs(first) < rules->reach_cells && fabs(second) < rules->reach_cells)
+                || !(fabs(one) < aside || fabs(two) < aside))
                 continue;
             const int64_t at = v * width + u, n = out->count++;
             out->u[n] = (double)du;
@@ -177,8 +177,7 @@ INLINE void line_block(
 }
 
 /* The same of the edge of the light: by minus its direction, minus its place, minus the log of its width. */
-INLINE void shadow_block(
-    const double *restrict us, const double *restrict vs, const double x[UNKNOWNS], edge_block_t *restrict out)
+INLINE void shadow_block(const double *restrict us, const double *restrict vs, const double x[UNKNOWNS], edge_block_t *restrict out)
 {
     const double c = cos(x[TOWARDS]), s = sin(x[TOWARDS]), place = x[PLACE], per_width = exp(-x[WIDTH]);
 #pragma omp simd
@@ -332,8 +331,8 @@ static int uneven_at(
 
 void lit_unevenly(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px,
-    double uneven, uint8_t *out)
+    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px, double uneven,
+    uint8_t *out)
 {
     for (int64_t n = 0; n < count; n++) {
         const double *side = sides + 4 * n, length[2] = {hypot(side[0], side[1]), hypot(side[2], side[3])};
@@ -343,16 +342,16 @@ void lit_unevenly(
             nearest = fmin(nearest, off[line] * length[line]);
         }
         /* Where the board may end, only the nearest places are looked at. */
-        out[n] = nearest > min_px && uneven_at(
-            grey, bytes, width, height, pixels + 2 * n, side, along, ends[n] ? 1 : parts, off, uneven);
+        out[n] = nearest > min_px
+            && uneven_at(grey, bytes, width, height, pixels + 2 * n, side, along, ends[n] ? 1 : parts, off, uneven);
     }
 }
 
 FOR_EACH_PROCESSOR
 void fit_light_steps(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *start, const double *sides,
-    const double *curvature, const double *aside, double blur, const double *max_step, const light_rules_t *rules,
-    int64_t most, double *scratch, double *out)
+    const double *curvature, const double *aside, double blur, const double *max_step, const light_rules_t *rules, int64_t most,
+    double *scratch, double *out)
 {
     lit_t lit = {.u = scratch, .v = scratch + most, .value = scratch + 2 * most, .pattern = scratch + 3 * most};
     for (int64_t n = 0; n < count; n++) {
@@ -379,8 +378,8 @@ void fit_light_steps(
             cholesky_solve(N, UNKNOWNS, column);
             spread += 0.5 * column[i];
         }
-        const double all[LIGHT_OUTCOMES] = {lit.centre[0] + x[X], lit.centre[1] + x[Y], sqrt(variance * spread), x[TOWARDS],
-                                            x[PLACE], exp(x[WIDTH]), x[LEFT], 1.0};
+        const double all[LIGHT_OUTCOMES] = {
+            lit.centre[0] + x[X], lit.centre[1] + x[Y], sqrt(variance * spread), x[TOWARDS], x[PLACE], exp(x[WIDTH]), x[LEFT], 1.0};
         memcpy(result, all, sizeof all);
     }
 }

@@ -2,8 +2,7 @@
  * tests/kernels/reference/linearise.py says in numpy what is computed. */
 #include "kernels.h"
 
-EXPORT FOR_EACH_PROCESSOR void place_corners(
-    const board_views_t *seen, int64_t first, int64_t count, double *lever, double *points)
+EXPORT FOR_EACH_PROCESSOR void place_corners(const board_views_t *seen, int64_t first, int64_t count, double *lever, double *points)
 {
     const int64_t C = seen->corners;
     for (int64_t view = first, n = 0; n < count; view++) {
@@ -108,8 +107,9 @@ EXPORT FOR_EACH_PROCESSOR void add_views(
             for (int64_t i = 0; i < 2; i++) {
                 const double *J = d_pixels_d_point + 3 * count * i + n;
                 const double j[3] = {weight * J[0], weight * J[count], weight * J[2 * count]};
-                fill_row(seen, R, q, point, weight, j, d_pixels_d_parameters + parameters * count * i + n, count, parameters, away[i],
-                         left[i], both + across * i);
+                fill_row(
+                    seen, R, q, point, weight, j, d_pixels_d_parameters + parameters * count * i + n, count, parameters, away[i],
+                    left[i], both + across * i);
             }
             if (seen->released && seen->place[point] >= 0)
                 add_released(sums, view, seen->place[point], left, both, both + across);

@@ -33,8 +33,7 @@ typedef struct {
 } home_t;
 
 /* Look at the places `from` to `to` - 1 and append them to the `count` near ones; return how many there are then. */
-INLINE int64_t look_at(
-    const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
+INLINE int64_t look_at(const places_t *places, int64_t from, int64_t to, const home_t *home, const near_t *near, int64_t count)
 {
     const float mine_a_u = home->lines[0], mine_a_v = home->lines[1];
     const float mine_b_u = home->lines[2], mine_b_v = home->lines[3];
@@ -56,9 +55,9 @@ INLINE int64_t look_at(
             const int32_t alike = (theirs[k] > home->min_contrast) & (theirs[k] < home->max_contrast);
             square[k] = alike ? here : INFINITY;
             place[k] = (int32_t)first + k;
-            meets[k] = alike & (along > cosine * here) & (back > cosine * here) &
-                       ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k]) &
-                       (theirs[k] > ratio * contrast);
+            meets[k] = alike & (along > cosine * here) & (back > cosine * here)
+                & ((b * b > a * a) != (home_b * home_b > home_a * home_a)) & (contrast > ratio * theirs[k])
+                & (theirs[k] > ratio * contrast);
         }
     }
     return count + to - from;
@@ -75,8 +74,7 @@ INLINE int32_t count_nearer(const near_t *near, int64_t count, float most)
 }
 
 /* Look at the corners around `home`, square by square: at least the `wanted` nearest alike. Returns how many. */
-INLINE int64_t gather(
-    const squares_t *squares, const places_t *places, const home_t *home, int64_t wanted, const near_t *near)
+INLINE int64_t gather(const squares_t *squares, const places_t *places, const home_t *home, int64_t wanted, const near_t *near)
 {
     /* Squares to each side that mostly have enough. */
     enum { AT_ONCE = 3 };
@@ -133,24 +131,28 @@ INLINE int link_seen(
     aside = aside < most ? aside : most;
     const double there = corners->contrast[j], here = corners->contrast[i];
     const double weakest = rules->contrast_ratio * (there < here ? there : here);
-    return edge_seen(image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0,
-                     aside, weakest);
+    return edge_seen(
+        image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, aside, weakest);
 }
 
 /* The nearest corner along each of the four arms of the corner at `place` whose edge is seen: to[arm] = 4 * corner +
  * arm, or -1. */
 INLINE void link_arms(
-    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image,
-    double scale, double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
+    const corners_t *corners, const squares_t *squares, const places_t *places, int64_t place, const image_t image, double scale,
+    double offset, const link_rules_t *rules, const near_t *near, int64_t *to)
 {
     enum { MAX_CANDIDATES = 512 };
     candidate_t candidates[MAX_CANDIDATES];
     const int64_t i = squares->order[place], wanted = rules->neighbours + 1;
-    const home_t home = {places->u[place], places->v[place],
-                         {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place],
-                          places->columns[B_V][place]},
-                         places->columns[CONTRAST][place], (float)corners->min_contrast[i], (float)corners->max_contrast[i],
-                         (float)rules->contrast_ratio, (float)(rules->arm_cosine * rules->arm_cosine)};
+    const home_t home = {
+        places->u[place],
+        places->v[place],
+        {places->columns[A_U][place], places->columns[A_V][place], places->columns[B_U][place], places->columns[B_V][place]},
+        places->columns[CONTRAST][place],
+        (float)corners->min_contrast[i],
+        (float)corners->max_contrast[i],
+        (float)rules->contrast_ratio,
+        (float)(rules->arm_cosine * rules->arm_cosine)};
     const int64_t count = gather(squares, places, &home, wanted, near);
     int64_t listed = 0;
     for (int64_t first = 0; first < count; first += TOGETHER) {
@@ -167,10 +169,10 @@ INLINE void link_arms(
             const int32_t at = near->place[k];
             const float u = (float)(places->u[at] - home.u), v = (float)(places->v[at] - home.v);
             const candidate_t fresh = {
-                square, arm_along(u * home.lines[0] + v * home.lines[1], u * home.lines[2] + v * home.lines[3]),
-                squares->order[at],
-                arm_along(-(u * places->columns[A_U][at] + v * places->columns[A_V][at]),
-                          -(u * places->columns[B_U][at] + v * places->columns[B_V][at]))};
+                square, arm_along(u * home.lines[0] + v * home.lines[1], u * home.lines[2] + v * home.lines[3]), squares->order[at],
+                arm_along(
+                    -(u * places->columns[A_U][at] + v * places->columns[A_V][at]),
+                    -(u * places->columns[B_U][at] + v * places->columns[B_V][at]))};
             int64_t rank = listed++;
             for (; rank > 0 && candidates[rank - 1].square > square; rank--)
                 candidates[rank] = candidates[rank - 1];
@@ -210,8 +212,9 @@ FOR_EACH_PROCESSOR int64_t find_links(
     places_t places = {memory, memory + room, {NULL}};
     for (int k = 0; k < COLUMNS; k++)
         places.columns[k] = (float *)(memory + 2 * room) + k * room;
-    const near_t near = {places.columns[COLUMNS - 1] + room, (int32_t *)(places.columns[COLUMNS - 1] + 2 * room),
-                         (int32_t *)(places.columns[COLUMNS - 1] + 3 * room)};
+    const near_t near = {
+        places.columns[COLUMNS - 1] + room, (int32_t *)(places.columns[COLUMNS - 1] + 2 * room),
+        (int32_t *)(places.columns[COLUMNS - 1] + 3 * room)};
     for (int64_t k = 0; k < count; k++) {
         const int32_t i = squares.order[k];
         places.u[k] = corners->pixels[2 * i];
@@ -224,8 +227,7 @@ FOR_EACH_PROCESSOR int64_t find_links(
         nearest[k] = both[k] = -1;
     /* In the order of the squares: neighbours look at the same corners and pixels. */
     for (int64_t k = 0; k < count; k++)
-        link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near,
-                  nearest + 4 * (int64_t)squares.order[k]);
+        link_arms(corners, &squares, &places, k, image, scale, offset, rules, &near, nearest + 4 * (int64_t)squares.order[k]);
     free(memory);
     free(scratch);
     for (int64_t k = 0; k < 4 * count; k++)
@@ -234,9 +236,9 @@ FOR_EACH_PROCESSOR int64_t find_links(
     /* Both halves of a link go, so what is dropped is marked before it is. */
     for (int64_t k = 0; k < 4 * count; k++) {
         const int64_t opposite = k / 4 * 4 + (k + 2) % 4;
-        nearest[k] = both[k] >= 0 && both[opposite] >= 0 &&
-                     link_length(corners->pixels, k / 4, both[k]) >
-                         rules->length_ratio * link_length(corners->pixels, k / 4, both[opposite]);
+        nearest[k] = both[k] >= 0 && both[opposite] >= 0
+            && link_length(corners->pixels, k / 4, both[k])
+                > rules->length_ratio * link_length(corners->pixels, k / 4, both[opposite]);
     }
     for (int64_t k = 0; k < 4 * count; k++)
         if (nearest[k] && both[k] >= 0) {

@@ -63,7 +63,8 @@ int64_t count_bad_pixels(
     for (int64_t v = first; v < height - 1; v += apart)
         for (int64_t u = 1; u < width - 1; u++) {
             const int64_t at = v * width + u;
-            const double own = level_at(grey, bytes, at), left = level_at(grey, bytes, at - 1), above = level_at(grey, bytes, at - width);
+            const double own = level_at(grey, bytes, at), left = level_at(grey, bytes, at - 1),
+                         above = level_at(grey, bytes, at - width);
             /* Mostly it is like one of these two. */
             if (fabs(own - left) <= least || fabs(own - above) <= least)
                 continue;

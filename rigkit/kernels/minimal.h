@@ -11,7 +11,7 @@ enum { CUBICS = 10, MONOMIALS = 20 };
  * x3 y3 x2y xy2 x2z x2 y2z y2 xyz xy | xz2 xz x yz2 yz y z3 z2 z 1, the first ten of which are eliminated. */
 static const int QUADRATIC[4][4] = {{0, 1, 2, 6}, {1, 3, 4, 7}, {2, 4, 5, 8}, {6, 7, 8, 9}};
 static const int CUBIC[10][4] = {
-    {0, 2, 4, 5},   {2, 3, 8, 9},   {4, 8, 10, 11}, {3, 1, 6, 7},    {8, 6, 13, 14},
+    {0, 2, 4, 5},     {2, 3, 8, 9},   {4, 8, 10, 11}, {3, 1, 6, 7},     {8, 6, 13, 14},
     {10, 13, 16, 17}, {5, 9, 11, 12}, {9, 7, 14, 15}, {11, 14, 17, 18}, {12, 15, 18, 19},
 };
 

@@ -18,8 +18,7 @@ enum {
 #define RELATIVE_STEP 1e-14
 
 /* Write g(x) = linear x + factor P(x) - offset, which increases, and its slope. */
-INLINE void evaluate(
-    const increasing_t *g, int64_t first, int64_t count, const double *x, double *residual, double *slope)
+INLINE void evaluate(const increasing_t *g, int64_t first, int64_t count, const double *x, double *residual, double *slope)
 {
     const double *linear = g->linear + first, *factor = g->factor + first, *offset = g->offset + first;
     for (int64_t i = 0; i < count; i++)

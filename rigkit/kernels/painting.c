@@ -33,7 +33,7 @@ INLINE float wave_of(float place, int64_t count, float wide, float narrow, float
     wave = fabsf(wave - rintf(wave)) * -2.0f + 0.5f;
     wave = beyond(wave, wide, narrow) * 2.0f;
     const float last = count % 2 ? 1.0f : -1.0f;
-    return place < -0.5f ? -*within : place > (float)count - 0.5f ? last * *within : wave;
+    return place<-0.5f ? -*within : place>(float) count - 0.5f ? last * *within : wave;
 }
 
 /* Lay sheet and squares over the sub-samples of pixel (row, column) of the box. */
@@ -49,7 +49,7 @@ INLINE void paint_pixel(
         const float *x = places->axes[0] + v * columns, *y = places->axes[1] + v * columns;
         for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++) {
             const float share = inside(x[u], (float)surface->ends[0], (float)surface->ends[2], wide_x, narrow_x)
-                                * inside(y[u], (float)surface->ends[1], (float)surface->ends[3], wide_y, narrow_y);
+                * inside(y[u], (float)surface->ends[1], (float)surface->ends[3], wide_y, narrow_y);
             float value = fine[v * stride + u];
             value += share * (white - value);
             if (surface->columns) {
@@ -131,7 +131,7 @@ INLINE void add_rectangle(float *fine, int64_t stride, const places_t *places, c
             for (int64_t u = column * per_pixel; u < (column + 1) * per_pixel; u++) {
                 const float x = places->axes[0][v * columns + u], y = places->axes[1][v * columns + u];
                 fine[v * stride + u] += change * inside(x, low[0], high[0], places->wide[0][pixel], places->narrow[0][pixel])
-                                        * inside(y, low[1], high[1], places->wide[1][pixel], places->narrow[1][pixel]);
+                    * inside(y, low[1], high[1], places->wide[1][pixel], places->narrow[1][pixel]);
             }
     }
 }
@@ -167,8 +167,8 @@ INLINE void paint_marks(float *fine, int64_t stride, const places_t *places, con
 INLINE float side_of(const float *value, int64_t k, int64_t count, int64_t stride, float square_mm)
 {
     const float slope = k == 0 ? value[stride] - value[0]
-                        : k == count - 1 ? value[0] - value[-stride]
-                                         : 0.5f * (value[stride] - value[-stride]);
+        : k == count - 1       ? value[0] - value[-stride]
+                               : 0.5f * (value[stride] - value[-stride]);
     return (slope < -MAX_CELL ? -MAX_CELL : slope > MAX_CELL ? MAX_CELL : slope) * square_mm;
 }
 
@@ -245,8 +245,8 @@ EXPORT FOR_EACH_PROCESSOR int64_t paint_surface(float *fine, const tile_t *tile,
 {
     const int64_t per_pixel = tile->per_pixel, height = tile->rows / per_pixel, width = tile->columns / per_pixel;
     const int64_t pixels = height * width, samples = tile->rows * tile->columns;
-    double *memory = malloc(
-        sizeof(double) * (size_t)(2 * pixels + 3 * tile->columns) + sizeof(float) * (size_t)(8 * pixels + 3 * samples));
+    double *memory =
+        malloc(sizeof(double) * (size_t)(2 * pixels + 3 * tile->columns) + sizeof(float) * (size_t)(8 * pixels + 3 * samples));
     if (!memory)
         return 0;
     double *coarse = memory, *rows = memory + 2 * pixels, values[3][TILE_NODES * TILE_NODES];

@@ -166,10 +166,9 @@ static void read_end(
 /* Set `paper` and `out_gaps` of `count` corners to what `outer_squares.with_paper` says. `scratch` has room for 4 numbers
  * a corner and 2 a step, `ends_scratch` for all ends, `near` for their numbers. */
 void find_paper(
-    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels,
-    const double *sides, const double *gaps, const uint8_t *ends, const double *contrast, const double *blur,
-    const double *sign, const int64_t *owner, const paper_rules_t *rules, double *scratch, uint8_t *memory, int64_t *near,
-    double *paper, double *out_gaps)
+    const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
+    const double *gaps, const uint8_t *ends, const double *contrast, const double *blur, const double *sign, const int64_t *owner,
+    const paper_rules_t *rules, double *scratch, uint8_t *memory, int64_t *near, double *paper, double *out_gaps)
 {
     const outer_t all = {pixels, sides, gaps, contrast, blur, sign, ends, owner};
     const picture_t image = {grey, width, height, bytes};
@@ -183,7 +182,10 @@ void find_paper(
         const uint8_t *own = ends + k / 4 * 4;
         /* The way out is as long as the cell's side, which is the mean of what lies before and behind the corner. */
         every[number++] = (outer_end_t){
-            .who = k / 4, .which = k % 4, .cell = mean_gap(&all, k / 4, k % 4 / 2), .single = own[0] + own[1] + own[2] + own[3] == 1};
+            .who = k / 4,
+            .which = k % 4,
+            .cell = mean_gap(&all, k / 4, k % 4 / 2),
+            .single = own[0] + own[1] + own[2] + own[3] == 1};
     }
     double *values = scratch + 2 * rules->step_count;
     for (int64_t k = 0; k < number; k++) {

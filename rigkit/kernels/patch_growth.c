@@ -8,7 +8,10 @@ typedef struct {
     int64_t count;
 } heap_t;
 
-INLINE double rank_of(const heap_t *heap, int64_t place) { return heap->out[(int64_t)PATCH_COLUMNS * heap->nodes[place] + 6]; }
+INLINE double rank_of(const heap_t *heap, int64_t place)
+{
+    return heap->out[(int64_t)PATCH_COLUMNS * heap->nodes[place] + 6];
+}
 
 INLINE void swap_nodes(heap_t *heap, int64_t a, int64_t b)
 {
@@ -93,7 +96,10 @@ FOR_EACH_PROCESSOR int64_t grow_patches(
             continue;
         const double u = step * (double)column - at[0], v = step * (double)row - at[1];
         place_t place = {
-            step * (double)column, step * (double)row, at[2] + at[4] * u + at[5] * v, at[3] + at[6] * u + at[7] * v,
+            step * (double)column,
+            step * (double)row,
+            at[2] + at[4] * u + at[5] * v,
+            at[3] + at[6] * u + at[7] * v,
             {at[4], at[5], at[6], at[7]}};
         if (try_node(first, second, epipolar, rules, grid, node, &patch, &place)) {
             push_node(&heap, (int32_t)node);
@@ -114,8 +120,11 @@ FOR_EACH_PROCESSOR int64_t grow_patches(
                 continue;
             const double u = step * (double)du, v = step * (double)dv;
             place_t place = {
-                step * (double)(column + du), step * (double)(row + dv), at[0] + at[2] * u + at[3] * v,
-                at[1] + at[4] * u + at[5] * v, {at[2], at[3], at[4], at[5]}};
+                step * (double)(column + du),
+                step * (double)(row + dv),
+                at[0] + at[2] * u + at[3] * v,
+                at[1] + at[4] * u + at[5] * v,
+                {at[2], at[3], at[4], at[5]}};
             if (try_node(first, second, epipolar, rules, grid, next, &patch, &place)) {
                 push_node(&heap, (int32_t)next);
                 grown++;

@@ -7,12 +7,12 @@
 typedef float four_t __attribute__((vector_size(16), aligned(4)));
 
 /* Write the weights of four neighbours at the fraction t after the second (Catmull and Rom). */
-#define CUBIC(t, w0, w1, w2, w3)                                                                                       \
-    do {                                                                                                               \
-        (w0) = (t) * (-0.5f + (t) * (1.0f - 0.5f * (t)));                                                              \
-        (w1) = 1.0f + (t) * (t) * (-2.5f + 1.5f * (t));                                                                \
-        (w2) = (t) * (0.5f + (t) * (2.0f - 1.5f * (t)));                                                               \
-        (w3) = (t) * (t) * (-0.5f + 0.5f * (t));                                                                       \
+#define CUBIC(t, w0, w1, w2, w3) \
+    do { \
+        (w0) = (t) * (-0.5f + (t) * (1.0f - 0.5f * (t))); \
+        (w1) = 1.0f + (t) * (t) * (-2.5f + 1.5f * (t)); \
+        (w2) = (t) * (0.5f + (t) * (2.0f - 1.5f * (t))); \
+        (w3) = (t) * (t) * (-0.5f + 0.5f * (t)); \
     } while (0)
 
 /* Read `image` at the `count` places (u, v) + A (x, y), which lie at least a pixel inside; count is a multiple of 16. */
@@ -46,8 +46,8 @@ INLINE void read_samples(
     }
 #pragma omp simd
     for (int64_t n = 0; n < count; n++)
-        out[n] = (across[0][n] * sums[4 * n] + across[1][n] * sums[4 * n + 1]) +
-                 (across[2][n] * sums[4 * n + 2] + across[3][n] * sums[4 * n + 3]);
+        out[n] = (across[0][n] * sums[4 * n] + across[1][n] * sums[4 * n + 1])
+            + (across[2][n] * sums[4 * n + 2] + across[3][n] * sums[4 * n + 3]);
 }
 
 /* Read `image` at side x side places a pixel apart, from (u, v), which lies at least a pixel inside. */
@@ -62,19 +62,18 @@ INLINE void read_square(const image_t image, float u, float v, int64_t side, flo
     for (int64_t j = 0; j < side + 3; j++) {
         const float *from = image.brightness + (ptrdiff_t)(top - 1 + j) * (ptrdiff_t)image.width + (left - 1);
         for (int64_t i = 0; i < side; i++)
-            lines[j * side + i] =
-                across[0] * from[i] + across[1] * from[i + 1] + across[2] * from[i + 2] + across[3] * from[i + 3];
+            lines[j * side + i] = across[0] * from[i] + across[1] * from[i + 1] + across[2] * from[i + 2] + across[3] * from[i + 3];
     }
     for (int64_t j = 0; j < side; j++)
         for (int64_t i = 0; i < side; i++)
-            out[j * side + i] = down[0] * lines[j * side + i] + down[1] * lines[(j + 1) * side + i] +
-                                down[2] * lines[(j + 2) * side + i] + down[3] * lines[(j + 3) * side + i];
+            out[j * side + i] = down[0] * lines[j * side + i] + down[1] * lines[(j + 1) * side + i]
+                + down[2] * lines[(j + 2) * side + i] + down[3] * lines[(j + 3) * side + i];
 }
 
 INLINE int is_inside(const image_t image, double u, double v, double margin)
 {
-    return u >= 1.0 + margin && v >= 1.0 + margin && u < (double)image.width - 2.0 - margin &&
-           v < (double)image.height - 2.0 - margin;
+    return u >= 1.0 + margin && v >= 1.0 + margin && u < (double)image.width - 2.0 - margin
+        && v < (double)image.height - 2.0 - margin;
 }
 
 #endif

@@ -59,8 +59,8 @@ INLINE void six_products(float rows[UNKNOWNS][MAX_SAMPLES], const float *with, i
 INLINE int take_patch(const image_t image, double u, double v, double min_contrast, patch_t *p)
 {
     const int64_t half = p->half, side = 2 * half + 1, wide = side + 2, count = p->count;
-    if (!is_inside(image, u - (double)half - 1.0, v - (double)half - 1.0, 0.0) ||
-        !is_inside(image, u + (double)half + 1.0, v + (double)half + 1.0, 0.0))
+    if (!is_inside(image, u - (double)half - 1.0, v - (double)half - 1.0, 0.0)
+        || !is_inside(image, u + (double)half + 1.0, v + (double)half + 1.0, 0.0))
         return 0;
     float around[(MAX_SIDE + 2) * (MAX_SIDE + 2)];
     read_square(image, (float)(u - (double)(half + 1)), (float)(v - (double)(half + 1)), wide, around);
@@ -176,7 +176,8 @@ INLINE void compare(patch_t *p, double sums[UNKNOWNS], double *common, double *e
 
 /* Fill `matrix` and add to `step` what the line says of them; return whether there is a line. */
 INLINE int add_line(
-    const line_t *line, const place_t *place, double scale1, double weight, double step[UNKNOWNS], double matrix[UNKNOWNS][UNKNOWNS])
+    const line_t *line, const place_t *place, double scale1, double weight, double step[UNKNOWNS],
+    double matrix[UNKNOWNS][UNKNOWNS])
 {
     knowledge_t known;
     if (!line_knowledge(line, place, scale1, &known))
@@ -226,8 +227,8 @@ INLINE int read_there(patch_t *p, const image_t image2, double scale1, double sc
 /* Align the patch `p`, taken `scale1` pixels a sample around (u1, v1), with `image2` of `scale2` pixels a sample; return
  * whether it settled. */
 INLINE int align_patch(
-    patch_t *p, const image_t image2, double scale1, double scale2, const patch_rules_t *rules, const line_t *line,
-    place_t *place, agreement_t *out)
+    patch_t *p, const image_t image2, double scale1, double scale2, const patch_rules_t *rules, const line_t *line, place_t *place,
+    agreement_t *out)
 {
     const double half = (double)p->half, u0 = place->u2, v0 = place->v2;
     double step[UNKNOWNS], matrix[UNKNOWNS][UNKNOWNS];
@@ -325,8 +326,8 @@ INLINE double covariance_of(const place_t *place, double scale1, const agreement
 /* Align the patches around a pair as finely as its texture allows; write PATCH_COLUMNS numbers and return 1 if it is good.
  * The patch of the image that shows the surface larger is read from a coarser level: both are equally sharp. */
 FOR_EACH_PROCESSOR int align_pair(
-    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch,
-    place_t *place, double *out)
+    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch, place_t *place,
+    double *out)
 {
     const place_t start = *place;
     const double scale = 0.5 * log2(fabs(start.A[0] * start.A[3] - start.A[1] * start.A[2]));
@@ -359,8 +360,7 @@ FOR_EACH_PROCESSOR int align_pair(
 
 /* Align patches from `starts`: u1, v1, u2, v2 and the affinity row by row. What fails is NaN throughout. */
 FOR_EACH_PROCESSOR void align_patches(
-    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const double *starts, int64_t count,
-    double *out)
+    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const double *starts, int64_t count, double *out)
 {
     patch_t patch;
     make_window(rules, &patch);

@@ -48,7 +48,7 @@ int line_knowledge(const line_t *line, const place_t *at, double scale, knowledg
 
 void make_window(const patch_rules_t *rules, patch_t *patch);
 int align_pair(
-    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch,
-    place_t *place, double *out);
+    const pyramid_t *first, const pyramid_t *second, const patch_rules_t *rules, const line_t *line, patch_t *patch, place_t *place,
+    double *out);
 
 #endif

@@ -88,8 +88,8 @@ INLINE float value_at_rank(
 /* Of every step-th inner pixel of every step-th inner row: set out to the upper median of |response|, and the brightness
  * that `few` of them are darker and brighter than. `room` has a place for each of them. */
 FOR_EACH_PROCESSOR void typical_values(
-    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness,
-    float *room, float *out)
+    const float *smooth, int64_t height, int64_t width, int64_t step, int64_t few, float *response, float *brightness, float *room,
+    float *out)
 {
     int64_t count = 0;
     float low = INFINITY, high = -INFINITY;
@@ -114,8 +114,7 @@ FOR_EACH_PROCESSOR void typical_values(
  * between `darkest` and `brightest`, but not below `least`. Every fourth pixel is looked at: the edges of boards are wider
  * than the squares that could hide between them. */
 FOR_EACH_PROCESSOR void fill_thresholds(
-    const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest,
-    float *out)
+    const float *smooth, int64_t height, int64_t width, float floor, float least, float darkest, float brightest, float *out)
 {
     enum { APART = 4 };
     const int64_t strips = width / STRIP + 1, bands = height / STRIP_ROWS + 1;
@@ -271,10 +270,9 @@ INLINE void fill_triple(const search_t s, int64_t v)
         const float least = lowest_threshold(s, v, strip);
         /* The last strip begins in the one before, so that the compiler knows how many pixels there are. */
         const int64_t at = u + STRIP < s.width ? u : s.width - 1 - STRIP;
-        high[strip] =
-            at >= STRIPS_FROM
-                ? fill_strip(from + at, s.width, STRIP, least, one + at, two + at, three + at, most + at)
-                : fill_strip(from + u, s.width, s.width - 1 - u, least, one + u, two + u, three + u, most + u);
+        high[strip] = at >= STRIPS_FROM
+            ? fill_strip(from + at, s.width, STRIP, least, one + at, two + at, three + at, most + at)
+            : fill_strip(from + u, s.width, s.width - 1 - u, least, one + u, two + u, three + u, most + u);
     }
 }
 
@@ -310,8 +308,7 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
     int32_t *at, float *response)
 {
     const int64_t stride = width + STRIP + 4;
-    const search_t s = {
-        smooth, thresholds, height, width, stride, width / STRIP + 1, scratch, scratch + RING * stride, high};
+    const search_t s = {smooth, thresholds, height, width, stride, width / STRIP + 1, scratch, scratch + RING * stride, high};
     for (int64_t k = 0; k < (RING + 2) * stride; k++)
         scratch[k] = LOWEST;
     int64_t count = 0;
@@ -336,8 +333,8 @@ FOR_EACH_PROCESSOR int64_t find_peaks(
  * ((height / side + 1) * (width / side + 1)), `bins` (`finest` + 1), both zeroed, and `share` (count) are scratch. Returns
  * how many are left. */
 int64_t keep_strongest(
-    int32_t *at, float *response, int64_t count, int64_t height, int64_t width, int64_t side, int64_t most,
-    int64_t finest, float *squares, int32_t *bins, int32_t *share)
+    int32_t *at, float *response, int64_t count, int64_t height, int64_t width, int64_t side, int64_t most, int64_t finest,
+    float *squares, int32_t *bins, int32_t *share)
 {
     (void)height;
     const int32_t across = (int32_t)(width / side) + 1, step = (int32_t)side;

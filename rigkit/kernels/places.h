@@ -49,8 +49,8 @@ static int set_node_values(const tile_t *tile, const double *matrix, double valu
 
 /* Set x and y of one row of sub-samples, every `step`th from `left` on, `count` of them. */
 INLINE void set_row(
-    const tile_t *tile, const double *matrix, const double values[3][TILE_NODES * TILE_NODES], int terms, int64_t row,
-    int64_t left, int64_t step, int64_t count, double *restrict x, double *restrict y, double *restrict depth)
+    const tile_t *tile, const double *matrix, const double values[3][TILE_NODES * TILE_NODES], int terms, int64_t row, int64_t left,
+    int64_t step, int64_t count, double *restrict x, double *restrict y, double *restrict depth)
 {
     if (tile->ray_rows) {
         const double *ray = tile->rays + 3 * (row * tile->columns + left);
@@ -96,8 +96,7 @@ INLINE double difference(const double *value, int64_t k, int64_t count, int64_t 
 
 /* Set the sub-samples that can meet the rectangle, in whole pixels with one more around; return whether there are any. `coarse`:
  * where the first sub-sample of every pixel meets the plane, (2, height, width). */
-static int set_box(
-    const double *coarse, int64_t height, int64_t width, const surface_t *surface, int64_t per_pixel, box_t *box)
+static int set_box(const double *coarse, int64_t height, int64_t width, const surface_t *surface, int64_t per_pixel, box_t *box)
 {
     int64_t top = height, bottom = -1, left = width, right = -1;
     for (int64_t v = 0; v < height; v++)
@@ -154,8 +153,7 @@ INLINE void set_axes(const tile_t *tile, const double *matrix, const places_t *p
     const int terms = tile->ray_rows ? 3 : set_node_values(tile, matrix, values);
     double *rows[3] = {memory, memory + columns, memory + 2 * columns};
     for (int64_t v = 0; v < places->box.rows; v++) {
-        set_row(
-            tile, matrix, values, terms, places->box.top + v, places->box.left, 1, columns, rows[0], rows[1], rows[2]);
+        set_row(tile, matrix, values, terms, places->box.top + v, places->box.left, 1, columns, rows[0], rows[1], rows[2]);
         for (int k = 0; k < 2; k++) {
             float *axis = places->axes[k] + v * columns;
             for (int64_t u = 0; u < columns; u++)

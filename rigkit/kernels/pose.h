@@ -14,10 +14,22 @@ typedef struct {
     double x, y, z;
 } v3_t;
 
-INLINE v3_t v3(const double *at) { return (v3_t){at[0], at[1], at[2]}; }
-INLINE v3_t plus(v3_t a, v3_t b) { return (v3_t){a.x + b.x, a.y + b.y, a.z + b.z}; }
-INLINE v3_t times(double s, v3_t a) { return (v3_t){s * a.x, s * a.y, s * a.z}; }
-INLINE double dot(v3_t a, v3_t b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+INLINE v3_t v3(const double *at)
+{
+    return (v3_t){at[0], at[1], at[2]};
+}
+INLINE v3_t plus(v3_t a, v3_t b)
+{
+    return (v3_t){a.x + b.x, a.y + b.y, a.z + b.z};
+}
+INLINE v3_t times(double s, v3_t a)
+{
+    return (v3_t){s * a.x, s * a.y, s * a.z};
+}
+INLINE double dot(v3_t a, v3_t b)
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
 INLINE v3_t cross(v3_t a, v3_t b)
 {
     return (v3_t){a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
@@ -71,7 +83,10 @@ typedef struct {
     double noise, near, far;
 } level_t;
 
-INLINE level_t level_of(double noise) { return (level_t){noise, 1.0 / noise, 1.0 / (noise * (noise - 1.0))}; }
+INLINE level_t level_of(double noise)
+{
+    return (level_t){noise, 1.0 / noise, 1.0 / (noise * (noise - 1.0))};
+}
 
 /* marginal.marginal_quality of one residual. */
 INLINE double quality_of(double r, level_t level)

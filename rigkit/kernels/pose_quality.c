@@ -23,7 +23,10 @@ INLINE void distances(const double *packed, int64_t count, int64_t first, int64_
     }
 }
 
-INLINE int64_t block_size(int64_t count, int64_t first) { return count - first < BLOCK ? count - first : BLOCK; }
+INLINE int64_t block_size(int64_t count, int64_t first)
+{
+    return count - first < BLOCK ? count - first : BLOCK;
+}
 
 /* SampsonRows.residuals: E (hypotheses, 9) -> out (hypotheses, count). */
 FOR_EACH_PROCESSOR void residuals(const double *packed, int64_t count, const double *E, int64_t hypotheses, double *out)
@@ -137,8 +140,8 @@ INLINE double sum_up(const double *packed, int64_t count, level_t level, const p
 
 /* SampsonRows.improved: R (hypotheses, 9) and t (hypotheses, 3) move to the best quality at `noise`. */
 FOR_EACH_PROCESSOR void improve(
-    const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses,
-    const int64_t *free, int64_t freedom, int64_t max_steps, double settled)
+    const double *packed, int64_t count, double *R, double *t, double noise, int64_t hypotheses, const int64_t *free,
+    int64_t freedom, int64_t max_steps, double settled)
 {
     const level_t level = level_of(noise);
     for (int64_t h = 0; h < hypotheses; h++) {

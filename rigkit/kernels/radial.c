@@ -8,8 +8,17 @@
 INLINE double angle_of(double across, double along)
 {
     static const double P[] = {
-        1.0, -0.3333333333332844, 0.1999999999885511, -0.14285714180976467, 0.11111106180455946, -0.09090773074808414,
-        0.07689953496306857, -0.06640233930429408, 0.056883492268090106, -0.04348052215716462, 0.021135373157693246};
+        1.0,
+        -0.3333333333332844,
+        0.1999999999885511,
+        -0.14285714180976467,
+        0.11111106180455946,
+        -0.09090773074808414,
+        0.07689953496306857,
+        -0.06640233930429408,
+        0.056883492268090106,
+        -0.04348052215716462,
+        0.021135373157693246};
     /* Sine and cosine of the half; of the two the one that is not lost in a difference comes first. */
     const double larger = sqrt(0.5 * (1.0 + fabs(along))), smaller = 0.5 * across / larger;
     const double sine = along < 0.0 ? larger : smaller, cosine = along < 0.0 ? smaller : larger;
@@ -146,8 +155,7 @@ typedef struct {
 } directions_t;
 
 /* Fill `out` for `count` points from the `first` on, those beyond `max_angle` as if on the axis. */
-INLINE void look(
-    const radial_points_t *at, int64_t first, int64_t count, double max_angle, directions_t *out, uint8_t *valid)
+INLINE void look(const radial_points_t *at, int64_t first, int64_t count, double max_angle, directions_t *out, uint8_t *valid)
 {
     const double *xs = at->x + first, *ys = at->y + first, *zs = at->z + first;
     double inside[POINTS];
@@ -175,9 +183,8 @@ EXPORT FOR_EACH_PROCESSOR void differentiate_scaramuzza(
     const double zero[POINTS] = {0.0}, max_angle = fill_table(at, table), a0 = at->polynomial[0];
     const int64_t N = at->count, n = at->terms - 1;
     /* z rho - r f = |(rho, f)| sin(angle(rho) - theta) changes sign once, from minus to plus, on the range. */
-    const increasing_t g = {
-        at->polynomial, seen.cosine, seen.minus_sine, zero, seen.angle, table, at->terms, POINTS, CELLS, 0.0, max_angle,
-        0.0,            at->max_radius};
+    const increasing_t g = {at->polynomial, seen.cosine, seen.minus_sine, zero, seen.angle,    table, at->terms, POINTS,
+                            CELLS,          0.0,         max_angle,       0.0,  at->max_radius};
     for (int64_t first = 0; first < N; first += POINTS) {
         const int64_t count = N - first < POINTS ? N - first : POINTS;
         scales_t of;

@@ -46,8 +46,7 @@ INLINE void ring_angles(
 }
 
 /* Sample every `apart`-th place of a ring. As brightness_at, but first all places, which vectorises, then all reads. */
-INLINE void sample_ring(
-    const image_t image, const float *circle, int64_t apart, float u, float v, float radius, float *samples)
+INLINE void sample_ring(const image_t image, const float *circle, int64_t apart, float u, float v, float radius, float *samples)
 {
     float right[TURN], below[TURN];
     int32_t at[TURN];
@@ -86,8 +85,7 @@ INLINE void sample_ring(
 /* Return whether the ring around (u, v) is that of a chessboard corner of at least a contrast; if so, its two angles and
  * its contrast (reference.front.read_rings); 2 where only motion explains how bright its middle is. */
 INLINE int read_ring(
-    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2],
-    double *contrast)
+    const image_t image, const ring_rules_t rules, float u, float v, float radius, double least, double angles[2], double *contrast)
 {
     float ring[TURN], even[HALF];
     sample_ring(image, rules.circle, 1, u, v, radius, ring);

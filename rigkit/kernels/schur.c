@@ -48,8 +48,8 @@ int64_t schur_memory(int64_t globals, int64_t views)
     return across * across + views * POSE * (across + POSE);
 }
 
-EXPORT FOR_EACH_PROCESSOR int64_t solve_schur(
-    const normal_equations_t *n, double damping, double *memory, double *step_g, double *step_p, double *predicted)
+EXPORT FOR_EACH_PROCESSOR int64_t
+solve_schur(const normal_equations_t *n, double damping, double *memory, double *step_g, double *step_p, double *predicted)
 {
     const int64_t G = n->globals, V = n->views, across = padded(G + 1), size = POSE * across;
     double *sums = memory, *rows = sums + across * across, *factors = rows + V * size;

@@ -1,10 +1,10 @@
-/* From an image as it was read to one that saddles are sought in: smaller, smoother. The definitions in numpy are in tests/kernels/reference/front.py. */
+/* From an image as it was read to one that saddles are sought in: smaller, smoother. The definitions in numpy are in
+ * tests/kernels/reference/front.py. */
 #include "front.h"
 
 /* The means of factor x factor pixels: out (height / factor, width / factor). `sums` (width) is scratch. */
 FOR_EACH_PROCESSOR void shrink_floats(
-    const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums,
-    float *restrict out)
+    const float *restrict image, int64_t height, int64_t width, int64_t factor, float *restrict sums, float *restrict out)
 {
     const int64_t rows = height / factor, columns = width / factor;
     const float share = 1.0f / (float)(factor * factor);
@@ -34,8 +34,7 @@ INLINE uint32_t sum_of_two(const uint16_t *sums)
 
 /* The same of bytes; sums of at most 256 rows, or of 16 rows and columns, fit 16 bits. `sums` (2 * width) is scratch. */
 FOR_EACH_PROCESSOR void shrink_bytes(
-    const uint8_t *restrict image, int64_t height, int64_t width, int64_t factor, uint16_t *restrict sums,
-    float *restrict out)
+    const uint8_t *restrict image, int64_t height, int64_t width, int64_t factor, uint16_t *restrict sums, float *restrict out)
 {
     enum { MAX_SUMMED = 16 };
     const int64_t rows = height / factor, columns = width / factor;
@@ -78,8 +77,9 @@ typedef struct {
 
 INLINE rows_t rows_around(int64_t v, int64_t height, int64_t width)
 {
-    return (rows_t){(v > 2 ? v - 2 : 0) * width, (v > 1 ? v - 1 : 0) * width, v * width,
-                    (v < height - 1 ? v + 1 : height - 1) * width, (v < height - 2 ? v + 2 : height - 1) * width};
+    return (rows_t){
+        (v > 2 ? v - 2 : 0) * width, (v > 1 ? v - 1 : 0) * width, v * width, (v < height - 1 ? v + 1 : height - 1) * width,
+        (v < height - 2 ? v + 2 : height - 1) * width};
 }
 
 /* Smooth with the kernel (outer, inner, centre, inner, outer) both ways, the border repeated; `half` gets every second
@@ -102,8 +102,7 @@ static FOR_EACH_PROCESSOR void smooth_floats(
         middle[width] = middle[width + 1] = middle[width - 1];
         float *restrict to = out + v * width;
         for (int64_t u = 0; u < width; u++)
-            to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) +
-                    centre * column[u + 2];
+            to[u] = outer * (column[u] + column[u + 4]) + inner * (column[u + 1] + column[u + 3]) + centre * column[u + 2];
         if (v % 2 == 0)
             for (int64_t u = 0; u < half_width; u++)
                 half[v / 2 * half_width + u] = to[2 * u];
@@ -126,15 +125,15 @@ static FOR_EACH_PROCESSOR void smooth_bytes(
         const uint8_t *restrict below2 = image + at.below2, *restrict below = image + at.below;
         const uint8_t *restrict here = image + at.here;
         for (int64_t u = 0; u < width; u++)
-            middle[u] = (uint16_t)(outer * (uint16_t)(above2[u] + below2[u]) + inner * (uint16_t)(above[u] + below[u]) +
-                                   centre * here[u]);
+            middle[u] =
+                (uint16_t)(outer * (uint16_t)(above2[u] + below2[u]) + inner * (uint16_t)(above[u] + below[u]) + centre * here[u]);
         column[0] = column[1] = middle[0];
         middle[width] = middle[width + 1] = middle[width - 1];
         float *restrict to = out + v * width;
         for (int64_t u = 0; u < width; u++)
-            to[u] = share * (float)(uint16_t)(outer * (uint16_t)(column[u] + column[u + 4]) +
-                                              inner * (uint16_t)(column[u + 1] + column[u + 3]) +
-                                              centre * column[u + 2]);
+            to[u] = share
+                * (float)(uint16_t)(outer * (uint16_t)(column[u] + column[u + 4])
+                                    + inner * (uint16_t)(column[u + 1] + column[u + 3]) + centre * column[u + 2]);
         if (v % 2 == 0)
             for (int64_t u = 0; u < half_width; u++)
                 half[v / 2 * half_width + u] = to[2 * u];

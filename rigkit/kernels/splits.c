@@ -212,8 +212,8 @@ static split_t clearest_split(const sheet_view_t *view, int64_t several, const s
     /* Corners that either side is as smooth with are not on the discontinuity. */
     for (int64_t k = 0; k < count; k++) {
         const double narrower = (best.end - best.start) - (found[k].end - found[k].start);
-        if (found[k].alone <= rules->as_smooth * clearest.alone &&
-            (narrower > 0.0 || (narrower == 0.0 && found[k].ratio > best.ratio)))
+        if (found[k].alone <= rules->as_smooth * clearest.alone
+            && (narrower > 0.0 || (narrower == 0.0 && found[k].ratio > best.ratio)))
             best = found[k];
     }
     return best;
@@ -264,7 +264,6 @@ void clearest_splits(
         out[3 * k] = best.ratio;
         out[3 * k + 1] = best.start;
         out[3 * k + 2] = best.end;
-        view = (sheet_view_t){
-            pixels, sigma, columns, rows, 1, columns, {view.middle[0], view.middle[1]}, view.cell_px};
+        view = (sheet_view_t){pixels, sigma, columns, rows, 1, columns, {view.middle[0], view.middle[1]}, view.cell_px};
     }
 }

@@ -91,8 +91,8 @@ FOR_EACH_PROCESSOR double fit_perspective(const double *places, const double *pi
     for (int64_t i = 0; i < count; i++) {
         const double x = (places[2 * i] - from[0]) / from_size, y = (places[2 * i + 1] - from[1]) / from_size;
         const double u = (pixels[2 * i] - to[0]) / to_size, v = (pixels[2 * i + 1] - to[1]) / to_size;
-        const double rows[2][ENTRIES] = {{x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u},
-                                         {0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v}};
+        const double rows[2][ENTRIES] = {
+            {x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, -u}, {0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, -v}};
         for (int64_t r = 0; r < 2; r++)
             for (int64_t p = 0; p < ENTRIES; p++)
                 for (int64_t q = 0; q < ENTRIES; q++)
@@ -206,8 +206,8 @@ INLINE void terms_of_degree(
 }
 
 FOR_EACH_PROCESSOR int64_t fit_polynomials(
-    const double *places, const double *values, int64_t count, int64_t terms, double max_leverage, double *basis, double *scratch, double *unit,
-    double *triangle, double *basis_values, double *misses, double *off, double *gain, double *scatter)
+    const double *places, const double *values, int64_t count, int64_t terms, double max_leverage, double *basis, double *scratch,
+    double *unit, double *triangle, double *basis_values, double *misses, double *off, double *gain, double *scatter)
 {
     double *left = scratch, *leverage = scratch + 2 * count, *missed = scratch + 3 * count, *ranked_off = scratch + 4 * count;
     double low[2] = {INFINITY, INFINITY}, high[2] = {-INFINITY, -INFINITY};
@@ -260,8 +260,8 @@ FOR_EACH_PROCESSOR int64_t fit_polynomials(
  * `fit_polynomials`, or -1 where a place is nearer than `nearest` in it. `rest` (count, 2) is scratch. */
 int64_t fit_map(
     const double *places, const double *pixels, int64_t count, int64_t terms, double max_leverage, double nearest, double *rest,
-    double *basis, double *scratch, double *homography, double *unit, double *triangle, double *basis_values, double *misses, double *off,
-    double *gain, double *scatter)
+    double *basis, double *scratch, double *homography, double *unit, double *triangle, double *basis_values, double *misses,
+    double *off, double *gain, double *scatter)
 {
     const double *h = homography;
     if (!(fit_perspective(places, pixels, count, homography) > nearest))
@@ -316,8 +316,8 @@ INLINE void line_shapes(double *row)
 }
 
 FOR_EACH_PROCESSOR void add_polynomial(
-    const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle, const double *basis_values,
-    const double *misses, int64_t most_certain, double *out)
+    const double *wanted, int64_t count, const double *unit, int64_t terms, int64_t degree, const double *triangle,
+    const double *basis_values, const double *misses, int64_t most_certain, double *out)
 {
     const double size = unit[2];
     const int64_t end = TERMS_TO(degree);

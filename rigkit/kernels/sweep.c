@@ -9,7 +9,10 @@ enum { CENSUS_REACH = 2, BAND = 16, SIDE_BYTES = 8 };
 enum { NO_LEVEL = 128 };
 
 /* Return the number of levels, with those that only fill up vectors. */
-int64_t sweep_levels(int64_t levels) { return (levels + 15) / 16 * 16; }
+int64_t sweep_levels(int64_t levels)
+{
+    return (levels + 15) / 16 * 16;
+}
 
 /* Write the census of `rows` x `columns` samples from (2, 2) of `from`, (rows + 4) x (columns + 4): which neighbours are
  * darker. */
@@ -113,8 +116,8 @@ FOR_EACH_PROCESSOR void sweep_costs(
 /* One step of a path: `now` are the costs of the best surfaces that end at each level here, of those that came from the
  * sample before, less their least. Return the least of them. */
 INLINE uint8_t follow(
-    const uint8_t *restrict came, uint8_t least, uint8_t jump, uint8_t bend, const uint8_t *restrict cost,
-    uint8_t *restrict now, uint16_t *restrict total, int64_t levels)
+    const uint8_t *restrict came, uint8_t least, uint8_t jump, uint8_t bend, const uint8_t *restrict cost, uint8_t *restrict now,
+    uint16_t *restrict total, int64_t levels)
 {
     const uint8_t far = (uint8_t)(least + jump);
     uint8_t low = 255;
@@ -188,8 +191,8 @@ FOR_EACH_PROCESSOR void sweep_surfaces(
                         const uint8_t *there = (path < 3 ? before : now) + path * size + (column + dc) * bytes;
                         const uint8_t jump = jump_cost(rules, samples1[at], samples1[at + dr * columns + dc]);
                         here[0] = follow(
-                            there + SIDE_BYTES, there[0], jump, (uint8_t)rules->bend, cost, here + SIDE_BYTES,
-                            total + at * levels, levels);
+                            there + SIDE_BYTES, there[0], jump, (uint8_t)rules->bend, cost, here + SIDE_BYTES, total + at * levels,
+                            levels);
                     } else {
                         here[0] = begin(cost, here + SIDE_BYTES, total + at * levels, levels);
                     }

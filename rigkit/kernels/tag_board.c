@@ -148,8 +148,8 @@ void map_tag_board(const tag_fit_t *fit)
         const int64_t fewest = values == room.rest ? 1 : count < 3 ? count : 3;
         terms = terms_within(wanted > fewest ? wanted : fewest);
         best = fit_polynomials(
-            room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle, room.basis_values,
-            room.misses, room.off, room.gain, numbers + MAP_SCATTER);
+            room.places, values, count, terms, rules->max_leverage, room.basis, room.left, room.unit, room.triangle,
+            room.basis_values, room.misses, room.off, room.gain, numbers + MAP_SCATTER);
     }
     /* What further terms add is noise. */
     int64_t plain = 0;
@@ -175,8 +175,8 @@ void see_marked(const tag_fit_t *fit, tag_room_t *room, int64_t most_certain)
     else
         memset(room->surface, 0, (size_t)(SURFACE_COLUMNS * room->count) * sizeof(double));
     add_polynomial(
-        room->places, room->count, room->unit, (int64_t)numbers[MAP_TERMS], (int64_t)numbers[MAP_PLAIN_DEGREE], room->triangle, room->basis_values,
-        room->misses, most_certain, room->surface);
+        room->places, room->count, room->unit, (int64_t)numbers[MAP_TERMS], (int64_t)numbers[MAP_PLAIN_DEGREE], room->triangle,
+        room->basis_values, room->misses, most_certain, room->surface);
 }
 
 /* Tell the fit of the corner of a lone tag in the image on which side of its lines that lies, and how dark it is. */
@@ -204,8 +204,7 @@ static void tell_side(const tag_fit_t *fit, tag_room_t *room, int64_t k)
 static void tell_marked(const tag_fit_t *fit, tag_room_t *room)
 {
     for (int64_t k = 0; k < room->count; k++) {
-        memcpy(
-            fit->curvature + 2 * (int64_t)room->cell[k], room->surface + SURFACE_COLUMNS * k + CURVATURE, 2 * sizeof(double));
+        memcpy(fit->curvature + 2 * (int64_t)room->cell[k], room->surface + SURFACE_COLUMNS * k + CURVATURE, 2 * sizeof(double));
         room->single[2 * k] = room->single[2 * k + 1] = 0.0;
         room->contrast[k] = NAN;
         if (!fit->board->joined)
@@ -218,8 +217,8 @@ void fit_marked(const tag_fit_t *fit, tag_room_t *room, const edge_rules_t *rule
     tell_marked(fit, room);
     fit_tag_edges(
         fit->grey, fit->bytes, fit->width, fit->height, fit->board->count, marks_of(fit, MARK_CELLS), fit->board->steps,
-        fit->board->signs, room->count, room->start, room->surface, room->single, room->contrast, room->blur, fit->rules->window, rules,
-        fit->windows, room->out);
+        fit->board->signs, room->count, room->start, room->surface, room->single, room->contrast, room->blur, fit->rules->window,
+        rules, fit->windows, room->out);
 }
 
 /* Return s of the marked corners, by a quick fit of a few of them. */
@@ -304,7 +303,8 @@ void refit_tag_corners(const tag_fit_t *fit)
         double most = 0.0, half = 0.0;
         for (int64_t axis = 0; axis < 2; axis++) {
             const double *step = fit->board->steps + 4 * cell + 2 * axis;
-            const double longer = 0.5 * (step[0] > step[1] ? step[0] : step[1]), reach = longer < rules->last->reach ? longer : rules->last->reach;
+            const double longer = 0.5 * (step[0] > step[1] ? step[0] : step[1]),
+                         reach = longer < rules->last->reach ? longer : rules->last->reach;
             const double length = hypot(seen[SIDES + 2 * axis], seen[SIDES + 2 * axis + 1]);
             const double wide = reach * length < rules->last->radius_px ? reach * length : rules->last->radius_px;
             const double bend = fabs(seen[CURVATURE + axis] - fit->curvature[2 * cell + axis]);
@@ -380,7 +380,8 @@ void tag_heights(const double *pixels, int64_t rows, int64_t columns, double *lo
     for (int64_t row = 0; row + 1 < rows; row += 2)
         for (int64_t column = 0; column + 1 < columns; column += 2, longer++, height++) {
             const double *first = pixels + 2 * (row * columns + column), *below = first + 2 * columns;
-            const double along[2] = {first[2] - first[0], first[3] - first[1]}, down[2] = {below[0] - first[0], below[1] - first[1]};
+            const double along[2] = {first[2] - first[0], first[3] - first[1]},
+                         down[2] = {below[0] - first[0], below[1] - first[1]};
             const double across = hypot(along[0], along[1]), high = hypot(down[0], down[1]);
             *longer = isfinite(first[0] + first[2] + below[0] + below[2]) ? (across > high ? across : high) : NAN;
             *height = fabs(along[0] * down[1] - along[1] * down[0]) / *longer;

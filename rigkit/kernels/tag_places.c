@@ -4,8 +4,7 @@
 
 /* Set `quads` to the corners of those squares of a lattice (rows, columns) whose row and column together are `odd`, or not, in order
  * of growing angle from u to v, and `cells` to the (column, row) of their first; return how many there are. */
-int64_t squares_of_lattice(
-    const double *pixels, int64_t rows, int64_t columns, int64_t odd, double *quads, int64_t *cells)
+int64_t squares_of_lattice(const double *pixels, int64_t rows, int64_t columns, int64_t odd, double *quads, int64_t *cells)
 {
     int64_t count = 0;
     for (int64_t row = 0; row + 1 < rows; row++)
@@ -34,8 +33,8 @@ INLINE int is_before(const int64_t *one, const int64_t *other)
 /* Set `place` to the quarter turns and the shift that take most of the tags at `cells` of a lattice of `columns` x `rows` corners,
  * turned by `turns` against it, to their `places` on the board, the lowest of several; return how many agree. */
 int64_t vote_place(
-    const int64_t *cells, const int64_t *turns, const int64_t *places, int64_t count, int64_t columns, int64_t rows, int64_t *scratch,
-    int64_t *place)
+    const int64_t *cells, const int64_t *turns, const int64_t *places, int64_t count, int64_t columns, int64_t rows,
+    int64_t *scratch, int64_t *place)
 {
     int64_t most = 0;
     for (int64_t n = 0; n < count; n++) {

@@ -120,8 +120,8 @@ static int64_t corners_there(const tag_fit_t *fit, tag_room_t *room, double blur
             memcpy(at + 2 * n, fit->corners + CORNER_COLUMNS * n, 2 * sizeof(double));
         for (int64_t k = 0; k < room->count; k++)
             memcpy(
-                at + 2 * (int64_t)room->cell[k], there[k] != NOT_SEEN ? room->out + OUTCOMES * k : room->surface + SURFACE_COLUMNS * k,
-                2 * sizeof(double));
+                at + 2 * (int64_t)room->cell[k],
+                there[k] != NOT_SEEN ? room->out + OUTCOMES * k : room->surface + SURFACE_COLUMNS * k, 2 * sizeof(double));
         read_own(fit, room, at, own);
     }
     for (int64_t k = 0; k < room->count; k++) {
@@ -199,7 +199,8 @@ static int64_t drop_round(const tag_fit_t *fit)
     double *off = room.blur, *allowed = room.contrast;
     for (int64_t k = 0; k < room.count; k++)
         off[k] = (isnan(room.off[k]) ? 0.0 : room.off[k] < FAR ? room.off[k] : FAR) / room.gain[k];
-    const double own = median_of_numbers(off, room.count, 1, room.ranked), typical = own > rules->scatter_floor ? own : rules->scatter_floor;
+    const double own = median_of_numbers(off, room.count, 1, room.ranked),
+                 typical = own > rules->scatter_floor ? own : rules->scatter_floor;
     const double typical_sigma = usual_of(fit, &room, CORNER_SIGMA);
     int seen = 0;
     for (int64_t k = 0; k < room.count; k++) {

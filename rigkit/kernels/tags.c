@@ -5,14 +5,13 @@
  * A pixel's place in the tag is a cubic polynomial of its position, from which the four corners move the picture, each
  * by the share that it has in the bilinear interpolation of the place, and in which sides bend: by 4 x (1 - x) and
  * 4 y (1 - y) times how far their middles move. Free are these moves, those of the middles as far as they are not known,
- * the blur s, and the light (1 + g . x) (a + b S), S the share of ink.
- *
- * Pixels are taken in squares, for which the same edges count, side by side as the compiler vectorises them. */
+ * the blur s, and the light (1 + g . x) (a + b S), S the share of ink. Pixels are taken in squares, for which the same
+ * edges count, side by side as the compiler vectorises them. */
 #include "kernels.h"
 
 enum { SHARES = 6, BENDS = 8, MOVES = 2 * SHARES, S = MOVES, A, B, GX, GY, PARAMETERS };
 enum { ORDERS = 4, MAX_CELLS = 32, SIDE = TAG_SIDE, BLOCK = SIDE * SIDE, AT_ONCE = 4, LANES = 16 };
-_Static_assert(AT_ONCE * BLOCK == 4 * LANES, "products are taken in four parts");
+_Static_assert(4 * LANES == BLOCK * AT_ONCE, "products are taken in four parts");
 
 /* To the compiler so many numbers side by side, of any alignment. */
 typedef float lanes_t __attribute__((vector_size(4 * LANES), aligned(4)));
@@ -59,10 +58,12 @@ INLINE void tag_place(const tag_t *tag, const float *restrict du, const float *r
             m[k] = (float)tag->map[axis * TAG_TERMS + k];
         for (int i = 0; i < BLOCK; i++) {
             const float u = du[i] * per_px, v = dv[i] * per_px, uu = u * u, uv = u * v, vv = v * v;
-            out->at[axis][i] = (m[0] + m[1] * u + m[2] * v) + (m[3] * uu + m[4] * uv + m[5] * vv)
-                + uu * (m[6] * u + m[7] * v) + vv * (m[8] * u + m[9] * v);
-            out->grow[axis][0][i] = per_px * ((m[1] + 2.0f * m[3] * u + m[4] * v) + (3.0f * m[6] * uu + 2.0f * m[7] * uv + m[8] * vv));
-            out->grow[axis][1][i] = per_px * ((m[2] + m[4] * u + 2.0f * m[5] * v) + (m[7] * uu + 2.0f * m[8] * uv + 3.0f * m[9] * vv));
+            out->at[axis][i] = (m[0] + m[1] * u + m[2] * v) + (m[3] * uu + m[4] * uv + m[5] * vv) + uu * (m[6] * u + m[7] * v)
+                + vv * (m[8] * u + m[9] * v);
+            out->grow[axis][0][i] =
+                per_px * ((m[1] + 2.0f * m[3] * u + m[4] * v) + (3.0f * m[6] * uu + 2.0f * m[7] * uv + m[8] * vv));
+            out->grow[axis][1][i] =
+                per_px * ((m[2] + m[4] * u + 2.0f * m[5] * v) + (m[7] * uu + 2.0f * m[8] * uv + 3.0f * m[9] * vv));
         }
     }
 }
@@ -90,7 +91,7 @@ INLINE void profile_of(
     out->count = last - first;
     for (int64_t k = 0; k < out->count; k++) {
         const float edge = (float)tag->breaks[first + k];
-        float(*restrict part)[BLOCK] = out->part[k];
+        float (*restrict part)[BLOCK] = out->part[k];
         for (int i = 0; i < BLOCK; i++) {
             float x = (place[i] - edge) * per_s[i], step[5];
             x = x < FURTHEST ? x : FURTHEST;
@@ -103,8 +104,8 @@ INLINE void profile_of(
     }
 }
 
-/* Add to `sums`, by orders along x and y as far as the series below has them, what the cells of one row have more than those of the row before it, `before`,
- * beyond the edge `beyond` between the two; without such a row nothing lies before it. */
+/* Add to `sums`, by orders along x and y as far as the series below has them, what the cells of one row have more than those
+ * of the row before it, `before`, beyond the edge `beyond` between the two; without such a row nothing lies before it. */
 INLINE void add_row(
     const profile_t *along, const uint8_t *ink, const uint8_t *before, const float (*restrict beyond)[BLOCK],
     float (*restrict sums)[ORDERS][BLOCK])
@@ -156,7 +157,7 @@ INLINE void share_of_ink(const tag_t *tag, const float *u, const float *v, const
     float sums[ORDERS][ORDERS][BLOCK] = {{{0.0f}}};
     const uint8_t *ink = tag->ink + along[1].first * tag->cells + along[0].first, *before = NULL;
     for (int64_t j = 0; j <= along[1].count; j++, before = ink, ink += tag->cells)
-        add_row(along, ink, before, j ? (const float(*)[BLOCK])along[1].part[j - 1] : NULL, sums);
+        add_row(along, ink, before, j ? (const float (*)[BLOCK])along[1].part[j - 1] : NULL, sums);
     for (int i = 0; i < BLOCK; i++) {
         /* Blur along the two normals is correlated: Mehler's series, as in edges_model.c. */
         const float rho = n[0][0][i] * n[1][0][i] + n[0][1][i] * n[1][1][i], half = 0.5f * rho * rho;
@@ -194,8 +195,8 @@ INLINE int64_t block_pixels(
         /* Where the polynomial has turned over it shows the tag once more, mirrored. */
         const float area = here.grow[0][0][i] * here.grow[1][1][i] - here.grow[0][1][i] * here.grow[1][0][i];
         pixels->counts[i] *= ((x >= low) & (x <= high) & (y >= low) & (y <= high) & (area > 0.0f)) ? 1.0f : 0.0f;
-        const float share[SHARES] = {
-            (1.0f - x) * (1.0f - y), x * (1.0f - y), (1.0f - x) * y, x * y, 4.0f * x * (1.0f - x), 4.0f * y * (1.0f - y)};
+        const float share[SHARES] = {(1.0f - x) * (1.0f - y), x * (1.0f - y),       (1.0f - x) * y, x * y,
+                                     4.0f * x * (1.0f - x),   4.0f * y * (1.0f - y)};
         for (int part = 0; part < SHARES; part++)
             pixels->share[part][i] = share[part];
         count += pixels->counts[i];
@@ -269,8 +270,8 @@ INLINE void block_rows(
 /* Fill the normal equations; return the sum of squared residuals. */
 FOR_EACH_PROCESSOR
 static double tag_equations(
-    const tag_t *tag, const tag_block_t *blocks, int64_t count, const tag_rules_t *rules,
-    double N[PARAMETERS * PARAMETERS], double right[PARAMETERS])
+    const tag_t *tag, const tag_block_t *blocks, int64_t count, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS],
+    double right[PARAMETERS])
 {
     lanes_t sums[(PARAMETERS + 1) * (PARAMETERS + 2) / 2];
     memset(sums, 0, sizeof sums);
@@ -305,7 +306,8 @@ static double tag_equations(
 
 /* Add what is known of the `curvatures` and of the light beforehand, at noise of this `variance`. */
 static void add_prior(
-    const tag_t *tag, double curvature_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS], double step[PARAMETERS])
+    const tag_t *tag, double curvature_sigma, double variance, const tag_rules_t *rules, double N[PARAMETERS * PARAMETERS],
+    double step[PARAMETERS])
 {
     const double dim = 1.0 / (rules->light_sigma * tag->scale), straight = variance / (curvature_sigma * curvature_sigma);
     for (int i = BENDS; i < MOVES; i++) {
@@ -364,9 +366,10 @@ void fit_tags(
     for (int64_t n = 0; n < count; n++) {
         double *result = out + n * TAG_OUTCOMES;
         memset(result, 0, TAG_OUTCOMES * sizeof(double));
-        tag_t tag = {
-            .map = maps + 2 * TAG_TERMS * n, .centre = centres + 2 * n, .breaks = breaks, .scale = scales[n], .s = blur[n],
-            .b = -contrast[n], .ink = ink + cells * cells * n, .cells = cells};
+        tag_t tag = {.s = blur[n], .b = -contrast[n], .breaks = breaks, .ink = ink + cells * cells * n, .cells = cells};
+        tag.map = maps + 2 * TAG_TERMS * n;
+        tag.centre = centres + 2 * n;
+        tag.scale = scales[n];
         int64_t seen;
         const int64_t squares = tag_pixels(&tag, grey, bytes, width, height, reach, blocks, capacity, &seen);
         if (seen <= PARAMETERS || cells > MAX_CELLS)
