@@ -41,8 +41,10 @@ def print_circle_margins(looks: Iterable[tuple[str, bool, NDArray[np.uint8]]]) -
     print(f"\ncircles: {len(nothing)} images of grids without a lattice of circles:", "; ".join(nothing[:SHOWN]))
     names = [field.name for field in fields(GridEvidence)]
     for shows, what in ((True, "grids"), (False, "other lattices")):
-        print(f"{len(seen[shows])} {what}; | strange |", " | ".join(names), "| image |, in scales of the evidence")
-        for name, evidence in sorted(seen[shows], key=lambda item: item[1].strange, reverse=shows)[:SHOWN]:
+        print(
+            f"{len(seen[shows])} {what}; | implausibility |", " | ".join(names), "| image |, in scales of the evidence"
+        )
+        for name, evidence in sorted(seen[shows], key=lambda item: item[1].implausibility, reverse=shows)[:SHOWN]:
             parts = (value / scale for value, scale in zip(astuple(evidence), SCALES, strict=True))
-            print(f"| {evidence.strange:.2f} |", " | ".join(f"{part:.2f}" for part in parts), f"| {name} |")
+            print(f"| {evidence.implausibility:.2f} |", " | ".join(f"{part:.2f}" for part in parts), f"| {name} |")
     print(f"the limit is {MAX_IMPLAUSIBILITY}")

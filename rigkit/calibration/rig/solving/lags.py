@@ -181,7 +181,8 @@ def _with_times(by_target: tuple[FloatArray, FloatArray, FloatArray], speeds: Fl
     for c in range(cameras):
         follow[c, :, :, 6 + c] = speeds[c]
     back = np.swapaxes(follow, -1, -2)
-    return np.concatenate([back @ information @ follow, back @ score[..., None]], axis=-1).sum(axis=0)
+    summed: FloatArray = np.concatenate([back @ information @ follow, back @ score[..., None]], axis=-1).sum(axis=0)
+    return summed
 
 
 def _free(by_target: tuple[FloatArray, FloatArray, FloatArray]) -> BoolArray:

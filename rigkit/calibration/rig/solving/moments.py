@@ -72,7 +72,8 @@ class Moments:
     def speeds(self, c: int, key: IntArray) -> FloatArray:
         """Return how the targets of views of camera `c` go on at their moments, (V, 6) a unit of time."""
         order = np.arange(float(self.ways.shape[1]))
-        return np.einsum("vks,vk->vs", self.ways[key], (order + 1.0) * self._times(c, key) ** order)
+        speeds: FloatArray = np.einsum("vks,vk->vs", self.ways[key], (order + 1.0) * self._times(c, key) ** order)
+        return speeds
 
     def speeds_at_all(self) -> FloatArray:
         """Return the speeds of all targets at the moments of all cameras, (n, F, 6)."""
@@ -80,7 +81,8 @@ class Moments:
         return np.array([self.speeds(c, keys) for c in range(len(self.lags))])
 
     def _times(self, c: int, key: IntArray) -> FloatArray:
-        return (self.lags[c] + self.own[c, key])[:, None]
+        times: FloatArray = self.lags[c] + self.own[c, key]
+        return times[:, None]
 
     def at_reference(self, part: PoseJacobians, c: int, meanwhile: Mat3, lag: int) -> PoseJacobians:
         """Return how views of camera `c` follow the targets as they are at the first camera's moment, and the `lag`
