@@ -184,14 +184,14 @@ def simulated_rig(name: str, goal_px: float, rng: np.random.Generator) -> Sessio
         [[frame_observation.view for frame_observation in frame] for frame in guide.frames], NAMES, [SIZE, SIZE]
     )
     assert whole is not None
-    left = left_of_rig(whole.rig, options)
+    left = left_of_rig(whole, options)
     return Session(
         frames=len(guide.frames),
         words=advice.words,
         said=max(own.error for own in advice.left) if advice.left else float("nan"),
         stated=max(own.error for own in left),
-        true=max(true_error_of_rig(lens, whole.rig), *(true_error(lens, own.camera) for own in whole.rig.cameras)),
-        model="/".join(own.camera.model for own in whole.rig.cameras),
+        true=max(true_error_of_rig(lens, whole), *(true_error(lens, own.camera) for own in whole.cameras)),
+        model="/".join(own.camera.model for own in whole.cameras),
         seconds=longest,
     )
 

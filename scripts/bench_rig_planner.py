@@ -55,7 +55,7 @@ def calibrated(views: Views, lens: Lens) -> RigCalibration:
     return calibrate_rig(views, dict.fromkeys(NAMES, SIZE), model=lens.camera.model, degree=degree, folds=0)
 
 
-def watched(rig: RigCalibration) -> Monitored:
+def monitored(rig: RigCalibration) -> Monitored:
     """Return a rig as its file would have it."""
     return Monitored(
         names=tuple(c.name for c in rig.cameras),
@@ -82,7 +82,7 @@ def session(lens: Lens, rng: np.random.Generator) -> list[float]:
     free = free_poses(lens, rng)
     first = seen(((f"{k:03d}", next(free)) for k in range(FRAMES)), lens, rng)
     rig = calibrated(first, lens)
-    plan = next_frames(watched(rig), [BOARD], MORE, reach=Reach(field_deg=lens.field_deg))
+    plan = next_frames(monitored(rig), [BOARD], MORE, reach=Reach(field_deg=lens.field_deg))
     held = []
     for k, view in enumerate(plan.views):
         back = rig.cameras[NAMES.index(view.seen_by[0])].cam_from_rig.inverse()

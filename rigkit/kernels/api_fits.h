@@ -72,7 +72,7 @@ EXPORT void line_curvatures(
 typedef struct {
     ARRAY(const double, steps, step_count);
     int64_t step_count;
-    double aside, first, last, goes_on, cut, near_witness, seen, max_paper;
+    double lateral, first, last, goes_on, cut, near_witness, seen, max_paper;
 } paper_rules_t;
 
 EXPORT int64_t paper_memory(int64_t count);
@@ -323,11 +323,11 @@ typedef struct {
 
 EXPORT void lit_unevenly(
     IMAGE(grey), int64_t count, ARRAY(const double, pixels, count, 2), ARRAY(const double, sides, count, 2, 2),
-    ARRAY(const double, aside, count), ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts,
+    ARRAY(const double, lateral, count), ARRAY(const uint8_t, ends, count), ARRAY(const double, along, parts), int64_t parts,
     double max_lateral, double min_px, double uneven, RESULT(truth_t, out, count));
 EXPORT void fit_light_steps(
     IMAGE(grey), int64_t count, ARRAY(const double, start, count, 2), ARRAY(const double, sides, count, 2, 2),
-    ARRAY(const double, curvature, count, 2), ARRAY(const double, aside, count), double blur,
+    ARRAY(const double, curvature, count, 2), ARRAY(const double, lateral, count), double blur,
     ARRAY(const double, max_step, LIGHT_UNKNOWNS), const light_rules_t *rules, int64_t most,
     SCRATCH(double, scratch, 4, most), RESULT(double, out, count, LIGHT_OUTCOMES));
 

@@ -89,7 +89,7 @@ EXPORT int64_t mark_known(
 typedef struct {
     int64_t neighbours, places, min_places;
     ARRAY(const double, along, places);
-    double arm_cosine, contrast_ratio, length_ratio, aside, min_aside;
+    double arm_cosine, contrast_ratio, length_ratio, lateral, min_lateral;
 } link_rules_t;
 
 /* The corners and the level that their edges are read from. */
@@ -123,7 +123,7 @@ typedef struct {
     const ring_rules_t *ring;
     ARRAY(const double, along, places);
     int64_t places, min_places, tried, min_predicting;
-    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, aside, min_aside, max_lateral, min_area;
+    double reach, ring_part, min_ring, max_ring, line_sine, contrast_ratio, lateral, min_lateral, max_lateral, min_area;
 } growth_rules_t;
 
 /* The brightness of a level: full-resolution pixel = scale * level pixel + offset. */

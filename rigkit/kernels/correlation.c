@@ -92,10 +92,10 @@ static double set_influence(
         const double cosine = sides[2 * line] / across, sine = sides[2 * line + 1] / across;
         reach[line] = across < 2.0 * rules->radius_px ? across : 2.0 * rules->radius_px;
         for (int k = 0; k < LAGS; k++) {
-            const double along = cosine * columns[k] + sine * rows[k], aside = cosine * rows[k] - sine * columns[k];
+            const double along = cosine * columns[k] + sine * rows[k], lateral = cosine * rows[k] - sine * columns[k];
             /* Over so much of the line it overlaps with itself, shifted: less over what has the other sign. */
             const double left = 1.0 - 3.0 * fabs(along) / reach[line];
-            influence[k] += exp(aside * aside / (-4.0 * blur * blur)) * (left > 0.0 ? left : 0.0);
+            influence[k] += exp(lateral * lateral / (-4.0 * blur * blur)) * (left > 0.0 ? left : 0.0);
         }
     }
     for (int k = 0; k < LAGS; k++) {

@@ -15,7 +15,7 @@ typedef struct {
 
 /* The model along one line over a block of pixels: the step, its derivatives, -s dS/ds, and the pixel's place. */
 typedef struct {
-    float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], aside[BLOCK];
+    float value[BLOCK], slope[BLOCK], bow[BLOCK], curl[BLOCK], grown[BLOCK], along[BLOCK], lateral[BLOCK];
 } edge_t;
 
 /* What lies beyond the outer squares of one line over a block of pixels: how much of it a pixel sees, and that times how
@@ -95,7 +95,7 @@ INLINE void add_edge(const int size, const line_t line, float shift, float tilt,
     for (int i = 0; i < size; i++) {
         const float along = out->along[i];
         const float bend = 0.5f * line.curvature * (along * along + line.blur * line.blur);
-        const float at = out->aside[i] - bend - tilt * along + shift;
+        const float at = out->lateral[i] - bend - tilt * along + shift;
         x[i] = cut((at - apart) * per_width);
         y[i] = cut((at + apart) * per_width);
     }
@@ -133,7 +133,7 @@ INLINE void along_line(const int size, const line_t line, const float *u, const 
 {
     for (int i = 0; i < size; i++) {
         out->along[i] = line.cosine * (u[i] - x) + line.sine * (v[i] - y);
-        out->aside[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
+        out->lateral[i] = line.cosine * (v[i] - y) - line.sine * (u[i] - x);
     }
     add_edge(size, line, 0.0f, 0.0f, 1.0f, 1, out);
     if (line.tight) {
@@ -155,7 +155,7 @@ INLINE void add_paper(
     edge_t edge;
     for (int i = 0; i < size; i++) {
         edge.along[i] = at->along[i];
-        edge.aside[i] = at->aside[i];
+        edge.lateral[i] = at->lateral[i];
     }
     add_edge(size, line, shift, tilt, 1.0f, 1, &edge);
     const float half = 0.5f * way;

@@ -94,8 +94,8 @@ INLINE void fill_rows(
         const float bend1 = line1.curvature * one.along[i], bend2 = line2.curvature * two.along[i];
         rows[X][i] = by_d1 * (line1.sine + bend1 * line1.cosine) + by_d2 * (line2.sine + bend2 * line2.cosine);
         rows[Y][i] = by_d1 * (bend1 * line1.sine - line1.cosine) + by_d2 * (bend2 * line2.sine - line2.cosine);
-        rows[T1][i] = -by_d1 * (one.along[i] + bend1 * one.aside[i]);
-        rows[T2][i] = -by_d2 * (two.along[i] + bend2 * two.aside[i]);
+        rows[T1][i] = -by_d1 * (one.along[i] + bend1 * one.lateral[i]);
+        rows[T2][i] = -by_d2 * (two.along[i] + bend2 * two.lateral[i]);
         rows[S][i] = -scale * grown;
         rows[A][i] = light;
         rows[B][i] = light * pattern;

@@ -275,10 +275,10 @@ INLINE int fits(
         const double side = direction % 2 ? -sign : sign;
         const double there = sheet->contrast[r * sheet->columns + c];
         const double weakest = rules->contrast_ratio * (there < *contrast ? there : *contrast);
-        double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
-        aside = aside > rules->min_aside ? aside : rules->min_aside;
-        aside = aside < rules->max_lateral ? aside : rules->max_lateral;
-        if (!edge_seen(level->image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, side, aside, weakest))
+        double lateral = rules->lateral * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
+        lateral = lateral > rules->min_lateral ? lateral : rules->min_lateral;
+        lateral = lateral < rules->max_lateral ? lateral : rules->max_lateral;
+        if (!edge_seen(level->image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, side, lateral, weakest))
             return 0;
     }
     return 1;

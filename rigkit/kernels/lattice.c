@@ -330,10 +330,10 @@ void edge_shifts(
                 if (!square_of(pixels, columns, row, column, scale, offset, corner) || next++ % every)
                     continue;
                 /* The edge that the square starts with, and how the square goes on from there. */
-                const double *start = corner[0], *end = corner[1 + down], *aside = corner[2 - down], *last = corner[3];
+                const double *start = corner[0], *end = corner[1 + down], *lateral = corner[2 - down], *last = corner[3];
                 const double side = 0.5 * reach * ((row + column) % 2 ? -sign : sign);
-                const double across_u = side * (aside[0] + last[0] - start[0] - end[0]);
-                const double across_v = side * (aside[1] + last[1] - start[1] - end[1]);
+                const double across_u = side * (lateral[0] + last[0] - start[0] - end[0]);
+                const double across_v = side * (lateral[1] + last[1] - start[1] - end[1]);
                 for (int64_t k = 0; k < parts; k++) {
                     const double u = start[0] + along[k] * (end[0] - start[0]);
                     const double v = start[1] + along[k] * (end[1] - start[1]);

@@ -47,7 +47,7 @@ INLINE double edge_at(double z)
 
 /* Gather the pixels that the cell of a corner at `start` has near its lines. */
 INLINE void gather(
-    const void *grey, int64_t bytes, int64_t width, int64_t height, const double start[2], const double sides[4], double aside,
+    const void *grey, int64_t bytes, int64_t width, int64_t height, const double start[2], const double sides[4], double lateral,
     double blur, const light_rules_t *rules, lit_t *out)
 {
     const double det = sides[0] * sides[3] - sides[1] * sides[2], square = rules->radius_px * rules->radius_px;
@@ -67,7 +67,7 @@ INLINE void gather(
             const double first = (sides[3] * x - sides[2] * y) / det, second = (sides[0] * y - sides[1] * x) / det;
             const double one = (y * sides[0] - x * sides[1]) / length[0], two = (y * sides[2] - x * sides[3]) / length[1];
             if (!(fabs(first) < rules->reach_cells && fabs(second) < rules->reach_cells)
-                || !(fabs(one) < aside || fabs(two) < aside))
+                || !(fabs(one) < lateral || fabs(two) < lateral))
                 continue;
             const int64_t at = v * width + u, n = out->count++;
             out->u[n] = (double)du;
@@ -166,11 +166,11 @@ INLINE void line_block(
     const double c = cos(angle), s = sin(angle);
 #pragma omp simd
     for (int k = 0; k < BLOCK; k++) {
-        const double along = c * (us[k] - x) + s * (vs[k] - y), aside = c * (vs[k] - y) - s * (us[k] - x);
-        out->z[k] = (aside - 0.5 * bend * along * along) * per_blur;
+        const double along = c * (us[k] - x) + s * (vs[k] - y), lateral = c * (vs[k] - y) - s * (us[k] - x);
+        out->z[k] = (lateral - 0.5 * bend * along * along) * per_blur;
         out->by[0][k] = per_blur * (s + bend * along * c);
         out->by[1][k] = per_blur * (bend * along * s - c);
-        out->by[2][k] = -per_blur * along * (1.0 + bend * aside);
+        out->by[2][k] = -per_blur * along * (1.0 + bend * lateral);
         out->by[3][k] = -out->z[k];
     }
     set_sides(out);
@@ -331,14 +331,14 @@ static int uneven_at(
 
 void lit_unevenly(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *pixels, const double *sides,
-    const double *aside, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px, double uneven,
-    uint8_t *out)
+    const double *lateral, const uint8_t *ends, const double *along, int64_t parts, double max_lateral, double min_px,
+    double uneven, uint8_t *out)
 {
     for (int64_t n = 0; n < count; n++) {
         const double *side = sides + 4 * n, length[2] = {hypot(side[0], side[1]), hypot(side[2], side[3])};
         double off[2], nearest = INFINITY;
         for (int line = 0; line < 2; line++) {
-            off[line] = fmin(max_lateral, aside[n] / fmax(length[line], 1e-9));
+            off[line] = fmin(max_lateral, lateral[n] / fmax(length[line], 1e-9));
             nearest = fmin(nearest, off[line] * length[line]);
         }
         /* Where the board may end, only the nearest places are looked at. */
@@ -350,7 +350,7 @@ void lit_unevenly(
 FOR_EACH_PROCESSOR
 void fit_light_steps(
     const void *grey, int64_t bytes, int64_t width, int64_t height, int64_t count, const double *start, const double *sides,
-    const double *curvature, const double *aside, double blur, const double *max_step, const light_rules_t *rules, int64_t most,
+    const double *curvature, const double *lateral, double blur, const double *max_step, const light_rules_t *rules, int64_t most,
     double *scratch, double *out)
 {
     lit_t lit = {.u = scratch, .v = scratch + most, .value = scratch + 2 * most, .pattern = scratch + 3 * most};
@@ -360,7 +360,7 @@ void fit_light_steps(
         memset(result, 0, LIGHT_OUTCOMES * sizeof(double));
         result[5] = rules->first_width;
         result[6] = 1.0;
-        gather(grey, bytes, width, height, from, side, aside[n], blur, rules, &lit);
+        gather(grey, bytes, width, height, from, side, lateral[n], blur, rules, &lit);
         if (!lit.count || !seek_step(&lit, rules, x))
             continue;
         x[X] = from[0] - lit.centre[0];

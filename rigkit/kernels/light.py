@@ -25,7 +25,7 @@ def fit_light_steps(
     start: FloatArray,
     sides: FloatArray,
     curvature: FloatArray,
-    aside: FloatArray,
+    lateral: FloatArray,
     blur: float,
     max_step: FloatArray,
     rules: LightRules,
@@ -33,14 +33,16 @@ def fit_light_steps(
     """Return the outcomes of N corners, (N, 8). Arguments as `detection.subpixel.shadows.light_steps`; what a step
     of the fit changes is `max_step` (11,) at most."""
     capacity = (2 * math.ceil(rules.radius_px) + 1) ** 2 + LIGHT_BLOCK
-    return np.asarray(kernels().fit_light_steps(image, start, sides, curvature, aside, blur, max_step, rules, capacity))
+    return np.asarray(
+        kernels().fit_light_steps(image, start, sides, curvature, lateral, blur, max_step, rules, capacity)
+    )
 
 
 def lit_unevenly(
     image: GreyImage,
     pixels: FloatArray,
     sides: FloatArray,
-    aside: FloatArray,
+    lateral: FloatArray,
     ends: BoolArray,
     along: FloatArray,
     max_lateral: float,
@@ -51,7 +53,7 @@ def lit_unevenly(
 
     The last four are its constants.
     """
-    return np.asarray(kernels().lit_unevenly(image, pixels, sides, aside, ends, along, max_lateral, min_px, uneven))
+    return np.asarray(kernels().lit_unevenly(image, pixels, sides, lateral, ends, along, max_lateral, min_px, uneven))
 
 
 @structure("paper_rules_t")

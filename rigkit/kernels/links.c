@@ -125,14 +125,14 @@ INLINE int link_seen(
     const double u = (corners->pixels[2 * i] - offset) / scale, v = (corners->pixels[2 * i + 1] - offset) / scale;
     const double end_u = (corners->pixels[2 * j] - offset) / scale;
     const double end_v = (corners->pixels[2 * j + 1] - offset) / scale;
-    double aside = rules->aside * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
+    double lateral = rules->lateral * sqrt((end_u - u) * (end_u - u) + (end_v - v) * (end_v - v));
     const double most = corners->reach[i];
-    aside = aside > rules->min_aside ? aside : rules->min_aside;
-    aside = aside < most ? aside : most;
+    lateral = lateral > rules->min_lateral ? lateral : rules->min_lateral;
+    lateral = lateral < most ? lateral : most;
     const double there = corners->contrast[j], here = corners->contrast[i];
     const double weakest = rules->contrast_ratio * (there < here ? there : here);
     return edge_seen(
-        image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, aside, weakest);
+        image, rules->along, rules->places, rules->min_places, u, v, end_u, end_v, link->arm % 2 ? -1.0 : 1.0, lateral, weakest);
 }
 
 /* The nearest corner along each of the four arms of the corner at `place` whose edge is seen: to[arm] = 4 * corner +
@@ -193,7 +193,7 @@ static double link_length(const double *pixels, int64_t i, int64_t to)
 }
 
 /* reference.links.links: both[4 * i + arm] = 4 * neighbour + its arm, -1 for none. Of the corners, `lines` (count, 4)
- * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `aside`.
+ * are the unit vectors of A and B, `least` and `most` bound the contrast of those looked at, `reach` is the most `lateral`.
  * `nearest` (count, 4) is scratch. Returns 0 without memory. */
 FOR_EACH_PROCESSOR int64_t find_links(
     const corners_t *corners, image_t image, double scale, double offset, const link_rules_t *rules, int64_t *nearest,

@@ -95,9 +95,9 @@ static void read_sides(
     const double right = (double)(image->width - 1), bottom = (double)(image->height - 1);
     for (int64_t k = 0; k < rules->step_count; k++)
         for (int side = 0; side < 2; side++) {
-            const double aside = side ? -rules->aside : rules->aside;
-            const double column = way[0] * rules->steps[k] + aside * way[1];
-            const double row = way[1] * rules->steps[k] + aside * way[0];
+            const double lateral = side ? -rules->lateral : rules->lateral;
+            const double column = way[0] * rules->steps[k] + lateral * way[1];
+            const double row = way[1] * rules->steps[k] + lateral * way[0];
             const double u = pixel[0] + (column * sides[0] + row * sides[2]);
             const double v = pixel[1] + (column * sides[1] + row * sides[3]);
             const int inside = u >= 0.0 && v >= 0.0 && u <= right && v <= bottom;
@@ -146,7 +146,7 @@ static void read_end(
     /* Beside the way out across line 1 lie squares of line 2, with their own edges and those of the next squares: what
      * blur leaves of the difference of the two squares. */
     const double across = mean_gap(all, end->who, 1 - end->which / 2) / (sqrt(2.0) * blur);
-    const double left = erf(rules->aside * across) + erf((1.0 - rules->aside) * across) - 1.0;
+    const double left = erf(rules->lateral * across) + erf((1.0 - rules->lateral) * across) - 1.0;
     for (int64_t k = 0; k < count; k++)
         differs[k] = (double)(one[k] - other[k]) / (contrast * left);
     end->found = find_end(end, rules, differs);

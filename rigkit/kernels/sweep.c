@@ -25,12 +25,12 @@ INLINE void take_census(const float *from, int64_t rows, int64_t columns, uint32
         uint32_t *bits = out + row * columns;
         for (int64_t j = -CENSUS_REACH; j <= CENSUS_REACH; j++) {
             for (int64_t i = -CENSUS_REACH; i <= CENSUS_REACH; i++) {
-                const float *aside = centre + j * wide + i;
+                const float *lateral = centre + j * wide + i;
                 if (i == 0 && j == 0)
                     continue;
 #pragma omp simd
                 for (int64_t k = 0; k < columns; k++)
-                    bits[k] = (bits[k] << 1) | (uint32_t)(aside[k] < centre[k]);
+                    bits[k] = (bits[k] << 1) | (uint32_t)(lateral[k] < centre[k]);
             }
         }
     }

@@ -129,7 +129,7 @@ def test_images_are_exchanged_where_the_other_order_holds_or_explains_more(monke
 
     def found(*, holds: bool, unexplained: bool) -> SentinelCheck:
         names = SimpleNamespace(names=("left", "right"))
-        return cast(SentinelCheck, SimpleNamespace(watched=names, holds=holds, unexplained=unexplained, flipped=""))
+        return cast(SentinelCheck, SimpleNamespace(monitored=names, holds=holds, unexplained=unexplained, flipped=""))
 
     odd, moved, holding = (found(holds=h, unexplained=u) for h, u in ((False, True), (False, False), (True, False)))
     for given, other, wrong in ((odd, odd, False), (moved, moved, False), (odd, moved, True), (moved, holding, True)):

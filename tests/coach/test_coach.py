@@ -123,15 +123,15 @@ def test_a_watched_folder_makes_a_session_that_matches_the_truth(pictures: list[
     # The first picture once more, and the first place once more: whoever took it is told that it brought nothing.
     cv2.imwrite(str(monitored / "001.png"), pictures[0])
     cv2.imwrite(str(monitored / "002.png"), pictures[0] ^ 1)
-    printed, known = [], []
+    printed, counts = [], []
 
     def show(images: object) -> None:
         printed.append(coach.state().get("words"))
-        known.append(len(reported))
+        counts.append(len(reported))
 
     coach_frames(coach, frames_of_folders([monitored], until_idle_s=0.5), photos=True, show=show)
     # The picture before the page is the one whose corners are drawn on it.
-    assert known[0] == 1
+    assert counts[0] == 1
     assert any(str(words).startswith("Not taken, as it is frame-0001.png already. ") for words in printed)
     assert any(
         str(words).startswith("Not taken, as it brings little that is new: 0 % of what the place asked for would. ")

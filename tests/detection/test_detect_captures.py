@@ -116,7 +116,7 @@ def test_overexposed_tags(gain: float) -> None:
     images = [read_grey(path) for path in paths]
     bright = [np.clip(np.rint(gain * image.astype(np.float64)), 0, 255).astype(np.uint8) for image in images]
     guess = guess_board(bright)
-    assert guess is not None and guess.reported
+    assert guess is not None and guess.determined
     assert guess.board.pattern == AprilGrid(0.3)
     board = Board("grid", 12, 12, 88.0, 88.0, pattern=AprilGrid(0.3))
     seen, off = 0, []

@@ -145,7 +145,7 @@ def _rules() -> GrowthRules:
         "line_sine": LINE_SINE,
         "contrast_ratio": CONTRAST_RATIO,
         "lateral": LATERAL_LENGTHS,
-        "min_aside": MIN_LATERAL_PX,
+        "min_lateral": MIN_LATERAL_PX,
         "max_lateral": MAX_LATERAL_PX,
         "min_area": MIN_AREA_PX2,
     }

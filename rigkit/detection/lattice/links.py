@@ -93,7 +93,7 @@ def _link_rules(length_ratio: float) -> front.LinkRules:
         contrast_ratio=CONTRAST_RATIO,
         length_ratio=length_ratio,
         lateral=LATERAL_LENGTHS,
-        min_aside=MIN_LATERAL_PX,
+        min_lateral=MIN_LATERAL_PX,
     )
 
 

@@ -70,7 +70,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
             f"It moves the projection by {change.size_px:.3f} px rms{caveat}; after the correction "
             f"{check.rms_fixed_px:.3f} px are left.{_nearest_words(check, change)}"
         )
-    if not check.holds and check.baseline is None and len(check.watched.cameras) > 1:
+    if not check.holds and check.baseline is None and len(check.monitored.cameras) > 1:
         sentences.append(
             "Moved since, or never held? Pictures of the time of the calibration, given with --before, tell: what was "
             "wrong then is no change."
@@ -78,7 +78,7 @@ def check_facts(check: SentinelCheck) -> PageFacts:
     if check.holds and check.powers:
         worst = min(check.powers, key=lambda power: power.chance)
         sentences.append(_could_have_found(worst))
-        if worst.chance < FOUND and len(check.watched.cameras) == 1:
+        if worst.chance < FOUND and len(check.monitored.cameras) == 1:
             sentences.append("Which pictures would tell most: rigkit plan CALIBRATION --check")
     return PageFacts(
         headline=headline,
@@ -103,8 +103,8 @@ def _cost_words(check: SentinelCheck, change: Change) -> str:
     """Return what a change costs: in the length that is measured, or of what is a metre away."""
     if check.cost_unit != "px":
         return f"an error of {check.cost:.2g} {check.cost_unit} rms in the length"
-    c = 0 if change.hypothesis.camera is None else check.watched.names.index(change.hypothesis.camera)
-    return px_words(check.watched.cameras[c], change.size_px)
+    c = 0 if change.hypothesis.camera is None else check.monitored.names.index(change.hypothesis.camera)
+    return px_words(check.monitored.cameras[c], change.size_px)
 
 
 def _nearest_words(check: SentinelCheck, change: Change) -> str:
@@ -206,14 +206,14 @@ def check_page(check: SentinelCheck, title: str, provenance: Mapping[str, str]) 
         title,
         check_facts(check),
         provenance,
-        drawings=[(f"{name}: {moves}", change_svg(check, c)) for c, name in enumerate(check.watched.names)],
+        drawings=[(f"{name}: {moves}", change_svg(check, c)) for c, name in enumerate(check.monitored.names)],
     )
 
 
 def change_svg(check: SentinelCheck, c: int) -> str:
     """Draw how the best explanation moves the projection of camera `c` of what stays where it is, magnified."""
-    before, after = far_camera(check.watched.cameras[c]), far_camera(check.fixed.cameras[c])
-    turn = check.fixed.cam_from_rig[c].rotation @ check.watched.cam_from_rig[c].rotation.T
+    before, after = far_camera(check.monitored.cameras[c]), far_camera(check.fixed.cameras[c])
+    turn = check.fixed.cam_from_rig[c].rotation @ check.monitored.cam_from_rig[c].rotation.T
     pixels = grid_pixels(before.size_px, ARROWS).reshape(-1, 2)
     rays, valid = before.unproject(pixels)
     moved, seen = after.project(rays[valid] @ turn.T)
