@@ -28,7 +28,7 @@ SAME_CHANCE = 0.01
 """A difference this unlikely for one and the same camera is no chance."""
 COVARIANCE_FLOOR_PX = 0.05
 """Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
-TYPICAL = 0.9
+TYPICAL_SHARE = 0.9
 """Part of the differences of one and the same camera that is called usual."""
 IMPORTANT_PX = 0.1
 """What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
@@ -126,7 +126,7 @@ def compare_calibrations(
         drawn,
     )
     chance, unusual = found.chance([_without(step, turn) for step in _touched(a.camera, pixels)])
-    typical = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - TYPICAL - unusual, 0.5, 1.0 - unusual)))
+    typical = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - TYPICAL_SHARE - unusual, 0.5, 1.0 - unusual)))
     low, median, high = typical.tolist()
     same_model = _kind(a.camera) == _kind(b.camera)
     return CalibrationComparison(difference, median, (low, high), chance, same_model)
@@ -184,7 +184,7 @@ class _Modes:
 
     def chance(self, steps: Sequence[FloatArray]) -> tuple[float, float]:
         """Return the probability of a difference as large as the one found, and how unlikely one answer must be for
-        that to be 1 - TYPICAL: it is one of several.
+        that to be 1 - TYPICAL_SHARE: it is one of several.
 
         What is large is asked in several ways, and the one that says most is compared with what it would say by chance
         (Tippett's combination). Of anything: the mean square, and the difference in units of what is expected
@@ -209,7 +209,9 @@ class _Modes:
             null_size = np.einsum("in,ij,jn->n", by_chance, inverse, by_chance)
             likely.append(_exceeded(float(size @ inverse @ size), null_size))
         least = np.min(likely, axis=0)
-        return float(np.count_nonzero(least <= least[0]) / len(least)), float(np.quantile(least[1:], 1.0 - TYPICAL))
+        return float(np.count_nonzero(least <= least[0]) / len(least)), float(
+            np.quantile(least[1:], 1.0 - TYPICAL_SHARE)
+        )
 
 
 def _exceeded(size: float, null: FloatArray) -> FloatArray:

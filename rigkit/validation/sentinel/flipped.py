@@ -18,7 +18,7 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.validation.sentinel.evidence import FreshView, Monitored
 from rigkit.validation.sentinel.judge import check_views
 
-FLIPS = {
+FLIP_SIGNS = {
     "turned by half a turn": (-1.0, -1.0),
     "mirrored left to right": (-1.0, 1.0),
     "mirrored top to bottom": (1.0, -1.0),
@@ -53,7 +53,7 @@ def _fitting_flips(monitored: Monitored, views: Sequence[FreshView], which: tupl
     whose = {frame: {v.camera for v in views if v.frame == frame} for frame in {v.frame for v in views}}
     together = any(len(seen) > 1 and not seen.isdisjoint(which) for seen in whose.values())
     fit = []
-    for words, signs in FLIPS.items():
+    for words, signs in FLIP_SIGNS.items():
         if not together and max(_moved(camera, signs) for camera in cameras) < MIN_SHARE_FLIPPED:
             continue
         # In a mirror a board's columns or its rows are counted backwards, as the colours of its ends have it.
