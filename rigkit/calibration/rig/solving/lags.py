@@ -35,7 +35,7 @@ CHANCE = 0.01
 """Of cameras that are triggered together so few are taken for lagging, with lags that may be none in their sigmas."""
 MAX_ROUNDS, SETTLED = 8, 0.01
 """Ways and times of pictures are found anew until the cost changes by less than this part, so many times at most."""
-FIRST_SPREAD, LEAST_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
+FIRST_SPREAD, MIN_SPREAD, SPREAD_ROUNDS = 0.1, 1e-4, 50
 """By how much pictures of a camera lag differently, in the time between frames: where the search begins, the least that
 is told from nothing, and how many steps it makes."""
 ORDERS_DRAWN = 199
@@ -48,8 +48,8 @@ def times_of(keys: Sequence[Key], frames: Mapping[Key, str]) -> FloatArray:
     """Return the time of every key, (F,), in units of the usual time between two frames; NaN for views that share no
     pose. The last numbers in the names of `frames` tell it, their order where these do not rise."""
     names = sorted({frame for key, frame in frames.items() if key[0] == frame}, key=natural_key)
-    told = [last_number(name) for name in names]
-    numbers = np.array([float(n) if n.isdecimal() else 0.0 for n in told])
+    in_names = [last_number(name) for name in names]
+    numbers = np.array([float(n) if n.isdecimal() else 0.0 for n in in_names])
     if not (np.diff(numbers) > 0.0).all():
         numbers = np.arange(float(len(names)))
     typical = np.median(np.diff(numbers)) if len(names) > 1 else 1.0
@@ -139,7 +139,7 @@ def _with_own_times(state: RigState, moments: Moments, observations: RigObservat
     poses, late = np.arange(6), np.arange(6, products.shape[1])
     largest = np.maximum(np.einsum("fii->fi", products[..., :-1]).max(axis=1, keepdims=True), 1.0)
     for _ in range(SPREAD_ROUNDS):
-        known = (sigma_px / np.maximum(spread, LEAST_SPREAD)) ** 2
+        known = (sigma_px / np.maximum(spread, MIN_SPREAD)) ** 2
         information = np.where(free, known, HELD * largest)
         system, right = products[..., :-1].copy(), products[..., -1].copy()
         system[:, poses, poses] += RIDGE * largest
