@@ -110,8 +110,8 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
     so by chance."""
     if not any(c.chosen and c.name == MOVING for c in candidates):
         return list(candidates)
-    message = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
-    return [replace(c, chosen=c.name == CENTRAL, reason=message[c.name]) for c in candidates]
+    reasons = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
+    return [replace(c, chosen=c.name == CENTRAL, reason=reasons[c.name]) for c in candidates]
 
 
 def pupil_moves_significantly(calibration: Calibration) -> bool:

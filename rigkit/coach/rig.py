@@ -115,29 +115,29 @@ class RigGuide:
         open_mounts = [c for c, px in mounts.items() if px is None or px > self.options.goal_px]
         known_px = [px for px in mounts.values() if px is not None]
         mount_px = max(known_px) if mounts and len(known_px) == len(mounts) else None
-        message = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
-        alone = all(advice.enough for advice in lenses)
+        advice = RigAdvice(lenses=lenses, mount_px=mount_px, targets=(None,) * len(lenses))
+        alone = all(lens.enough for lens in lenses)
         if len(lenses) > 1 and not open_mounts and (alone or self._rig_is_enough(lenses)):
-            message = self._of_rig(message, frame_observations, photo=photo)
+            advice = self._of_rig(advice, frame_observations, photo=photo)
         elif len(lenses) == 1 or not alone:
-            message = self._of_lenses(message, frame_observations)
+            advice = self._of_lenses(advice, frame_observations)
         else:
             advised_camera = max(open_mounts, key=lambda c: np.inf if mounts[c] is None else float(mounts[c] or 0.0))
-            message = self._of_mount(replace(message, advised_camera=advised_camera), frame_observations)
+            advice = self._of_mount(replace(advice, advised_camera=advised_camera), frame_observations)
         seeing, min_gain = [g for g in frame_observations if g.view is not None], min_gain_of(photo=photo)
         complaint = next((g.complaint for g in seeing if g.complaint), "")
-        if message.enough or message.waits or not seeing or message.worth < min_gain:
-            return message
-        return replace(message, take=not complaint, words=complaint.capitalize() or TAKING)
+        if advice.enough or advice.waits or not seeing or advice.worth < min_gain:
+            return advice
+        return replace(advice, take=not complaint, words=complaint.capitalize() or TAKING)
 
-    def _of_lenses(self, message: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
+    def _of_lenses(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return what the lens that is worst off says; where nobody knows an error, that with the fewest frames."""
-        lenses = message.lenses
+        lenses = advice.lenses
         badly = [(a.enough, a.waits, -a.share, len(lens.views)) for lens, a in zip(self.lenses, lenses, strict=True)]
         advised_camera = min(range(len(lenses)), key=lambda c: badly[c])
         own = lenses[advised_camera]
         return replace(
-            message,
+            advice,
             words=own.words if len(lenses) == 1 else f"{self.names[advised_camera]}: {own.words}",
             worth=max(
                 [
@@ -153,37 +153,37 @@ class RigGuide:
             targets=tuple(a.target_px if c == advised_camera and not a.waits else None for c, a in enumerate(lenses)),
         )
 
-    def _of_mount(self, message: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
+    def _of_mount(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation]) -> RigAdvice:
         """Return what the camera whose mount is least sure says."""
-        c = message.advised_camera
+        c = advice.advised_camera
         if c not in self._asked:
             self._asked[c] = self._shared_target(c)
         words, targets = self._asked[c]
-        return replace(message, words=words, targets=tuple(targets), worth=self._mount_gain(c, frame_observations))
+        return replace(advice, words=words, targets=tuple(targets), worth=self._mount_gain(c, frame_observations))
 
-    def _of_rig(self, message: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
+    def _of_rig(self, advice: RigAdvice, frame_observations: Sequence[FrameObservation], *, photo: bool) -> RigAdvice:
         """Return what the rig's calibration says, once lenses and mounts seem good enough."""
         self._go_on()
         steady = self._whole.steady(len(self.frames))
         if steady is None:
-            return replace(message, words=CHECKING, waits=True)
+            return replace(advice, words=CHECKING, waits=True)
         if self._whole.latest is None:
-            return self._of_mount(replace(message, advised_camera=1), frame_observations)
+            return self._of_mount(replace(advice, advised_camera=1), frame_observations)
         try:
             known = self._known_by(self._whole.latest)
         except DegenerateError as error:
-            return replace(message, words=str(error))
-        message = replace(message, left=known.left, gain=known.plan.gain)
+            return replace(advice, words=str(error))
+        advice = replace(advice, left=known.left, gain=known.plan.gain)
         would_do = known.reached or known.plan.gain < MIN_GAIN_TO_CONTINUE
         if steady and would_do:
-            return replace(message, words=enough_words(known.left, known.plan.gain), enough=True)
+            return replace(advice, words=enough_words(known.left, known.plan.gain), enough=True)
         words, targets = known.target()
         if would_do:
             words = f"One more, to see that it is steady: {words[0].lower()}{words[1:]}"
         frame = [frame_observation.view for frame_observation in frame_observations]
         new = any(view is not None and not lens.repeats(view) for lens, view in zip(self.lenses, frame, strict=True))
         worth = known.worth(frame, photo=photo) if new else 0.0
-        return replace(message, words=words, targets=tuple(targets), worth=worth)
+        return replace(advice, words=words, targets=tuple(targets), worth=worth)
 
     def _rig_is_enough(self, lenses: Sequence[Advice]) -> bool:
         """Say whether the rig's calibration says so although some lens alone does not, as cameras help each other."""

@@ -27,8 +27,8 @@ def brief(self: Any) -> str:
 
     Classes take it as their `__repr__`.
     """
-    message = [f"{field.name}={_value(getattr(self, field.name))}" for field in fields(self)]
-    words = ", ".join(message)
+    values = [f"{field.name}={_value(getattr(self, field.name))}" for field in fields(self)]
+    words = ", ".join(values)
     if len(words) > MAX_TOGETHER:
         words = words[: words.rindex(",", 0, MAX_TOGETHER)] + ", ..."
     return f"{type(self).__name__}({words})"

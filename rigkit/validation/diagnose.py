@@ -128,14 +128,14 @@ def _best_stretch(camera: Camera, detections: Sequence[BoardDetection], boards: 
 
 def diagnose_squares(fitting: Sequence[FittingSquares]) -> tuple[str, ...]:
     """Return which board of a pair, which fitted nowhere as declared, has squares of another size; empty for none."""
-    message = []
+    sizes = []
     for one in fitting:
         ids, declared_mm = [f"'{board.board_id}'" for board in one.boards], one.boards[0].square_x_mm
         of = f"board {ids[0]}" if len(ids) == 1 else f"one of {', '.join(ids)}, {one.where} in image 1,"
-        message.append(
+        sizes.append(
             f"{of} would fit the others with squares of {one.factor * declared_mm:.1f} mm ({declared_mm:g} is declared)"
         )
-    return (f"{', or '.join(message)}; measure them again",) if message else ()
+    return (f"{', or '.join(sizes)}; measure them again",) if sizes else ()
 
 
 def diagnose(reports: Sequence[ValidationReport]) -> tuple[str, ...]:

@@ -306,8 +306,8 @@ def _through_its_blur(grey: GreyImage, draft: _Draft) -> _Draft:
         beside = bool((half_gap_px < NEAR_BESIDE * draft.fit.blur_px).any())
         uneven = _uneven(draft)
         change = float(np.linalg.norm(uneven - draft.uneven_px2))
-        told = change < MIN_UNEVEN * float(np.median(draft.fit.blur_px)) ** 2
-        if told and not grown and (not beside or done == BLUR_ROUNDS - 1):
+        settled = change < MIN_UNEVEN * float(np.median(draft.fit.blur_px)) ** 2
+        if settled and not grown and (not beside or done == BLUR_ROUNDS - 1):
             break
         fitted = _again(grey, replace(draft, uneven_px2=uneven), beside=beside)
         if not _enough(fitted):

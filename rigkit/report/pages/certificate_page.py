@@ -97,10 +97,10 @@ def certificate_pdf(
     certificate: Certificate, title: str, provenance: Mapping[str, str], limit: float | None = None
 ) -> bytes:
     """Return the certificate as one sheet of A4 with room for a signature."""
-    message = certificate_facts(certificate, limit)
-    verdict = "" if message.passed is None else f"{message.badge.upper()}. "
+    page = certificate_facts(certificate, limit)
+    verdict = "" if page.passed is None else f"{page.badge.upper()}. "
     facts = [f"{name}: {fact}" for name, fact in {**basis(certificate), **provenance}.items()]
-    return sheet_pdf(certificate, title, [f"{verdict}{message.headline}.", *message.sentences], facts)
+    return sheet_pdf(certificate, title, [f"{verdict}{page.headline}.", *page.sentences], facts)
 
 
 def basis(certificate: Certificate) -> dict[str, str]:

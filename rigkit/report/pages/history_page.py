@@ -53,15 +53,15 @@ def history_facts(entries: Sequence[HistoryEntry]) -> PageFacts:
 
 def overwritten(kept: Sequence[Edition]) -> tuple[str, ...]:
     """Return which calibrations were replaced by others of the same name, in sentences."""
-    message = []
+    lines = []
     for watched in dict.fromkeys(edition.watched for edition in kept if edition.several):
         own = [edition for edition in kept if edition.watched == watched]
         since = " and ".join(edition.entries[0].date[:10] for edition in own[1:])
-        message.append(
+        lines.append(
             f"{watched} is another file since the entry of {since}: amounts are changes of what it held then, and each "
             "is drawn by itself."
         )
-    return tuple(message)
+    return tuple(lines)
 
 
 def history_page(entries: Sequence[HistoryEntry], title: str, provenance: Mapping[str, str]) -> str:

@@ -34,16 +34,16 @@ def judge_since(monitored: Monitored, before: Look, look: Look, cost: Sequence[G
     Raises DegenerateError where the frames of before do not go together with the cameras at all.
     """
     trusted, now, change = monitored, monitored, np.zeros(monitored.layout.count)
-    first = message = before(monitored)
+    first = evidence = before(monitored)
     for k in range(CORRECTIONS):
-        message = before(now)
-        wider = _Disagreement.of(message, look(now))
-        whitened = Whitened.of(trusted, wider.of_frames(message))
+        evidence = before(now)
+        wider = _Disagreement.of(evidence, look(now))
+        whitened = Whitened.of(trusted, wider.of_frames(evidence))
         if k == 0:
             score = whitened.score
             beyond = float(score @ np.linalg.solve(whitened.covariance, score)) - len(score)
             trusted = replace(monitored, covariance=max(beyond, 1.0) * monitored.covariance)
-            whitened = Whitened.of(trusted, wider.of_frames(message))
+            whitened = Whitened.of(trusted, wider.of_frames(evidence))
         gain = np.linalg.solve(whitened.covariance, whitened.by_theta @ trusted.covariance).T
         change = gain @ (whitened.score + whitened.by_theta @ change)
         now = monitored.changed(change)
@@ -65,27 +65,27 @@ class _Disagreement:
         """Return that of frames of several times, between which something may have changed."""
         count = times[0].score.shape[1]
         information, score = [], []
-        for k, message in enumerate(times):
+        for k, evidence in enumerate(times):
             own = slice(k * count, (k + 1) * count)
             each = (
-                np.zeros((len(message.score), len(times) * count, len(times) * count)),
-                np.zeros((len(message.score), len(times) * count)),
+                np.zeros((len(evidence.score), len(times) * count, len(times) * count)),
+                np.zeros((len(evidence.score), len(times) * count)),
             )
             each[0][:, own, own], each[1][:, own] = (
-                message.information / message.variance_px2,
-                message.score / message.variance_px2,
+                evidence.information / evidence.variance_px2,
+                evidence.score / evidence.variance_px2,
             )
             information.append(each[0])
             score.append(each[1])
         return cls(*disagreement(np.concatenate(information), np.concatenate(score)))
 
-    def of_frames(self, message: FreshEvidence) -> FreshEvidence:
+    def of_frames(self, evidence: FreshEvidence) -> FreshEvidence:
         """Return what frames say, counted so much less."""
         if self.ratio <= 1.0:
-            return message
+            return evidence
         return replace(
-            message,
-            variance_px2=self.ratio * message.variance_px2,
-            overdispersion=float(np.sqrt(self.ratio)) * message.overdispersion,
-            freedom=min(self.freedom, message.freedom),
+            evidence,
+            variance_px2=self.ratio * evidence.variance_px2,
+            overdispersion=float(np.sqrt(self.ratio)) * evidence.overdispersion,
+            freedom=min(self.freedom, evidence.freedom),
         )

@@ -215,12 +215,12 @@ def rig_from(
         raise InputError(f"{session.path}: {causes[0]} ({error})") from error
     rig = named_by_rule(session, rig)
     if not session.rigid_boards:
-        message = [
+        ties = [
             s
             for (_, own), c in zip(views.items(), rig.single, strict=True)
             for s in suggest_ties([v for _, v in own], c)
         ]
-        rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(message)))
+        rig = replace(rig, verdicts=(*rig.verdicts, *dict.fromkeys(ties)))
     if rig.verdicts[0].severity is Severity.BAD:
         wrong = [Finding.bad(words) for words in _misread(session)]
         rig = replace(rig, verdicts=(rig.verdicts[0], *wrong, *rig.verdicts[1:]))
