@@ -155,7 +155,11 @@ def rectify_stereo_images(
     *,
     progress: Progress = silent,
 ) -> RectificationResult:
-    """Write images taken at once by two cameras of a rig so that a point has the same row in both.
+    """Write images taken at once by two cameras of a rig so that a point has the same row in both. Pairs of which an
+    image cannot be read or is missing are left out, as by `rectify_image`.
+
+    Raises InputError: cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be
+    written.
 
     Parameters
     ----------
@@ -166,9 +170,6 @@ def rectify_stereo_images(
     rig : file of the rig, ours or another tool's.
     options : the view, without angles or a size.
     names : the two cameras; None: the rig's first two.
-
-    Pairs of which an image cannot be read or is missing are left out, as by `rectify_image`. Raises InputError for
-    cameras that are not there, angles or a size of the view, a damaged rig, or a file that cannot be written.
     """
     if options.hfov_deg is not None or options.size_px is not None or any(options.angles_deg):
         raise InputError("rectify: the baseline decides the view of a stereo pair; leave out its angles and its size")
