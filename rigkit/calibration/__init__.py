@@ -1,38 +1,36 @@
-"""Camera and rig calibration from views of boards: `calibrate.py` runs it all, in this order.
+"""Calibration of a camera or a rig from views of boards. `calibrate.py` runs these steps in order:
 
-- `views`: what can be used (`usable`), as arrays (`observations`), and what is left out together (`repeats`, `folds`)
-- `solving`: a start (`radial_alignment`, `initialise`, `poses`), then one model by least squares (`state`, `shape`,
-  `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`) with its covariance
-  (`clustered`)
-- `choosing`: which end of a board is which (`board_orientation`), which model and which board shape (`heldout`,
-  `choice`, `models_tried`, `lens_choice`, `one_model`); `between_models` says what that leaves open, `begun` keeps it
-  for a rig
-- `certainty`, how sure that is: `covariance`, `uncertainty`, `departures`, `series`, `displaced`; `coverage` says where
-  boards were
-- `judging`: `captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`, `pupil` (with `view_evidence` and
-  `neighbours`), `verdicts`
-- what comes out: `assemble`, `result` (with `board_shape`, `pupil`)
-- again with a pupil that moves, where the images ask for it: `with_pupil`
+- `views`: the usable views (`usable`) as arrays (`observations`), and the folds of the cross-validation (`folds`,
+  with near-duplicate images in one fold: `repeats`)
+- `solving`: initial values (`radial_alignment`, `initialise`, `poses`), then least squares for one camera model
+  (`state`, `shape`, `camera_prior`, `evidence`, `linearise`, `normal_equations`, `solver`, `outliers`, `fit`) with a
+  cluster-robust covariance (`clustered`)
+- `choosing`: model selection by held-out error (`heldout`, `choice`, `models_tried`, `lens_choice`, `one_model`), the
+  uncertainty that it leaves (`between_models`), boards numbered from the other end (`board_orientation`), and what a
+  rig takes over from its cameras (`begun`)
+- `certainty`: uncertainty of parameters and projection (`covariance`, `uncertainty`), model inadequacy (`departures`,
+  `series`, `displaced`), and which part of the image the boards covered (`coverage`)
+- `judging`: diagnosis of images, residuals and result (`captured`, `moved`, `changing`, `mixed`, `turned`, `two_kinds`,
+  `pupil`, with `view_evidence` and `neighbours`), summarised by `verdicts`
+- the result: `assemble`, `result` (with `board_shape`, `pupil`)
+- a second calibration with a moving entrance pupil, where the residuals indicate one: `with_pupil`
 
-What a calibration is called on its way::
+Classes, in the order in which a calibration makes them::
 
-    what was asked for                                  Request              choosing/models_tried
-    a model, of one size, that is to be fitted          ModelInQuestion      choosing/models_tried
-    solved by least squares                             Fit                  solving/fit
-    one of several, with its held-out errors            FittedModel          choosing/choice
-    the best size and board shape of one model          ModelOutcome         choosing/one_model
-    a camera with all of these, before it is decided    BegunCalibration     choosing/begun
-    the model that it gets, of all or with its twins    ModelChoice          choosing/lens_choice
-    another that images support as well, with poses     RivalFit             choosing/between_models
-    the result                                          Calibration          result
-    what the result says of each FittedModel            Candidate            result
-    what it says of each RivalFit                       Rival                result
+    options of `calibrate`                                  Request            choosing/models_tried
+    camera model of one size, to be fitted                  ModelInQuestion    choosing/models_tried
+    least-squares solution                                  Fit                solving/fit
+    fitted model with its held-out error                    FittedModel        choosing/choice
+    best size and board shape of one camera model           ModelOutcome       choosing/one_model
+    camera with all its models fitted, none chosen yet      BegunCalibration   choosing/begun
+    model chosen, alone or together with like cameras       ModelChoice        choosing/lens_choice
+    other model that the images support about as well       RivalFit           choosing/between_models
+    result                                                  Calibration        result
+    summary of a FittedModel in the result                  Candidate          result
+    summary of a RivalFit in the result                     Rival              result
 
-`compare` tells two calibrations separation; `posed` and `hand_eye` are for a camera that is known.
+`compare` compares two calibrations; `posed` and `hand_eye` work with a camera that is known.
 
-`rig` does the same for several cameras. Each formula that both need stands here once, and does not ask which it is.
-`solving` has steps, priors, steps between poses and the squares of what was left out; `clustered` what repeats;
-`covariance` covariances and the boards' mean motion. `uncertainty` and `displaced` have how a lens follows another, and
-what it may do beyond its model. A file of `rig` that is called as one here has only what a rig does there besides, or
-instead.
+`rig` calibrates several cameras together. A module of `rig` holds only what differs from the module of the same name
+here; formulas that one camera and a rig share are here.
 """

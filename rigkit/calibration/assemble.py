@@ -1,4 +1,4 @@
-"""Putting a solved model together as a result: residuals, covariances, outliers."""
+"""The result of a solved model: residuals, covariances, outliers."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from rigkit.core.errors import DegenerateError
 from rigkit.geometry.rigid3 import Rigid3
 
 UNKNOWN_SHARE = 0.05
-"""A projection that is uncertain by this part of the image's width, where the boards were, is not determined."""
+"""The camera is not determined where the projection is uncertain by this part of the image's width at the corners."""
 MIN_RESULT_SIGMA_PX = 0.02
-"""No corner is better than this: keeps data without noise from looking determined by rounding."""
+"""Smallest standard deviation of a corner in that test: exact data would pass it by rounding errors alone."""
 
 
 def assemble(
@@ -36,7 +36,7 @@ def assemble(
     candidates: tuple[Candidate, ...],
     rivals: Sequence[RivalFit] = (),
 ) -> Calibration:
-    """Return the result, without verdicts; `rivals` are other lenses that the images support about as well."""
+    """Return the result without verdicts; `rivals` are other models that the images support about as well."""
     state, sigma = fit.state, fit.sigma_px
     covariance, clustered = _covariance(observations, fit)
     covariance += between_models(observations, fit, rivals, np.sqrt(np.diag(covariance)[:-6]))
@@ -63,10 +63,10 @@ def assemble(
 
 
 def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clustered]:
-    """Return the covariance of the parameters and of the mean motion of the boards, (P + 6, P + 6), with the images as
-    the independent units, and what the images said."""
+    """Return the covariance (P + 6, P + 6) of the parameters and the boards' mean motion, with images as the
+    independent units, and the cluster-robust estimate that it comes from."""
     p = fit.state.camera.parameters.size
-    # A warp may hide in the lens: an aspect ratio of the board in that of the pixels.
+    # The boards' warps belong to the shared unknowns: the aspect ratio of a board correlates with that of the pixels.
     n = p + fit.state.shape.basis.shape[-1]
     unit = fit.normal.covariance[0][:n, :n]
     variance = np.diag(unit)
@@ -79,7 +79,7 @@ def _covariance(observations: Observations, fit: Fit) -> tuple[FloatArray, Clust
 
 
 def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
-    """Return the corners that a fit leaves out."""
+    """Return the outliers of a fit."""
     out = []
     for i, j in np.argwhere(observations.present & ~fit.kept).tolist():
         view = observations.views[i]
@@ -91,9 +91,11 @@ def outliers_of(observations: Observations, fit: Fit) -> tuple[Outlier, ...]:
 
 
 def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
-    """Raise DegenerateError where the views leave the lens open, even at the corners that they have: `at_corners_px` is
-    the uncertainty there. How much a wrong model makes the images disagree, and how well they tell that, says nothing
-    about it."""
+    """Raise DegenerateError where the views do not determine the lens.
+
+    `at_corners_px` is the uncertainty of the projection at the corners. Its factors for overdispersion and few degrees
+    of freedom are taken out: they measure the misfit of the model, not the geometry of the views.
+    """
     sigma = float(np.nanmedian(at_corners_px)) if np.isfinite(at_corners_px).any() else np.inf
     sigma /= result.overdispersion * result.widening
     if result.sigma_px > 0.0:
@@ -108,13 +110,13 @@ def require_determined(result: Calibration, at_corners_px: FloatArray) -> None:
 def view_results(
     observations: Observations, state: State, residuals: Residuals, kept: BoolArray
 ) -> tuple[ViewResult, ...]:
-    """Return what is said of each view; residuals of corners that do not project are NaN."""
+    """Return the result of each view; residuals of corners that do not project are NaN."""
     px = np.where(residuals.valid[..., None], residuals.px, np.nan)
     return ViewResult.of_views(observations.views, Rigid3.stack(state.rotation, state.translation_mm), px, kept)
 
 
 def board_shapes(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> tuple[BoardShape, ...]:
-    """Return the boards that the views show, as the shape's unknowns have them."""
+    """Return the shapes of the boards in the views."""
     points, first_row = shape.points(unknowns), observations.first_row
     return tuple(
         BoardShape.of(observations.boards[b], shape.kind, points[first_row[b] : first_row[b + 1]])

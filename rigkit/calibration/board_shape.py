@@ -1,4 +1,4 @@
-"""The shape of a board as a calibration has it."""
+"""The solved shape of a board."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rigkit.core.boards import Board
 from rigkit.core.errors import InputError
 
 MAX_OFF_LATTICE = 0.25
-"""Of a square: the corners of a board stand nearer to where they belong, however it is bent."""
+"""Of a square: corners of a real board, however bent, are within this distance of the best flat lattice."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardShape:
-    """A board's corners as the solution has them.
+    """The solved corners of a board.
 
     Attributes
     ----------
@@ -24,8 +24,8 @@ class BoardShape:
     kind : "flat", "warp" (print scale and a low-order bow) or "released" (every corner free under a prior).
     points_mm : (columns * rows, 3) corners in the board frame, row by row.
     bow_mm : largest departure from a plane.
-    aspect : how much longer the squares are along x than stated, against y (0.001: by 0.1 %).
-    declared : the board as it was declared; None in a calibration read from a file of before files said so.
+    aspect : ratio of the stretches along x and along y against the declared squares, minus 1.
+    declared : the declared board; None in a calibration read from an old file, which does not contain it.
     """
 
     board_id: str
@@ -50,7 +50,7 @@ class BoardShape:
 
     @classmethod
     def of(cls, board: Board, kind: str, points_mm: Points) -> BoardShape:
-        """Return the shape of `board` with its corners at `points_mm`, bow and aspect from them."""
+        """Return the shape of `board` with its corners at `points_mm` (N, 3), bow and aspect computed from them."""
         if kind == "flat":
             return cls(board.board_id, kind, points_mm, declared=board)
         centred = points_mm - points_mm.mean(axis=0)
@@ -60,7 +60,7 @@ class BoardShape:
         return cls(board.board_id, kind, points_mm, bow, along_x / along_y - 1.0, board)
 
     def at(self, grid: IntArray) -> Points:
-        """Return the corners (N, 3) at places of the grid (N, 2), column and row."""
+        """Return the corners (N, 3) at grid places (N, 2), (column, row)."""
         return np.asarray(self.points_mm[grid @ np.array([1, self.column_count])])
 
     @property
@@ -70,8 +70,8 @@ class BoardShape:
 
     @property
     def board(self) -> Board:
-        """The flat board nearest to the corners as the solution has them. Of one that no file declares it is known that
-        its corners stand row by row, and no more: a chessboard."""
+        """The flat board that fits the solved corners best. One without a declaration is taken for a chessboard whose
+        corners are listed row by row."""
         if self.declared is None:
             return _chessboard_of(self.board_id, self.points_mm)
         named = replace(self.declared, board_id=self.board_id)
@@ -82,7 +82,7 @@ class BoardShape:
 
 
 def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
-    """Return how much longer a board with its points at (N, 3) mm is than stated, along x and along y."""
+    """Return the stretch factors along x and along y of points (N, 3) mm against the declared board."""
     centred = points_mm - points_mm.mean(axis=0)
     flat = board.points() - board.points().mean(axis=0)
     along_x, along_y = (flat * centred).sum(axis=0)[:2] / (flat**2).sum(axis=0)[:2]
@@ -90,7 +90,7 @@ def _stretch(board: Board, points_mm: Points) -> tuple[float, float]:
 
 
 def _chessboard_of(board_id: str, points_mm: Points) -> Board:
-    """Return the chessboard whose corners these are, row by row; raises InputError where they are no lattice."""
+    """Return the chessboard with corners `points_mm` (N, 3), row by row; raises InputError if they are no lattice."""
     back = np.flatnonzero(np.diff(points_mm[:, 0]) < 0.0)
     columns = int(back[0]) + 1 if len(back) else len(points_mm)
     rows = len(points_mm) // max(columns, 1)

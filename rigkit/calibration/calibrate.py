@@ -1,8 +1,8 @@
-"""Calibrating one camera from views of chessboards, without any guess.
+"""Calibration of one camera from views of boards, without initial values.
 
-Every model (degree, board shape) in question is fitted; what is chosen is the one with the fewest numbers among those
-whose held-out error is as good as the smallest. All are compared on the same corners. Boards that are not flat bend the
-lenses to themselves: lenses are compared on flat boards first, and again on boards as they were found.
+Every candidate model (its degree, the boards' shape) is fitted to the same corners. Chosen is the one with the fewest
+parameters among those whose held-out error is as good as the smallest. A board that is not flat biases the lens, and
+not every model alike: models are compared with flat boards first, and again with the board shapes that were found.
 """
 
 from __future__ import annotations
@@ -54,23 +54,24 @@ def calibrate(
 
     Parameters
     ----------
-    views : boards as they were seen; several boards in one image are several views of one image name.
+    views : detected boards; several boards in one image are several views with the same image name.
     size_px : (width, height) of the images.
     model : name of a camera model, or "auto": all of them, chosen by held-out error.
-    degree : size of a model that comes in several (degree of "scaramuzza", terms of "brown"); by default chosen by
-        held-out error.
+    degree : size of a model that has several (degree of "scaramuzza", terms of "brown"); by default chosen by held-out
+        error.
     board : "flat", "warp", "released", or "auto": chosen by held-out error.
-    folds : of the cross-validation over images; 0 for none: choices then rest on BIC, halves are not compared, and that
-        another model may show the images as well is not in the sigmas, which are too small beyond the boards.
-    pupil : "auto": the lens is central, but where residuals say that its entrance pupil moves, and images that took no
-        part are shown better with it, that is two more unknowns (`Calibration.pupil`); "central": never; "moving":
-        always.
-    progress : told of the models tried.
+    folds : number of folds of the cross-validation over images. 0 disables it: BIC then selects the model, a lens that
+        moved between images is not looked for, and the sigmas do not include the uncertainty of the model selection,
+        so that they are too small outside the part of the image that boards covered.
+    pupil : "central": all rays meet in one point; "moving": the entrance pupil moves along the axis with the angle, two
+        more parameters (`Calibration.pupil`); "auto": moving where the residuals indicate it and the held-out error
+        confirms it.
+    progress : called with the stage and the counts of models done and in all.
 
     Raises
     ------
     InputError
-        No view, corners outside the image, unknown model, board shape or pupil, a number of folds without a meaning.
+        No view, corners outside the image, an unknown model, board shape or pupil, or an invalid number of folds.
     DegenerateError
         The views do not determine the camera.
     """
@@ -87,9 +88,12 @@ def calibrate_together(
     known: Sequence[BegunCalibration] = (),
     progress: Progress = silent,
 ) -> list[Calibration]:
-    """Return the calibration of each of the cameras of a rig, (name, views, what is asked for) each: alone, but the
-    models that "auto" asks for are chosen together where cameras are alike. What was `known` before of the same views
-    is not done again. Errors as of `calibrate`, with the name (none for "")."""
+    """Return the calibration of each camera of a rig, given as (name, views, options).
+
+    Each is calibrated by itself, but like cameras (`twins`) choose among the models of "auto" together. `known` are
+    earlier calibrations; one of the same views and options is not repeated. Raises as `calibrate`, with the camera's
+    name in the message unless it is "".
+    """
     begun = []
     for k, (name, views, request) in enumerate(cameras):
         progress("cameras", k, len(cameras))
@@ -103,13 +107,13 @@ def calibrate_together(
 
 
 def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
-    """Return the calibrations of cameras that are alike, or of one."""
+    """Return the calibrations of a group of like cameras."""
     tried = [one.tried for one in group]
     choices = choose_lenses(tried)
     found = [one.solved(choice.model) for one, choice in zip(group, choices, strict=True)]
     several = any(len(models_of(options)) > 1 for options in tried)
     if several and any(one.chosen.fit.state.shape.kind != "flat" for one in found):
-        # Boards that are not flat bend the lenses to themselves: as they were found, another one may be the better.
+        # A board that is not flat biases the lens: with the shapes found, another model may be the best one.
         names = best_sizes(tried)
         on_boards = [begun.on_boards(choice.model, names) for begun, choice in zip(group, choices, strict=True)]
         others = choose_lenses(on_boards)
@@ -133,10 +137,10 @@ def _finish(group: Sequence[BegunCalibration]) -> list[Calibration]:
 
 
 def _better(found: Sequence[ModelOutcome], again: Sequence[ModelOutcome]) -> bool:
-    """Say whether cameras that are alike are better off with the model that they were solved with again."""
+    """Return whether like cameras have a lower held-out error in `again` than in `found`."""
     pairs = [on_same_images(now, then, ("found", "again")) for now, then in zip(found, again, strict=True)]
     if any(option.heldout is not None and len(option.heldout) < 2 for pair in pairs for option in pair):
-        return False  # Nothing can be compared.
+        return False  # The standard error of a difference needs two images.
     if len(pairs) == 1:
         return choose(pairs[0], MIN_SIGMAS).name == "again"
     return HeldOut.of(pairs).chosen() == "again"
@@ -149,7 +153,7 @@ def _result(
     rivals: Sequence[FittedModel],
     likely: Mapping[str, float],
 ) -> Calibration:
-    """Return the result of a camera with its verdicts; with a pupil that moves where the lens has one."""
+    """Return the result of a camera with its verdicts, with a moving pupil where that is asked for or confirmed."""
     central, request = _with_verdicts(begun, found, tried, rivals, likely), begun.request
     if request.pupil == "central" or (request.pupil == "auto" and not may_move(central)):
         return central
@@ -181,12 +185,12 @@ def _with_verdicts(
     rivals: Sequence[FittedModel],
     likely: Mapping[str, float],
 ) -> Calibration:
-    """Return the result of a camera as it was solved for, with its verdicts."""
+    """Return the result of one solution with its verdicts."""
     request, fit = begun.request, found.chosen.fit
     others = _others(tried, far_camera(fit.state.camera).model) if len(models_of(tried)) > 1 else []
     close = rival_fits(found.observations, fit, rivals, likely)
     if not begun.name:
-        # What shape boards have is a question to all cameras of a rig together, which holds lenses by what each knows.
+        # In a rig all cameras together choose the boards' shapes.
         close += rival_shapes(found.chosen, found.shapes)
     result = assemble(
         found.observations,
@@ -198,16 +202,20 @@ def _with_verdicts(
     )
     in_force = [name for name, value in (("model", request.model), ("board_shape", request.board)) if value == "auto"]
     moved = moved_lens(found.observations, fit) if request.folds else ()
-    also = [*moved, *_at_the_end(found.beyond, result, in_force)]
-    far, clusters = _determined(result), found.observations.clusters()
-    solved_for = found.observations, fit
-    order = begun.observations.images
-    verdicts = judge(result, also, far=far, clusters=clusters, in_force=in_force, solved=solved_for, order=order)
+    verdicts = judge(
+        result,
+        [*moved, *_largest_size_chosen(found.beyond, result, in_force)],
+        far=_determined(result),
+        clusters=found.observations.clusters(),
+        in_force=in_force,
+        solved=(found.observations, fit),
+        order=begun.observations.images,
+    )
     return replace(result, verdicts=verdicts)
 
 
 def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
-    """Return the lenses tried but those of the `model` chosen, against the best of those."""
+    """Return as candidates the options of other camera models than `model`, compared with the best option of it."""
     own = [option for option in tried if option.model == model]
     if not own:
         return []
@@ -216,16 +224,16 @@ def _others(tried: Sequence[FittedModel], model: str) -> list[Candidate]:
 
 
 def _determined(result: Calibration) -> FarProjection:
-    """Return how sure the result is far away; raises DegenerateError where the views do not determine the camera."""
+    """Return the uncertainty of the projection; raises DegenerateError where the views do not determine the camera."""
     far = FarProjection.of(result, from_boards=True)
     require_determined(result, far.of_parameters_px)
     return far
 
 
-def _at_the_end(
+def _largest_size_chosen(
     beyond: Sequence[tuple[str, type[Camera], int | None]], result: Calibration, in_force: Sequence[str]
 ) -> list[Finding]:
-    """Say that the lens may ask for more than the model has, where the largest size of all is the best."""
+    """Return a finding where the largest size of the model was chosen: the lens may need a larger one."""
     if not beyond or "model" in in_force or not any(c.name == beyond[-1][0] and c.chosen for c in result.candidates):
         return []
     return [

@@ -1,8 +1,8 @@
-"""Two calibrations: is their difference what their uncertainties predict, or are these two cameras?
+"""Test whether two calibrations are of one unchanged camera: is their difference what their uncertainties predict?
 
-A camera calibrated from boards alone has a free rotation, which the boards' poses take up. So the difference is taken
-after the best rotation, over the pixels where both had boards, and what is predicted for it from the two covariances is
-taken over the same pixels, with the same three rotations projected out.
+A camera calibrated from boards alone has a free rotation, which the boards' poses absorb. So the difference is computed
+after the best rotation, over the pixels that boards covered in both. The difference predicted from the two covariances
+is computed over the same pixels, with the same three rotations projected out.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ import numpy as np
 
 from rigkit.calibration.certainty.coverage import covered_by_boards
 from rigkit.calibration.certainty.uncertainty import projection_design
+from rigkit.calibration.choosing.between_models import same_model
 from rigkit.calibration.result import Calibration
 from rigkit.calibration.solving.clustered import NULL_DRAWS, drawn_errors
 from rigkit.cameras.base import Camera, image_center
 from rigkit.cameras.compare import CameraDifference, compare_cameras, grid_pixels
 from rigkit.cameras.convert import refit_camera
-from rigkit.core.arrays import FloatArray, Pixels
+from rigkit.core.arrays import FloatArray, Pixels, Rays
 
 REFIT_SIGMA = 0.5
-"""What the models make of one lens is known from a refit to about half: poses and noise had their part in the fits."""
+"""Relative standard deviation of the difference between models that a refit gives: noise and poses affect the fits."""
 SAME_CHANCE = 0.01
-"""A difference this unlikely for one and the same camera is no chance."""
+"""Significance level: a difference less probable than this for one camera is not chance."""
 COVARIANCE_FLOOR_PX = 0.05
-"""Of no combination of the parameters does a covariance from images know that it moves the projection by less."""
+"""Smallest standard deviation of a mode of the projection: a covariance from images is not more accurate than that."""
 TYPICAL_SHARE = 0.9
-"""Part of the differences of one and the same camera that is called usual."""
+"""Part of the differences of one camera between the limits `usual_px`."""
 IMPORTANT_PX = 0.1
-"""What is smaller is of no importance, however surely it is there: corners of real images are hardly better."""
+"""A smaller difference is of no importance, however significant: corners of real images are hardly better."""
 
 
 class CameraVerdict(StrEnum):
-    """What a difference means."""
+    """Meaning of a difference."""
 
     SAME = "no contradiction"
     UNIMPORTANT = "differs by more than chance, of no importance"
@@ -44,16 +45,15 @@ class CameraVerdict(StrEnum):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CalibrationComparison:
-    """The difference of two calibrations beside what their uncertainties predict.
+    """The difference of two calibrations, and the one that their uncertainties predict.
 
     Attributes
     ----------
-    difference : where both had boards, after the best rotation.
-    predicted_px : the usual rms difference of two calibrations of one camera, there and after the best rotation: half
-        of them differ by more. A difference is mostly of one kind (the focal length, which the distances of the boards
-        take up): it scatters like the size of a single number, by several times, and its mean square is that of a few
-        large ones.
-    usual_px : between these lie nine of ten: what is larger than the second has a chance of less than one in ten.
+    difference : over the pixels that boards covered in both, after the best rotation.
+    predicted_px : median of the rms difference of two calibrations of one camera, over the same pixels and after the
+        best rotation. The mean square would be dominated by a few large differences: most of a difference is one mode
+        (the focal length, which correlates with the boards' distances), so that it varies like a single number.
+    usual_px : limits that contain 90 % of such differences; one above the second has a probability below 0.1.
     chance : probability of a difference at least this large if both were calibrations of the same, unchanged camera,
         each in its own model.
     same_model : both are of one model and size.
@@ -67,7 +67,7 @@ class CalibrationComparison:
 
     @property
     def ratio(self) -> float:
-        """The rms difference over the one predicted: about 1 for one and the same camera."""
+        """The rms difference over the one predicted: about 1 for one camera."""
         return self.difference.rms_px / max(self.predicted_px, np.finfo(float).tiny)
 
     @property
@@ -78,7 +78,7 @@ class CalibrationComparison:
 
     @property
     def same(self) -> bool:
-        """Nothing says that these are two cameras, or that the lens moved by anything of importance."""
+        """Whether no important difference is significant."""
         return self.verdict is not CameraVerdict.OTHER
 
 
@@ -87,15 +87,15 @@ def compare_calibrations(
 ) -> CalibrationComparison:
     """Compare two calibrations over the image of `a`.
 
-    Raises InputError or DegenerateError where the images differ in size, or the boards of the two had too little of it
-    in common.
+    Raises InputError or DegenerateError where the images differ in size, or the boards of both covered too few common
+    pixels.
 
     Notes
     -----
-    The null distribution of the difference is sampled: both calibrations' errors are drawn from their covariances
-    (Student's t with the degrees of freedom that these have) and turned into differences by the projection's
-    derivatives. Models of different kinds or sizes show one lens differently, which no covariance knows: that
-    difference, from each camera refitted as the other is modelled, is a part of the null.
+    The null distribution of the difference is sampled: errors of both calibrations are drawn from their covariances
+    (Student's t with their degrees of freedom) and propagated by the projection's derivatives. Models of different kind
+    or size differ for one lens, which no covariance includes: that difference is computed by refitting each camera with
+    the model of the other, and added to the null.
     """
     pixels = grid_pixels(a.camera.size_px, grid)
     both = covered_by_boards(a, pixels) & covered_by_boards(b, pixels)
@@ -105,7 +105,7 @@ def compare_calibrations(
     designs = [_design(a, rays), _design(b, rays @ difference.b_from_a.T)]
     # The rotation that the comparison fits, at first order. In two calibrations of one camera both are the same.
     turn = np.linalg.qr(designs[0][:, -3:])[0]
-    by_model = _by_model(a, b, difference, turn)[:, None]
+    by_model = _model_difference(a, b, difference, turn)[:, None]
     p = a.camera.parameters.size
     rng = np.random.default_rng(seed)
     drawn = np.concatenate(
@@ -125,21 +125,20 @@ def compare_calibrations(
         covariance,
         drawn,
     )
-    chance, unusual = found.chance([_without(step, turn) for step in _touched(a.camera, pixels)])
+    chance, unusual = found.chance([_without(step, turn) for step in _lens_changes(a.camera, pixels)])
     typical = np.sqrt(np.quantile((found.null**2).sum(axis=0), (1.0 - TYPICAL_SHARE - unusual, 0.5, 1.0 - unusual)))
     low, median, high = typical.tolist()
-    same_model = _kind(a.camera) == _kind(b.camera)
-    return CalibrationComparison(difference, median, (low, high), chance, same_model)
+    return CalibrationComparison(difference, median, (low, high), chance, same_model(a.camera, b.camera))
 
 
 def _without(column: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return differences (2 N,) or (2 N, K) without what the rotation `turn` (2 N, 3), of orthonormal columns, does."""
+    """Return differences (2 N,) or (2 N, K) with the rotations `turn` (2 N, 3), orthonormal columns, projected out."""
     return np.asarray(column - turn @ (turn.T @ column))
 
 
-def _touched(camera: Camera, pixels: Pixels) -> list[FloatArray]:
-    """Return what happens to lenses, as ways to differ (2 N, K) at pixels (N, 2): focus or zoom make the image larger
-    about the principal point; lens or sensor shift."""
+def _lens_changes(camera: Camera, pixels: Pixels) -> list[FloatArray]:
+    """Return the common changes of a lens as directions (2 N, K) at pixels (N, 2): focus or zoom (a scale about the
+    principal point), and a shift of lens or sensor."""
     centre = camera.axis_px
     if not np.isfinite(centre).all():
         centre = image_center(camera.size_px)
@@ -148,16 +147,15 @@ def _touched(camera: Camera, pixels: Pixels) -> list[FloatArray]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Modes:
-    """A difference over N pixels in its principal modes: the combinations of the unknowns that move the projection
-    independently of each other.
+    """A difference over N pixels in the principal modes of the predicted one: uncorrelated combinations of unknowns.
 
     Attributes
     ----------
     axes : (2 N, K) the modes over the pixels, of mean square one.
     found : (K,) the difference found, px rms in each mode.
-    null : (K, NULL_DRAWS) differences drawn for one and the same camera.
+    null : (K, NULL_DRAWS) differences drawn for one camera.
     expected : (K,) their variances.
-    beyond : mean square of what of the difference is in none of the modes, px^2.
+    beyond : mean square of the part of the difference outside all modes, px^2.
     """
 
     axes: FloatArray
@@ -168,10 +166,10 @@ class _Modes:
 
     @classmethod
     def of(cls, found: FloatArray, design: FloatArray, covariance: FloatArray, drawn: FloatArray) -> _Modes:
-        """Return a difference (2 N,) in the modes of K unknowns, from their derivatives `design` (2 N, K), covariance
-        and errors drawn (K, NULL_DRAWS)."""
+        """Return a difference (2 N,) in the modes of K unknowns, from the derivatives `design` (2 N, K), the covariance
+        and drawn errors (K, NULL_DRAWS)."""
         pixels = len(found) / 2.0
-        # Parameters have units of their own: in standard deviations they can be compared.
+        # Parameters have different units; in standard deviations they are comparable.
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         safe = np.where(sigma > 0.0, sigma, 1.0)
         basis, how = np.linalg.qr(design * safe / np.sqrt(pixels))
@@ -183,15 +181,14 @@ class _Modes:
         return cls(axes, modes, null, np.maximum(expected, 0.0), beyond)
 
     def chance(self, steps: Sequence[FloatArray]) -> tuple[float, float]:
-        """Return the probability of a difference as large as the one found, and how unlikely one answer must be for
-        that to be 1 - TYPICAL_SHARE: it is one of several.
+        """Return the p-value of the difference found, and the level of a single test at which that is
+        1 - TYPICAL_SHARE.
 
-        What is large is asked in several ways, and the one that says most is compared with what it would say by chance
-        (Tippett's combination). Of anything: the mean square, and the difference in units of what is expected
-        (Mahalanobis), in which each mode is judged by how far it may. Of each of the `steps` (2 N, k) to differ: how
-        much of it there is by generalised least squares, in standard deviations; where it is the way, no other test
-        finds less of it. What is known better than COVARIANCE_FLOOR_PX is taken for known to so much: of the surest
-        combinations a covariance from some images says least.
+        Several tests are combined by their smallest p-value, with its distribution under the null (Tippett). Two are
+        for any difference: its mean square, and its Mahalanobis distance. One for each of the `steps` (2 N, k): the
+        generalised least-squares estimate of that step, in standard deviations, the most powerful test for it.
+        COVARIANCE_FLOOR_PX is added to the standard deviation of each mode, as a covariance from few images is least
+        reliable for the most certain modes.
         """
         known = (self.expected + COVARIANCE_FLOOR_PX**2)[:, None]
         null = self.null**2
@@ -215,40 +212,35 @@ class _Modes:
 
 
 def _exceeded(size: float, null: FloatArray) -> FloatArray:
-    """Return for `size` and then for each of `null` (N,) by which part of all of them it is reached, (N + 1,)."""
+    """Return the p-values (N + 1,) of `size` and of each of `null` (N,): the part of all of them at least as large."""
     everything = np.concatenate([[size], null])
     order = np.argsort(np.argsort(-everything, kind="stable"), kind="stable")
     return np.asarray((order + 1.0) / len(everything))
 
 
-def _by_model(a: Calibration, b: Calibration, difference: CameraDifference, turn: FloatArray) -> FloatArray:
-    """Return the difference (2 M,), px at the covered pixels, that the two models alone make of one lens, after the
-    rotation `turn` (2 M, 3)."""
+def _model_difference(a: Calibration, b: Calibration, difference: CameraDifference, turn: FloatArray) -> FloatArray:
+    """Return the difference (2 M,) px at the covered pixels between the two models fitted to one lens, with the
+    rotations `turn` (2 M, 3) projected out."""
     pixels = difference.pixels[difference.covered]
     out = np.zeros(2 * len(pixels))
-    if _kind(a.camera) == _kind(b.camera):
+    if same_model(a.camera, b.camera):
         return out
     for sign, lens, like, like_from_lens in ((1.0, a, b, difference.b_from_a), (-1.0, b, a, difference.b_from_a.T)):
-        # The lens in the other's model, fitted as that was: where that had its corners.
+        # One lens refitted in the other's model, at the corners that the other was fitted to.
         at = np.concatenate([view.pixels for view in like.views])
         rays, valid = lens.camera.unproject(at)
         tried = []
-        # A model may ask for its own axis: turned as a moved lens is, none follows what one did of the other.
-        for how in (np.eye(3), like_from_lens):
-            refitted = refit_camera(like.camera, rays[valid] @ how.T, at[valid])
-            projected, seen = refitted.project(lens.camera.unproject(pixels)[0] @ how.T)
-            off = np.where(seen[:, None], projected - pixels, 0.0).reshape(-1)
-            tried.append(off - turn @ (turn.T @ off))
+        # The optical axis of a model with symmetry is that of its own calibration, or that of the other one.
+        for rotation in (np.eye(3), like_from_lens):
+            refitted = refit_camera(like.camera, rays[valid] @ rotation.T, at[valid])
+            projected, seen = refitted.project(lens.camera.unproject(pixels)[0] @ rotation.T)
+            tried.append(_without(np.where(seen[:, None], projected - pixels, 0.0).reshape(-1), turn))
+        # The residual of a model that the other cannot represent is in one of the two refits.
         out += sign * min(tried, key=lambda off: float(off @ off))
-    # What one model cannot follow of the other shows in one of the two refits.
     return out
 
 
-def _kind(camera: Camera) -> tuple[str, int]:
-    return camera.model, camera.parameters.size
-
-
-def _design(calibration: Calibration, rays: Pixels) -> FloatArray:
-    """Return d pixel / d (parameters, turn of the rays), (2 N, P + 3)."""
+def _design(calibration: Calibration, rays: Rays) -> FloatArray:
+    """Return d pixel / d (parameters, rotation of the rays), (2 N, P + 3)."""
     design = projection_design(calibration.camera, rays)
     return design.transpose(2, 0, 1).reshape(2 * len(rays), -1)

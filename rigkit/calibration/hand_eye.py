@@ -1,12 +1,12 @@
-"""Where a camera sits on a robot's hand (or before the robot), and where the board stands: hand-eye calibration.
+"""Robot-world / hand-eye calibration: the pose of a camera on a robot's hand (or before the robot), and of the board.
 
     cam_from_board[i] = cam_from_mount @ mount_from_stand[i] @ stand_from_board
 
-The robot tells mount_from_stand of every image. On a hand that carries the camera, the mount is the hand and the stand
-the robot's base; where the hand carries the board, the mount is the base and the stand the hand. Start: rotations from
-the null space of R_cam R_z^T = R_x R_robot, then translations linearly (M. Shah, "Solving the robot-world/hand-eye
-calibration problem using the Kronecker product", J. Mechanisms and Robotics 5, 2013); then least squares over all
-corners.
+The robot gives mount_from_stand for every image. If the hand carries the camera, the mount is the hand and the stand
+the robot's base; if it carries the board, the mount is the base and the stand the hand. Initial rotations come from the
+null space of R_cam R_z^T = R_x R_robot, initial translations linearly (M. Shah, "Solving the robot-world/hand-eye
+calibration problem using the Kronecker product", J. Mechanisms and Robotics 5, 2013); both poses are then refined by
+least squares over all corners.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from rigkit.optim.levenberg_marquardt import DenseProblem, DenseStep, minimise
 
 MIN_POSES = 3
 MAX_MISMATCH_RAD = np.radians(1.0)
-"""Robots and boards tell a rotation to some hundredths of a degree: more is a picture of another pose."""
+"""Rotations of robots and boards are accurate to some hundredths of a degree: more is an image of another pose."""
 MAX_SIGMA_OF_DISTANCE = 0.1
-"""A place known to no better than this part of the distance of the boards is none: turns about one axis leave it open
-along that axis. Turns about a second one, however few, count by how certain they make it."""
+"""Largest standard deviation of a position, as a part of the boards' distance. Rotations about a single axis leave the
+position along it undetermined; with a second axis this limit decides."""
 OPEN_PART = 1e-12
-"""A direction of which the corners know this part of what they know of the best is open: it is rounding."""
+"""Relative eigenvalue of the information matrix up to which a direction is undetermined: rounding."""
 HAND_EYE_DAMPING = Damping(start=1e-4, ceiling=1e12)
 HAND_EYE_STOP = Stop(steps=60, predicted_gain=1e-14)
 UNKNOWNS = 12
 INVERSE_FITS_BETTER = 3.0
-"""Robot poses taken the other way round are mistaken where they fit so many times better."""
+"""Robot poses are the wrong way round where their inverses fit so many times better."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -50,14 +50,14 @@ class HandEye:
     Attributes
     ----------
     cam_from_mount, stand_from_board : the two unknown poses, mm.
-    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. By what
-        the images disagree: what the robot does not tell exactly is in it.
-    freedom : its degrees of freedom; deviations that are quoted count them in (`widening`).
+    covariance : (12, 12) of (w, v) of the first, then of the second: R' = exp([w]x) R, t' = t + v, rad and mm. It is
+        estimated from the scatter between images and so includes the errors of the robot's poses.
+    freedom : its degrees of freedom; quoted standard deviations account for them (`widening`).
     rms_px : 2-D RMS of all corners.
-    image_rms_px : by image.
-    apart_mm, apart_rad : (N,) of the images used, in their order: how far the middle of the board, and its turn, as the
-        camera sees the board, are from where the robot has them.
-    left_out : by image, by how much (rad) its turns differ from the robot's.
+    image_rms_px : the same of each image.
+    apart_mm, apart_rad : (N,) for the images used, in their order: distance of the board's centre, and rotation angle,
+        between the board's pose seen by the camera and that predicted from the robot.
+    left_out : for each image left out, by how much (rad) its rotations differ from the robot's.
     """
 
     cam_from_mount: Rigid3
@@ -73,21 +73,21 @@ class HandEye:
     __repr__ = brief
 
     def sigmas(self) -> tuple[FloatArray, FloatArray]:
-        """Return standard deviations (2, 3) of the turns (rad) and of the translations (mm) of both poses: two
-        hold 95 % of errors, however few images there are."""
+        """Return the standard deviations (2, 3) of the rotations (rad) and of the translations (mm) of both poses,
+        widened so that two of them contain 95 % of the errors."""
         deviations = widening(self.freedom) * np.sqrt(np.diag(self.covariance)).reshape(2, 2, 3)
         return deviations[:, 0], deviations[:, 1]
 
 
 def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Sequence[Rigid3]) -> HandEye:
-    """Return where the camera and the board are, from views of one board and what the robot says at each.
+    """Return the hand-eye calibration from views of one board and the robot's pose at each.
 
     Raises
     ------
     InputError
-        Unlike numbers of views and poses; turns that do not belong together; poses that are the wrong way round.
+        Different numbers of views and poses; rotations of camera and robot that disagree; inverted robot poses.
     DegenerateError
-        Fewer than three images, or turns about one axis only: the place along it is open.
+        Fewer than three images, or rotations about one axis only, which leave the position along it undetermined.
     """
     if len(views) != len(mount_from_stand):
         raise InputError(f"hand-eye: {len(views)} views, but {len(mount_from_stand)} poses of the robot")
@@ -118,7 +118,7 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
         cam_from_mount=found.state[0],
         stand_from_board=found.state[1],
         covariance=known.covariance,
-        # A pose has six numbers: as many images as the unknowns take up say nothing of how images disagree.
+        # Each image measures six numbers: UNKNOWNS / 6 images determine the unknowns and say nothing about scatter.
         freedom=effective_freedom(min(known.freedom, len(use) - UNKNOWNS / 6), known.overdispersion, UNKNOWNS),
         rms_px=float(np.sqrt(squared.sum(axis=1).mean())),
         image_rms_px=by_image,
@@ -129,7 +129,7 @@ def hand_eye(camera: Camera, views: Sequence[BoardView], mount_from_stand: Seque
 
 
 class _AllCorners:
-    """All corners of all images against both unknown poses."""
+    """The least-squares problem of all corners of all images in the two unknown poses."""
 
     def __init__(self, camera: Camera, views: Sequence[BoardView], robot: Sequence[Rigid3]) -> None:
         self.camera, self.views, self.robot = camera, list(views), list(robot)
@@ -161,7 +161,7 @@ class _AllCorners:
 def _residuals(
     cam_from_mount: Rigid3, stand_from_board: Rigid3, problem: _AllCorners, seen: Sequence[Rigid3]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far the boards as they are seen are from where the robot has them, (N,) mm and (N,) rad."""
+    """Return distance (N,) mm and angle (N,) rad between the boards' poses seen and those predicted from the robot."""
     off_mm, turned = [], []
     for view, arm, cam_from_board in zip(problem.views, problem.robot, seen, strict=True):
         predicted = cam_from_mount @ arm @ stand_from_board
@@ -185,8 +185,8 @@ def _pose(camera: Camera, view: BoardView) -> Rigid3:
 
 
 def _mismatch(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> FloatArray:
-    """Return for each image by how much its turns against the others differ from the robot's, median, rad: from image
-    to image both turn by the same angle, whatever the unknown poses are."""
+    """Return for each image the median difference (N,) rad between the camera's and the robot's rotation angles to the
+    other images: the angles are equal whatever the unknown poses are."""
     angles = []
     for poses in (seen, robot):
         rotation = np.stack([pose.rotation for pose in poses])
@@ -195,23 +195,22 @@ def _mismatch(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> FloatArray:
 
 
 def _refuse_open(covariance: FloatArray, seen: Sequence[Rigid3]) -> None:
-    """Raise DegenerateError where a place is as good as unknown."""
+    """Raise DegenerateError where a position is undetermined."""
     distance = float(np.mean([np.linalg.norm(pose.translation_mm) for pose in seen]))
     blocks = [covariance[k : k + 3, k : k + 3] for k in (3, 9)]
     worst = np.inf
     if np.isfinite(covariance).all():
         worst = max(float(np.linalg.eigvalsh(block)[-1]) for block in blocks) ** 0.5
     if not worst <= MAX_SIGMA_OF_DISTANCE * distance:
-        predicted = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
+        known = f", known to {worst:.0f} mm only" if np.isfinite(worst) else ""
         raise DegenerateError(
-            f"hand-eye: the hand turned about one axis only, which leaves the place along it open{predicted}; turn it "
-            f"about "
-            "two"
+            "hand-eye: the hand turned about one axis only, which leaves the place along it open"
+            f"{known}; turn it about two"
         )
 
 
 def _linear(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> tuple[Rigid3, Rigid3]:
-    """Return start poses: R_x^T R_cam = R_robot R_z is linear in both rotations, what is left in both translations."""
+    """Return initial poses: R_x^T R_cam = R_robot R_z is linear in both rotations, the rest in both translations."""
     rows = [
         np.hstack([np.kron(np.eye(3), cam.rotation.T), -np.kron(arm.rotation, np.eye(3))])
         for cam, arm in zip(seen, robot, strict=True)
@@ -231,7 +230,7 @@ def _linear(seen: Sequence[Rigid3], robot: Sequence[Rigid3]) -> tuple[Rigid3, Ri
 
 
 def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -> None:
-    """Raise InputError where the robot's poses, taken the other way round, fit far better."""
+    """Raise InputError where the inverses of the robot's poses fit far better."""
     other = _AllCorners(problem.camera, problem.views, [pose.inverse() for pose in problem.robot])
     start = _linear(seen, other.robot)
     found = minimise(start, other.at, _moved, HAND_EYE_DAMPING, HAND_EYE_STOP)
@@ -243,8 +242,8 @@ def _refuse_inverse(problem: _AllCorners, seen: Sequence[Rigid3], cost: float) -
 
 
 def _by_image(problem: DenseProblem, image: IntArray) -> Clustered:
-    """Return the covariance (12, 12) of the solution with the image as the unit that is independent: what the robot
-    does not tell exactly shifts all corners of an image. Infinite where the corners leave an unknown open."""
+    """Return the covariance (12, 12) of the solution with images as independent units: an error of the robot's pose
+    shifts all corners of an image. Infinite where an unknown is undetermined."""
     count = int(image.max()) + 1
     rows, residual = problem.jacobian.reshape(-1, 2, UNKNOWNS), problem.residual.reshape(-1, 2)
     information, score = np.zeros((count, UNKNOWNS, UNKNOWNS)), np.zeros((count, UNKNOWNS))

@@ -1,4 +1,4 @@
-"""Views of boards under a camera that is known: poses are found, its lens stays as it is."""
+"""Board poses, and board shapes, for a camera whose intrinsics are known and held fixed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
 MAX_LENS_RESIDUAL_PX = 1.0
-"""A known lens that leaves more than this, 2-D RMS, is another lens, or the images are of another size or focus."""
+"""Above this 2-D RMS the lens is not that of the images, or their size or focus is another one."""
 
 
 def posed_calibration(
@@ -41,23 +41,21 @@ def posed_calibration(
     board: str = "flat",
     folds: int = FOLDS,
 ) -> Calibration:
-    """Return a calibration of which only the boards, poses and shapes, were solved for: the lens is `camera`.
+    """Return a calibration in which only the boards' poses and shapes are estimated; the camera stays `camera`.
 
-    With flat boards its held-out error is its training error: no image took part in the lens.
+    With flat boards the held-out error is the training error, as no image influenced the camera.
 
-    Raises InputError: no view can be used, or corners lie outside the camera's image; DegenerateError: no view fits the
-    lens.
+    Raises InputError: no usable view, or corners outside the camera's image; DegenerateError: no view fits the camera.
 
     Parameters
     ----------
-    views : boards as they were seen.
-    camera : the lens, which stays as it is.
+    views : detected boards.
+    camera : the known camera.
     covariance : (P, P) of its parameters; None: it is exact.
-    board, folds : the boards' shape, and of the cross-validation that chooses it, as for `calibrate`.
+    board, folds : as for `calibrate`.
     """
     observations, fit, dropped = _on_flat_boards(views, camera)
     observations, fit, heldout_px, candidates = _shaped(observations, fit, board, folds)
-    state, kept = fit.state, fit.kept
     p = camera.parameters.size
     own = np.zeros((p, p)) if covariance is None else covariance
     frame = np.zeros((p + 6, p + 6))
@@ -69,12 +67,12 @@ def posed_calibration(
         covariance=own,
         frame_covariance=frame,
         sigma_px=fit.sigma_px,
-        views=view_results(observations, state, fit.residuals, kept),
+        views=view_results(observations, fit.state, fit.residuals, fit.kept),
         dropped=dropped,
         outliers=outliers_of(observations, fit),
         candidates=candidates,
         convergence=fit.convergence,
-        boards=board_shapes(observations, state.shape, state.unknowns),
+        boards=board_shapes(observations, fit.state.shape, fit.state.unknowns),
     )
     return replace(result, verdicts=judge(result, _large_residual(result), in_force=("model", "board_shape")))
 
@@ -82,7 +80,7 @@ def posed_calibration(
 def _on_flat_boards(
     views: Sequence[BoardView], camera: Camera
 ) -> tuple[Observations, Fit, tuple[tuple[str, str], ...]]:
-    """Return the views that fit the lens, their poses before flat boards, and why the others were dropped."""
+    """Return the views that fit the lens, their poses for flat boards, and the reasons for dropping the others."""
     used, dropped = usable_views(views, camera.size_px)
     observations = Observations.from_views(used)
     state, kept = posed(observations, camera)
@@ -107,7 +105,7 @@ def _on_flat_boards(
 def _shaped(
     observations: Observations, fit: Fit, board: str, folds: int
 ) -> tuple[Observations, Fit, float | None, tuple[Candidate, ...]]:
-    """Return the fit with boards of the shape asked for, its held-out error, and what was tried; the lens stays."""
+    """Return the fit with the board shape asked for, its held-out error, and the candidates; the lens is held."""
     lens = fit.state.camera
     held = fit_kept(observations, replace(fit.state, camera=HeldLens.of(lens)), fit.kept)
     flat = FittedModel("board flat", held, heldout_squares(observations, held, folds))
@@ -128,7 +126,7 @@ def _large_residual(result: Calibration) -> tuple[Finding, ...]:
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class HeldLens(Camera):
-    """The camera `lens`, without a parameter."""
+    """The camera `lens` without free parameters."""
 
     lens: Camera
 
@@ -136,7 +134,7 @@ class HeldLens(Camera):
 
     @classmethod
     def of(cls, lens: Camera) -> HeldLens:
-        """Return the lens, held."""
+        """Return `lens` with its parameters held."""
         return cls(lens.size_px, np.zeros(0), lens)
 
     def parameter_names(self) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""What a calibration is: the camera, how well it explains the views, how sure it is, and what was left out."""
+"""The result of a calibration: the camera, its residuals and uncertainty, and what was left out."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class ViewResult:
     board_id : name of the board.
     cam_from_board : pose of the board.
     grid : (N, 2) int, (column, row) of each corner.
-    pixels : (N, 2) the corners as they were measured.
+    pixels : (N, 2) measured corners.
     residuals_px : (N, 2) measured minus projected, of ALL corners of the view, outliers too; NaN where the board's
         corner does not project.
-    kept : (N,) bool, False for outliers, which took no part in the solution.
+    kept : (N,) bool, False for outliers, which were not used.
     """
 
     image: str
@@ -72,8 +72,10 @@ class ViewResult:
     def of_views(
         cls, views: Sequence[BoardView], poses: Sequence[Rigid3], residuals_px: FloatArray, kept: BoolArray
     ) -> tuple[ViewResult, ...]:
-        """Return the results of V views padded to C corners, `residuals_px` (V, C, 2) and `kept` (V, C), checked
-        together as one is alone; what the views hold has been checked before."""
+        """Return the results of V views padded to C corners, `residuals_px` (V, C, 2) and `kept` (V, C).
+
+        Both arrays are checked once for all views, which is much faster; the arrays of the views were checked before.
+        """
         residuals_px = as_array(residuals_px, (len(views), None, 2), "residuals_px", finite=False)
         kept = np.array(kept, dtype=bool)
         kept.flags.writeable = False
@@ -102,13 +104,13 @@ class ViewResult:
 
 @dataclass(frozen=True, slots=True)
 class Outlier:
-    """A corner that took no part in the solution.
+    """A corner that was not used.
 
     Attributes
     ----------
-    image, board_id : in which image, of which board.
-    column, row : which corner.
-    residual_px : its distance from where the board puts it.
+    image, board_id : its image and board.
+    column, row : its place on the board.
+    residual_px : length of its residual; NaN where it does not project.
     """
 
     image: str
@@ -120,15 +122,15 @@ class Outlier:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A model or board shape that was tried, and why it was (not) taken.
+    """A model or board shape that was tried, and why it was or was not chosen.
 
     Attributes
     ----------
-    name : what was tried.
-    parameter_count : how many numbers it has.
+    name : name of the model and its size, or of the board shape.
+    parameter_count : number of its parameters.
     rms_px : training error.
-    heldout_rms_px : what the choice rests on; None where it could not be had (too few images).
-    chosen, reason : whether it was taken, and why.
+    heldout_rms_px : held-out error, by which candidates are chosen; None with too few images.
+    chosen, reason : whether it was chosen, and why.
     """
 
     name: str
@@ -141,8 +143,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rival:
-    """A lens of another model (or size) than the one chosen, or the same from boards of another shape, that the images
-    support about as well: its name among the candidates, the camera, and how likely it is the better one, 0 to 1."""
+    """A camera of another model, size or board shape than the chosen one that the images support about as well.
+
+    Attributes
+    ----------
+    name : its name among the candidates.
+    camera : the camera.
+    likely : probability that it is the better one, 0 to 1.
+    """
 
     name: str
     camera: Camera
@@ -151,14 +159,14 @@ class Rival:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class CalibrationCorners:
-    """All corners of the views of a calibration, outliers too, one view after the other.
+    """All corners of the views of a calibration, outliers too, view by view.
 
     Attributes
     ----------
     count : (V,) corners of each view.
-    view : (N,) the view of each corner.
-    grid, pixels, residuals_px, kept : (N, 2), (N, 2), (N, 2) and (N,), as of the views.
-    points_mm : (N, 3) the corners on their boards, as the solution has those.
+    view : (N,) index of each corner's view.
+    grid, pixels, residuals_px, kept : (N, 2), (N, 2), (N, 2) and (N,), as in `ViewResult`.
+    points_mm : (N, 3) the corners in their board's frame, in its solved shape.
     rotation, translation_mm : (V, 3, 3) and (V, 3), cam_from_board of each view.
     """
 
@@ -178,7 +186,7 @@ class CalibrationCorners:
         return self.pixels[self.kept], self.residuals_px[self.kept]
 
     def in_cam(self, chosen: IntArray) -> Points:
-        """Return the corners `chosen` (M,) in the camera frame, (M, 3)."""
+        """Return the corners with the indices `chosen` (M,) in the camera frame, (M, 3) mm."""
         view = self.view[chosen]
         turned = np.einsum("nij,nj->ni", self.rotation[view], self.points_mm[chosen])
         return np.asarray(turned + self.translation_mm[view])
@@ -214,27 +222,28 @@ class Calibration:
     camera : the camera.
     rms_px : training error: 2-D RMS per corner, sqrt(mean |residual|^2), kept corners of the views used. OpenCV's
         convention; sqrt(2) larger than an RMS per coordinate.
-    heldout_rms_px : the headline. The RMS over images that took no part, of a corner of median quality (residuals are
-        weighted as in the solution): k-fold over images, intrinsics and board shape frozen, only the pose of the
-        held-out board refitted. None with fewer than three images.
-    covariance : (P, P) of `camera.parameters`: Student's, with `freedom` degrees of freedom.
-    frame_covariance : (P + 6, P + 6) of the parameters together with the mean motion of the boards, (rad, mm): what
-        `uncertainty` needs to tell a moved camera from another lens.
+    heldout_rms_px : cross-validated error: the RMS of images that were left out of the fit, by k-fold cross-validation
+        over images. Intrinsics and board shapes are then fixed, only the poses of the held-out boards are fitted.
+        Residuals are weighted as in the solution, so that it is the error of a corner of median quality. None with
+        fewer than three images.
+    covariance : (P, P) of `camera.parameters`, of a Student's t distribution with `freedom` degrees of freedom.
+    frame_covariance : (P + 6, P + 6) of the parameters and the mean motion of the boards (rad, mm). The uncertainty of
+        a projection needs it to separate a change of the lens from a motion of the camera.
     sigma_px : standard deviation per coordinate of a corner of median quality, from the residuals.
-    overdispersion : by how much more the images disagree than independent corners would, as a ratio of standard
-        deviations. The covariances count it in: they rest on what repeats from image to image.
-    freedom : degrees of freedom of the covariances; infinite where there are too few images to know. Standard
-        deviations that are quoted count them in (`widening`).
+    overdispersion : ratio of the scatter between images to that expected from independent corners, as a ratio of
+        standard deviations, at least 1. The covariances include it.
+    freedom : degrees of freedom of the covariances; infinite with too few images to estimate them. Quoted standard
+        deviations account for them (`widening`).
     views : the views used, in the order given.
-    dropped : (image, reason) of what was not used; of images with views only something in them.
-    outliers : corners left out of views that were used.
+    dropped : (image, reason) of everything not used: whole images, or parts of images with views.
+    outliers : corners of used views that were not used.
     candidates : models, degrees and board shapes tried.
     convergence : of the final solve.
     boards : shapes of the boards.
-    verdicts : what is good and what is not, the headline first.
-    rivals : other lenses that the images support about as well: how far they differ where boards were is in the
-        covariances, elsewhere it is in the projection's uncertainty.
-    pupil : how the lens's entrance pupil moves; None: it looks from one point. Far away `camera` is exact with it too.
+    verdicts : findings about the calibration, the headline first.
+    rivals : other models that the images support about as well. Their difference from `camera` is part of the
+        covariances where boards were, and of the projection's uncertainty elsewhere.
+    pupil : movement of the entrance pupil; None for a central lens. For far points `camera` is exact with it too.
     """
 
     camera: Camera
@@ -262,7 +271,7 @@ class Calibration:
         keep_arrays(self, covariance=(p, p), frame_covariance=(p + 6, p + 6))
         require_of_frame(self.pupil, p + 6)
         if not self.views:
-            raise InputError("calibration: no view was used, and without data there is none; give images with boards")
+            raise InputError("calibration: no view was used; give images with boards")
 
     def __repr__(self) -> str:
         width, height = self.camera.size_px
@@ -284,16 +293,16 @@ class Calibration:
 
     @cached_property
     def near(self) -> Camera:
-        """The camera of points in mm: `camera`, or where its pupil moves a `NearCamera`."""
+        """The camera that projects points in mm: `camera`, or a `NearCamera` where the pupil moves."""
         return self.camera if self.pupil is None else NearCamera.of(self.camera, self.pupil.terms)
 
     def with_near(self, camera: Camera) -> Self:
-        """Return the same with another camera of points in mm, of the same model; all else is as it was."""
+        """Return the calibration with another `near` camera of the same model, all else unchanged."""
         pupil = replace(self.pupil, terms=camera.pupil) if self.pupil and isinstance(camera, NearCamera) else None
         return replace(self, camera=far_camera(camera), pupil=pupil)
 
     def along(self, rays: Rays, range_mm: float) -> Points:
-        """Return the points (..., 3) of the camera frame, mm, `range_mm` along rays (..., 3) from where these start."""
+        """Return points (..., 3) in the camera frame, mm, at `range_mm` from the entrance pupil along rays (..., 3)."""
         points = range_mm * rays
         if self.pupil is not None:
             points[..., 2] += pupil_shift_of_rays_mm(rays, self.pupil.terms)
@@ -301,22 +310,22 @@ class Calibration:
 
     @property
     def near_covariance(self) -> FloatArray:
-        """That of the parameters of `near` together with the mean motion of the boards."""
+        """Covariance of the parameters of `near` and the mean motion of the boards."""
         return self.frame_covariance if self.pupil is None else self.pupil.joint(self.frame_covariance)
 
     @property
     def parameter_sigmas(self) -> FloatArray:
-        """Standard deviations of `camera.parameters`, (P,): two hold 95 % of errors, however few images there are."""
+        """Standard deviations of `camera.parameters`, (P,), widened so that two of them contain 95 % of the errors."""
         return self.widening * np.sqrt(np.diag(self.covariance))
 
     @cached_property
     def widening(self) -> float:
-        """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
+        """Factor on quoted standard deviations, so that two of them contain 95 % of the errors."""
         return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
 
     @property
     def images_left_out(self) -> int:
-        """Number of images of which nothing is used."""
+        """Number of images without a used view."""
         return len({image for image, _ in self.dropped} - {view.image for view in self.views})
 
     @property

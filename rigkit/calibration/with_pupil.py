@@ -1,9 +1,8 @@
-"""A camera calibrated again with its entrance pupil as two more unknowns, where the images ask for it.
+"""Calibration with a moving entrance pupil: two more unknowns, where the images support them.
 
-The central camera is calibrated first. Where its residuals say that the lens does not look from one point (`pupil` in
-`judging`), sizes of the same model and shapes of the boards are fitted anew, lens, pupil, poses and boards together,
-and chosen as before. The pupil stays where both tell of it: it lowers the error on images that took no part by as much
-as two more numbers of a lens must, and the images agree on it far beyond their scatter.
+The central camera is calibrated first. Where its residuals indicate a moving pupil (`judging.pupil`), all sizes of the
+same model and all board shapes are fitted again with a pupil, and chosen as before. The pupil is kept if it lowers the
+held-out error as two more parameters must, and if it is significant against the scatter between images.
 """
 
 from __future__ import annotations
@@ -27,18 +26,19 @@ from rigkit.core.arrays import BoolArray
 from rigkit.core.errors import DegenerateError, InputError
 
 PUPILS = ("auto", "central", "moving")
-"""What may be asked for: a pupil where images tell of one; none; one."""
+"""Values of the option: a pupil where the images support one, never, always."""
 CENTRAL, MOVING = "one point of view", "moving pupil"
 """Names of the candidates."""
 
 
 def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Request) -> ModelOutcome | None:
-    """Return what a camera comes to with a pupil that moves, its model's sizes and the boards' shape chosen again; None
-    where the images do not tell it from the rest. Of `everything` that was seen, views that the central lens left out
-    and that agree with this one are taken back."""
+    """Return the camera with a moving pupil, model size and board shape chosen again; None if it is not identifiable.
+
+    Views of `everything` that the central lens dropped are used again if they agree with this one.
+    """
     start = found.chosen.fit
     options = _with_every_size(found, start.state, start.kept)
-    if options and (more := _taken_back(found, everything, options)) is not None:
+    if options and (more := _with_dropped_views(found, everything, options)) is not None:
         found, poses, kept = more
         options = _with_every_size(found, poses, kept)
         if options:
@@ -50,7 +50,7 @@ def solved_with_pupil(found: ModelOutcome, everything: Observations, request: Re
 
 
 def _with_every_size(found: ModelOutcome, poses: State, kept: BoolArray) -> list[FittedModel]:
-    """Return every size of the model with a pupil that moves, fitted to the corners `kept` of flat boards."""
+    """Return every size of the model with a moving pupil, fitted to the corners `kept` of flat boards."""
     observations, options = found.observations, []
     for size in found.sizes:
         lens = NearCamera.of(far_camera(size.fit.state.camera))
@@ -64,11 +64,11 @@ def _with_every_size(found: ModelOutcome, poses: State, kept: BoolArray) -> list
     return options
 
 
-def _taken_back(
+def _with_dropped_views(
     found: ModelOutcome, everything: Observations, options: Sequence[FittedModel]
 ) -> tuple[ModelOutcome, State, BoolArray] | None:
-    """Return the views used, with those of `everything` that were left out and agree with the best of lenses whose
-    pupil moves, the poses of all, and the corners kept; None where there is none."""
+    """Return the outcome with the dropped views of `everything` that agree with the best option added, the poses of all
+    views, and the corners kept; None where no dropped view agrees."""
     observations, left = found.observations, [everything.views[k] for k in np.flatnonzero(~found.used)]
     if not left:
         return None
@@ -82,7 +82,7 @@ def _taken_back(
         return None
     whole = Observations.from_views([*observations.views, *(left[k] for k in np.flatnonzero(back))])
     kept_of_all = np.zeros(whole.present.shape, dtype=bool)
-    # Corners stand in the order of each view, padded to the longest.
+    # Views are padded to the longest one, which may be another one now.
     kept_of_all[whole.present] = np.concatenate([fit.kept[observations.present], kept[back][others.present[back]]])
     poses = replace(
         fit.state,
@@ -96,8 +96,7 @@ def _taken_back(
 
 
 def against_central(central: ModelOutcome, moving: ModelOutcome, request: Request) -> tuple[bool, list[Candidate]]:
-    """Return whether images that took no part are shown better with the pupil, on the same corners, and both as
-    candidates."""
+    """Return whether the held-out error is lower with the moving pupil, on the same corners, and both as candidates."""
     options = on_same_images(central, moving, (CENTRAL, MOVING))
     if moving.observations is central.observations:
         options = compared(central.observations, options, request.folds, request.progress)
@@ -106,8 +105,7 @@ def against_central(central: ModelOutcome, moving: ModelOutcome, request: Reques
 
 
 def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the candidates of `against_central` where the lens stays central: a pupil that shows images better may do
-    so by chance."""
+    """Return the candidates of `against_central` with the central lens as the chosen one."""
     if not any(c.chosen and c.name == MOVING for c in candidates):
         return list(candidates)
     reasons = {CENTRAL: "images do not surely agree that the pupil moves", MOVING: "by how much it moves may be chance"}
@@ -115,11 +113,11 @@ def kept_central(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def pupil_moves_significantly(calibration: Calibration) -> bool:
-    """Say whether the images agree that the pupil of a calibration moves."""
+    """Return whether the pupil of a calibration moves significantly."""
     return calibration.pupil is not None and calibration.pupil.chance(calibration.freedom) <= BY_CHANCE
 
 
 def require_known(pupil: str) -> None:
-    """Raise InputError for an option without a meaning."""
+    """Raise InputError for an unknown value of the option `pupil`."""
     if pupil not in PUPILS:
         raise InputError(f"pupil '{pupil}' is unknown; known: {', '.join(PUPILS)}")

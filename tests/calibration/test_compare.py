@@ -84,7 +84,7 @@ def test_what_models_make_of_one_lens_is_allowed_for(
     ]
     allowed = compare_calibrations(*pair)
     monkeypatch.setattr(
-        compare, "_by_model", lambda a, b, difference, turn: np.zeros(2 * int(difference.covered.sum()))
+        compare, "_model_difference", lambda a, b, difference, turn: np.zeros(2 * int(difference.covered.sum()))
     )
     assert compare_calibrations(*pair).predicted_px < 0.8 * allowed.predicted_px
 
