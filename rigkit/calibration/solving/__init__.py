@@ -1,1 +1,1 @@
-"""One camera model fitted to all views: a start without any guess, then least squares by steps that eliminate poses."""
+"""Fit of one camera model to all views: initial values from the views alone, then sparse bundle adjustment."""

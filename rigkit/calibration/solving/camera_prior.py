@@ -1,7 +1,7 @@
-"""What is known of every camera before any view: pixels are square, and the lens sits roughly before the sensor.
+"""Priors that hold for every camera: pixels are nearly square, and the lens is roughly centred on the sensor.
 
-The standard deviations are so wide that a dozen views do not feel them (a centre known to 0.1 px is pulled by a
-millionth of that). One or two views do not determine a lens by themselves: these keep them from running away.
+They are so wide that they do not affect a dozen views (a centre known to 0.1 px is shifted by a millionth of that). One
+or two views do not determine a lens by themselves: there the priors keep the solution bounded.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from rigkit.cameras.base import Camera, image_center
 from rigkit.core.arrays import FloatArray
 
 CENTRE_SIGMA = 0.15
-"""Of the distance from the middle of the image to the optical axis, as a part of the image's longer side."""
+"""Of the distance between image centre and principal point, as a part of the image's longer side."""
 SQUARE_SIGMA = 0.01
 """Of the ratio of the pixel's sides, and of its skew."""
 
 DENOMINATOR_SIGMA = 1.0
-"""Of the denominator's coefficients in the rational distortion: numerator and denominator can grow together for ever
-(to 1e3, without convergence) while their ratio stays."""
+"""Of the coefficients in the denominator of the rational distortion model: numerator and denominator can grow together
+without limit (to 1e3, without convergence) while their ratio stays the same."""
 
 
 def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Return d r / d parameters (m, P) and r (m,): departures from what is expected, in standard deviations."""
+    """Return d r / d parameters (m, P) and r (m,), the deviations from the prior means in standard deviations."""
     names, values = camera.parameter_names(), camera.parameters
     rows, mean = _expected(names, camera.size_px)
     if "fy" not in names:
@@ -38,8 +38,8 @@ def camera_prior(camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 @lru_cache
 def _expected(names: tuple[str, ...], size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return d r / d parameters (m, P), and the parameters (P,) of which r = 0; the last row, where there are two focal
-    lengths, is theirs, and empty: it depends on them."""
+    """Return d r / d parameters (m, P) and the prior means (P,). With two focal lengths the last row is theirs; it
+    depends on their values and is zero here."""
     middle, reach = image_center(size_px).tolist(), CENTRE_SIGMA * max(size_px)
     expected = {"cx": (middle[0], reach), "cy": (middle[1], reach), "c": (1.0, SQUARE_SIGMA), "d": (0.0, SQUARE_SIGMA)}
     if "k6" in names:

@@ -1,24 +1,24 @@
-"""Covariances from what repeats: the image is the unit that is independent, not the corner.
+"""Cluster-robust covariances: images are the independent units, not corners.
 
-Residuals of one view share causes (a lens or a board that is not quite its model, blur, light, a board that bends), so
-50 to 300 corners count like a few. With H_v and s_v what image v contributes to information and score of the shared
-unknowns after its own poses are eliminated, and K = (sum H_v + prior)^-1, the sandwich
+Residuals of one view are correlated (lens or board deviate from their model, blur, light, a board that bends), so 50 to
+300 corners count like a few. Let H_v and s_v be the information and score of the shared unknowns from image v, with its
+poses eliminated, and K = (sum H_v + prior)^-1. The sandwich estimate
 
     K (sum_v s_v s_v^T) K
 
-holds whatever happens inside an image. Whitened by K, M_v = K^1/2 H_v K^1/2 is the leverage of an image: it has pulled
-the solution to itself, and z_v = K^1/2 s_v is too small. (I - M_v)^-1/2 z_v is not: its second moments sum to those of
-independent corners where corners are independent ("CR2").
+is valid for any correlation within an image. M_v = K^1/2 H_v K^1/2 is the leverage of an image: as the solution was
+fitted to it, its score z_v = K^1/2 s_v is too small. The corrected (I - M_v)^-1/2 z_v has the expected second moments
+if corners are independent ("CR2").
 
-So few images know the size of the second moments, and hardly their shape in ten or twenty directions. They are shrunk
-towards a multiple of what independent corners would have, by as much as their own noise asks ("oracle approximating
-shrinkage"): with few images one number scales the covariance of independent corners, with many each direction has its
-own. What corners of an image have in common adds to their scatter, a component of variance that is not negative: where
-that number is below one, it is so by chance, and one is taken, as Birge's ratio for measurements that agree too well.
+A few dozen images determine the trace of the second moments, but hardly their shape in ten or twenty dimensions. They
+are shrunk towards a multiple of the expectation for independent corners, as far as their own noise requires ("oracle
+approximating shrinkage"): with few images a single factor scales the covariance of independent corners, with many each
+direction has its own. A common error within an image can only add variance: a factor below one is chance, and replaced
+by one, as Birge's ratio for measurements that agree too well.
 
-What images say has as many degrees of freedom as there are images but one, or fewer where some images weigh more than
-others: quantiles are Student's. What counts these (bounds, chances) takes the covariance as it is; standard deviations
-that are quoted are widened (`widening`), so that two hold 95 % of errors after four images as after forty.
+The estimate has as many degrees of freedom as images less one, or fewer where the leverages differ; quantiles are
+Student's. Tests and bounds use the covariance with these degrees of freedom; quoted standard deviations are widened
+(`widening`), so that two of them contain 95 % of the errors for four images as well as for forty.
 
 References: R. M. Bell, D. F. McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage
 samples", Survey Methodology 28, 2002. J. G. MacKinnon, M. D. Webb, "Cluster-robust inference: a guide to empirical
@@ -38,31 +38,38 @@ from rigkit.core.arrays import FloatArray, IntArray, scaled_pinv
 from rigkit.kernels.linearise import chebyshev_series
 
 MIN_CLUSTERS = 2
-"""One image (or frame) says nothing about how they differ."""
+"""One image (or frame) gives no scatter between images."""
 MIN_LEFT = 0.05
-"""What is left of an image's pull in a direction that it alone determines: less is rounding."""
+"""Smallest 1 - leverage, of a direction that one image alone determines: less is rounding."""
 MAX_FOR_SERIES, SERIES_LEFT_OUT = 0.8, 1e-13
-"""Up to such a leverage x a series of Chebyshev polynomials approximates (1 - x)^-1/2; its coefficients fall by
-(1 - sqrt(1 - x)) / (1 + sqrt(1 - x)) each, down to about the second."""
+"""Up to this leverage x, (1 - x)^-1/2 is approximated by a series of Chebyshev polynomials. Its coefficients decrease
+by a factor of (1 - sqrt(1 - x)) / (1 + sqrt(1 - x)) each, to about the second number."""
 NULL_DRAWS = 4000
-"""Draws of a null distribution: a chance is then known to 0.002 near 0.01."""
+"""Draws of a null distribution: the standard error of a p-value near 0.01 is then 0.002."""
 QUOTED = 2.0
-"""So many quoted standard deviations hold what as many of a normal distribution do: 95.4 %."""
+"""Number of quoted standard deviations that contain the same probability as for a normal distribution: 95.4 %."""
 SERIAL_LAGS, SERIAL_POWER = 4.0, 2.0 / 9.0
-"""Among N clusters in order up to 4 (N / 100)^(2/9) neighbours are looked at (Newey and West)."""
+"""Autocorrelations of N clusters in order are used up to the lag 4 (N / 100)^(2/9) (Newey and West)."""
 SERIAL_SIGMAS = 3.0
-"""Neighbours agree where their products exceed those of an order by chance by so many standard deviations."""
+"""Standard deviations of a random order by which the autocorrelation must exceed its mean to be used."""
 LARGE_FREEDOM = 1e6
-"""As good as infinite, which the F distribution does not take."""
+"""Stands for infinity, which the F distribution does not accept."""
 RANK = 1e-12
-"""Combinations with less than this part of the largest information are not determined."""
+"""Relative eigenvalue of the information up to which a combination is undetermined."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Clustered:
-    """Covariance (n, n) of shared unknowns; `overdispersion`, by how much more (as a ratio of standard deviations) the
-    clusters disagree than independent corners would, at least 1; `freedom`, the degrees of freedom of the covariance
-    (infinite where it rests on the scatter of corners, with too few clusters to know better)."""
+    """A cluster-robust covariance.
+
+    Attributes
+    ----------
+    covariance : (n, n) of the shared unknowns.
+    overdispersion : scatter between clusters over that expected from independent corners, as a ratio of standard
+        deviations, at least 1.
+    freedom : degrees of freedom of the covariance; infinite with too few clusters, where it is that of independent
+        corners.
+    """
 
     covariance: FloatArray
     overdispersion: float
@@ -74,9 +81,8 @@ def effective_freedom(
 ) -> float:
     """Return the degrees of freedom of the variance in one of so many directions (Satterthwaite).
 
-    What corners scatter is known from all directions of all images. What images disagree beyond that is known as well
-    as `freedom` of them tell; where it is one number for all directions, as well as directions agree on it
-    (`common_freedom`).
+    The variance expected from independent corners is known from all directions of all images. The excess between images
+    has `freedom` degrees of freedom; a factor common to all directions has `common_freedom` besides.
     """
     beyond = max(0.0, 1.0 - 1.0 / overdispersion**2) if overdispersion > 0.0 else 0.0
     variance_of_ratio = beyond**2 * (1.0 / freedom + 1.0 / common_freedom)
@@ -85,9 +91,12 @@ def effective_freedom(
 
 
 def widening(freedom: float) -> float:
-    """Return by how much standard deviations with so many `effective_freedom` are widened when they are quoted: two
-    then hold what two of a normal distribution do, and one more than 68 %: 80 with three of them, 72 with ten."""
-    # Imported here: a camera is read, and used, without it.
+    """Return the factor on quoted standard deviations with `effective_freedom` degrees of freedom.
+
+    Two of them then contain the probability of two of a normal distribution; one contains more than 68 %: 80 % with
+    three degrees of freedom, 72 % with ten.
+    """
+    # Imported here: reading and using a camera does not need scipy.
     from scipy.special import ndtr, stdtrit
 
     return float(stdtrit(freedom, ndtr(QUOTED))) / QUOTED if freedom < LARGE_FREEDOM else 1.0
@@ -96,10 +105,10 @@ def widening(freedom: float) -> float:
 def reduced_by_cluster(
     products: FloatArray, count: int, cluster: IntArray, inverses: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return information (N, P, P) and score (N, P) of every cluster of views after their poses are eliminated.
+    """Return information (N, P, P) and score (N, P) of every cluster of views, with the poses eliminated.
 
-    `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) numbers the clusters,
-    `inverses` (V, 6, 6) are those of the poses' blocks, where they are known.
+    `products` (V, P + 7, P + 7) are those of `view_products`, `count` is P, `cluster` (V,) the cluster of each view,
+    `inverses` (V, 6, 6) those of the poses' blocks, if known.
     """
     coupling, pose = products[:, :count, count : count + 6], products[:, count : count + 6, count : count + 6]
     back = coupling @ (pose_inverses(pose) if inverses is None else inverses)
@@ -125,11 +134,11 @@ def clustered_covariance(
     Parameters
     ----------
     unit : (n, n) their covariance for independent corners of unit variance, all other unknowns free.
-    information, score : (N, n, n) and (N, n), of each cluster, its poses eliminated, released corners held: they are
-        many, mostly their priors hold them, and what they add to `unit` is scaled as a whole.
+    information, score : (N, n, n) and (N, n), of each cluster, with its poses eliminated and released corners held.
+        Released corners are many and mostly determined by their priors; what they add to `unit` is scaled as a whole.
     prior : (n, n) information of the priors.
     sigma_px : standard deviation of a corner, from all residuals.
-    in_order : whether the clusters follow each other in time, so that neighbours may err alike.
+    in_order : whether the clusters are in order of time, so that errors of neighbours may be correlated.
     """
     if len(score) < MIN_CLUSTERS or not sigma_px > 0.0:
         return Clustered(unit * sigma_px**2, 1.0, float("inf"))
@@ -142,7 +151,7 @@ def clustered_covariance(
     leverage = root.T @ information @ root
     pull = _without_leverage(leverage, score @ root / sigma_px)
     expected = root.T @ data @ root
-    # Images of much leverage count for several.
+    # Images of high leverage count for several.
     share = np.einsum("vii->v", leverage)
     freedom = max(float(share.sum() ** 2 / (share**2).sum()) - 1.0, 1.0)
     moments, alike = _serial_moments(pull) if in_order else (pull.T @ pull, 1.0)
@@ -159,7 +168,7 @@ def clustered_covariance(
 def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
     """Return (I - M)^-1/2 z (N, n) of clusters with leverages M (N, n, n) and z (N, n)."""
     out, size = np.empty_like(pull), np.sqrt((leverage * leverage).sum(axis=(1, 2)))
-    # Frobenius' norm bounds the eigenvalues of M. Where it is well below one, powers of M take less than all of those.
+    # The Frobenius norm bounds the eigenvalues of M. Where it is well below one, a series is faster than all of them.
     small = size < MAX_FOR_SERIES
     if small.any():
         bound = max(float(size[small].max()), RANK)
@@ -179,11 +188,11 @@ def _without_leverage(leverage: FloatArray, pull: FloatArray) -> FloatArray:
 
 
 def _serial_moments(pull: FloatArray) -> tuple[FloatArray, float]:
-    """Return the second moments of the sum of pulls z (N, n) in order, and by how much more that is than the sum of
-    theirs: 1 unless neighbours agree by more than chance.
+    """Return the second moments of the sum of scores z (N, n) in order, and their trace over that without
+    autocorrelation: 1 unless the autocorrelation is significant.
 
-    A board that moves before cameras without a common trigger moves the same way for a while, and the frames then err
-    alike. Newey and West's weights, which fall with the distance, leave no negative variance.
+    A board that moves in front of cameras without a common trigger keeps its direction for a while, so that errors of
+    successive frames are alike. The weights of Newey and West, which decrease with the lag, keep variances positive.
     """
     count, own = len(pull), pull.T @ pull
     lags = min(int(SERIAL_LAGS * (count / 100.0) ** SERIAL_POWER), count - 2)
@@ -191,7 +200,7 @@ def _serial_moments(pull: FloatArray) -> tuple[FloatArray, float]:
         return own, 1.0
     weights = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
     products = sum(w * (pull[:-k].T @ pull[k:]) for k, w in enumerate(weights, 1))
-    # Of an order by chance: the pairs z_i . z_j are any of all.
+    # In a random order the pairs z_i . z_j are drawn from all pairs.
     squares = (pull**2).sum(axis=1)
     pairs = count * (count - 1.0)
     mean = (float((pull.sum(axis=0) ** 2).sum()) - float(squares.sum())) / pairs
@@ -205,7 +214,7 @@ def _serial_moments(pull: FloatArray) -> tuple[FloatArray, float]:
 
 
 def _shrunk(moments: FloatArray, expected: FloatArray, freedom: float) -> FloatArray:
-    """Return the second moments shrunk towards a multiple of those expected."""
+    """Return the second moments shrunk towards a multiple of the expected ones."""
     count = len(moments)
     size = float(np.trace(moments))
     squared = float((moments**2).sum())
@@ -217,8 +226,8 @@ def _shrunk(moments: FloatArray, expected: FloatArray, freedom: float) -> FloatA
 
 
 def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> FloatArray:
-    """Return a covariance (N, N) in which the first n unknowns have the covariance `block` (n, n): the others follow
-    them as before, and what is their own is multiplied by `factor`."""
+    """Return a covariance (N, N) in which the first n unknowns have the covariance `block` (n, n). The regression of
+    the others on them is kept, and their conditional covariance multiplied by `factor`."""
     n = len(block)
     before = covariance[:n, :n]
     follow = covariance[n:, :n] @ scaled_pinv(before, RANK)
@@ -232,7 +241,7 @@ def with_block(covariance: FloatArray, block: FloatArray, factor: float) -> Floa
 
 
 def drawn_errors(covariance: FloatArray, freedom: float, rng: np.random.Generator) -> FloatArray:
-    """Return errors (n, NULL_DRAWS) of `covariance` (n, n): Student's t with the degrees of freedom that it has."""
+    """Return errors (n, NULL_DRAWS) drawn from Student's t with `covariance` (n, n) and `freedom`."""
     # Scaled to correlations first: parameters differ by twenty orders of magnitude.
     sigma = np.sqrt(np.diag(covariance))
     safe = np.where(sigma > 0.0, sigma, 1.0)

@@ -1,10 +1,10 @@
-"""The shape of the boards, with priors as wide as the views say.
+"""Board shapes with prior widths estimated from the views (empirical Bayes).
 
-A prior that is too wide lets the noise of the views bend a flat board, and the lens with it; one that is too narrow
-holds back the corners of a wavy one. The evidence of the views tells how wide it should be. Each board has a size of
-its own for bows, for stretches, and for the stray of single corners in the plane and out of it. The size follows
-MacKay's update sigma^2 = sum u^2 / gamma, where gamma = sum (1 - variance / prior^2) is how many of the unknowns u the
-views determine.
+A prior that is too wide lets noise bend a flat board, and biases the lens; one that is too narrow keeps the corners of
+a wavy board from moving. So the widths maximise the evidence. Each board has one width for its bows, one for its
+stretches, and one each for displacements of released corners in the plane and out of it. They follow MacKay's update
+sigma^2 = sum u^2 / gamma, where gamma = sum (1 - variance / prior^2) is the number of unknowns u that the views
+determine.
 
 Reference: D. MacKay, "Bayesian interpolation", Neural Computation 4 (1992), section 4.
 """
@@ -26,20 +26,20 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import BoolArray, FloatArray
 
 SIZE_ROUNDS = 2
-"""More rounds change the sizes by a few per cent and the lens not at all."""
+"""More rounds change the widths by a few per cent and the lens not at all."""
 STRAY_SIGMAS = 3.0
-"""Corners stray where they take this many standard deviations more off the cost than chance does."""
+"""Corners are released where that lowers the cost by this many standard deviations more than expected by chance."""
 OPEN = 1e-9
-"""A direction of which the views know this part of what they know of the best is open: it is rounding."""
+"""Relative eigenvalue up to which a direction of a corner is undetermined: rounding."""
 SIZES_TOLERANCE = 1e-4
-"""The rounds stop where a step promises less than this part of the cost: sizes are known to a tenth at best."""
+"""Relative decrease of the cost at which a round stops: widths are known to a tenth at best."""
 MIN_SIZE = 1e-4
-"""A size falls to no less than this part of the first one in a round: on exact data it would fall to nothing."""
+"""Smallest factor of a width in a round: on exact data it would become zero."""
 
 
 def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fit]:
-    """Return the fits with boards of the shape `board` ("warp", "released", or "auto": both), from that with flat ones.
-    With "auto" corners are only released where they stray at all."""
+    """Return the fits with boards of the shape `board` ("warp", "released", or "auto": both), from the fit with flat
+    boards. With "auto" corners are only released where they deviate significantly from the warp."""
     shape = shape_model("warp", observations)
     start = replace(fit.state, shape=shape, unknowns=np.zeros(shape.count))
     state, kept = _evident(observations, start, fit.kept)
@@ -55,14 +55,14 @@ def fit_shapes(observations: Observations, fit: Fit, board: str) -> dict[str, Fi
 
 
 def _stray(observations: Observations, state: State, kept: BoolArray) -> bool:
-    """Say whether corners lie elsewhere than the warp has them, by more than chance: what releasing each alone would
-    take off the cost, g^T H^-1 g, is chi-squared with as many degrees of freedom as the views know directions of it."""
+    """Return whether corners deviate significantly from the warp: the decrease of the cost by releasing each alone,
+    g^T H^-1 g, is chi-squared with as many degrees of freedom as the views determine directions of it."""
     shape = replace(shape_model("released", observations), basis=state.shape.basis)
     unknowns = np.concatenate([state.unknowns, np.zeros(shape.count - state.shape.count)])
     weight = np.where(kept, observations.weight, 0.0)
     normal = normal_equations(observations, replace(state, shape=shape, unknowns=unknowns), weight)
     points = len(shape.released)
-    # In one view a residual is all that is seen of a corner; from one side nothing tells how far off it is.
+    # A corner needs two views; along the line of sight common to all of them its position is undetermined.
     seen = np.bincount(observations.corner[kept], minlength=len(shape.flat))[shape.released] > 1
     size, axes = np.linalg.eigh(_own_blocks(normal, points))
     along = np.swapaxes(axes, -1, -2) @ normal.g[-3 * points :].reshape(points, 3, 1)
@@ -82,7 +82,7 @@ def _own_blocks(normal: NormalEquations, points: int) -> FloatArray:
 
 
 def _evident(observations: Observations, state: State, kept: BoolArray) -> tuple[State, BoolArray]:
-    """Return the state, roughly solved, with its priors as wide as the views say, and the corners to keep."""
+    """Return the state, roughly solved, with prior widths that maximise the evidence, and the corners to keep."""
     norm = evaluate(state, observations).weighted(observations)
     for _ in range(SIZE_ROUNDS):
         solution = solve(
@@ -114,9 +114,9 @@ def _sizes(observations: Observations, state: State, normal: NormalEquations, si
 
 
 def _variance(state: State, normal: NormalEquations) -> FloatArray:
-    """Return the variance of each unknown of the shape for corners of unit variance. That of a released corner is taken
-    with the others held: against the exact one its sizes come out the same within a tenth, without the inverse of a
-    matrix of thousands."""
+    """Return the variance of each unknown of the shape for corners of unit variance. That of a released corner is
+    computed with the others held: the widths agree with the exact ones within a tenth, without inverting a matrix of
+    thousands."""
     count, first = state.shape.count, state.shape.basis.shape[-1]
     if state.shape.kind == "warp":
         return np.diag(normal.covariance[0])[-count:]

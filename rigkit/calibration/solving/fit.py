@@ -1,4 +1,4 @@
-"""One model fitted to all views: start, robust solve, outliers by a stated rule, least squares on what is kept."""
+"""Fit of one camera model to all views: initial values, robust solve, outlier rejection, least squares on inliers."""
 
 from __future__ import annotations
 
@@ -23,20 +23,28 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 CAUCHY_SIGMAS = 2.5
 COARSE_TOLERANCE = 5e-2
 FINE = 1e-5
-"""The robust solves stop where a step promises less than this part of the cost: they only tell outliers from the rest,
-and the least squares that follow begin where they end."""
+"""Relative predicted decrease at which the robust solves stop: they only find outliers, and start the least squares."""
 GOOD_ENOUGH = 1e-3
-"""A scatter of this part of the image's width ends the search for a better start: 1.6 px of 1600."""
+"""A scatter of this part of the image's width ends the search for better initial values: 1.6 px of 1600."""
 SETTLE_ROUNDS = 8
 START_MM = 1000.0
 MAX_SCATTER_OF_VIEW = 2.0
-"""A view with this many times the scatter of all gets its pose found anew: perhaps its tilt has the wrong sign."""
+"""The pose of a view with this many times the scatter of all views is estimated again: its tilt may have the wrong
+sign (planar ambiguity)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A solved model: its state, the normal equations of the corners there, without priors, the corners kept (V, C),
-    sigma per coordinate of a corner, how the solver ended."""
+    """A solved model.
+
+    Attributes
+    ----------
+    state : the solution.
+    data : its normal equations, without priors.
+    kept : (V, C) the inliers.
+    sigma_px : standard deviation of a corner per coordinate.
+    convergence : of the final solve.
+    """
 
     state: State
     data: NormalEquations
@@ -74,9 +82,9 @@ def robust_sigma(fit: Fit, observations: Observations) -> float:
 
 
 def fit_model(observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None) -> Fit:
-    """Return the model fitted to all views from no guess.
+    """Return the model fitted to all views, without initial values.
 
-    Raises DegenerateError where no start explains the views, or there are no more of them than unknowns.
+    Raises DegenerateError where no solution explains the views, or there are not more residuals than unknowns.
     """
     best: _Found | None = None
     for start in initialise(observations, size_px, model, order):
@@ -102,8 +110,8 @@ def fit_model(observations: Observations, size_px: tuple[int, int], model: type[
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Found:
-    """A state found robustly, its residuals, their weighted lengths and the robust standard deviation of those; the
-    normal equations of all corners there, where they are known."""
+    """A robust solution, its residuals `px`, their weighted lengths `norm` and robust standard deviation, and the
+    normal equations of all corners there, if known."""
 
     state: State
     px: FloatArray
@@ -113,14 +121,14 @@ class _Found:
 
     @classmethod
     def at(cls, state: State, data: NormalEquations, observations: Observations) -> _Found:
-        """Return the state with what follows from the normal equations there."""
+        """Return the solution at a state from its normal equations."""
         norm = data.residuals[0].weighted(observations)
         return cls(state, data.residuals[0].px, norm, sigma_of(norm, observations.present), data)
 
 
 def _clean(observations: Observations, start: _Found) -> _Found | None:
-    """Return the state after one step of least squares if no corner is an outlier there, None otherwise. From a good
-    start to clean corners there is nothing for a robust loss to do."""
+    """Return the state after one step of least squares if it has no outlier, None otherwise: a robust solve is then
+    unnecessary."""
     sigma = start.sigma_px
     one = solve(observations, start.state, prior_sigma_px=sigma, max_iterations=1, at_start=start.data)
     found = _Found.at(one.state, one.data, observations)
@@ -128,16 +136,16 @@ def _clean(observations: Observations, start: _Found) -> _Found | None:
 
 
 def _robust(observations: Observations, state: State, start_sigma: float) -> _Found:
-    """Return what a coarse and a fine robust solve find; views that fit badly get their pose found anew. `start_sigma`
-    is that of `state`."""
+    """Return the result of a coarse and a fine robust solve, with the poses of badly fitting views estimated again in
+    between. `start_sigma` is that of `state`."""
     present = observations.present
     loss = CAUCHY_SIGMAS * start_sigma
     coarse = solve(observations, state, loss_px=loss, max_iterations=15, cost_tolerance=COARSE_TOLERANCE)
     state, norm = coarse.state, coarse.data.residuals[0].weighted(observations)
     sigma = sigma_of(norm, present)
     if not norm.max() > OUTLIER_SIGMAS * sigma:
-        return _Found(state, coarse.data.residuals[0].px, norm, sigma)  # nothing for a robust loss to do
-    # Padding is left out of the medians by standing beyond all corners.
+        return _Found(state, coarse.data.residuals[0].px, norm, sigma)  # No outlier: the fine solve is unnecessary.
+    # Padding is infinite, and sorted behind all corners.
     ordered = np.sort(np.where(present, norm, np.inf), axis=1)
     of_view = ordered[np.arange(len(norm)), np.maximum(present.sum(axis=1) - 1, 0) // 2] / MEDIAN_OF_RAYLEIGH
     bad = np.flatnonzero(of_view > MAX_SCATTER_OF_VIEW * sigma)
@@ -153,11 +161,10 @@ def _robust(observations: Observations, state: State, start_sigma: float) -> _Fo
 
 
 def posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]:
-    """Return the poses of all views under a camera that stays as it is, each at its own minimum, and which corners
-    (V, C) are no outliers there."""
+    """Return the poses of all views for a known camera, each at its own minimum, and the inliers (V, C)."""
     count = len(observations.views)
-    away = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
-    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), away, observations)
+    place = np.broadcast_to([0.0, 0.0, START_MM], (count, 3)).copy()
+    start = State.start(camera, np.broadcast_to(np.eye(3), (count, 3, 3)).copy(), place, observations)
     state = find_poses(observations, start, observations.weight, None)
     norm = evaluate(state, observations).weighted(observations)
     sigma = sigma_of(norm, observations.present)
@@ -177,17 +184,17 @@ def posed(observations: Observations, camera: Camera) -> tuple[State, BoolArray]
 
 
 def fit_kept(observations: Observations, state: State, kept: BoolArray, *, settle: bool = False) -> Fit:
-    """Return the least-squares solution on the kept corners; with `settle` the rule is applied again to the result,
-    until the set of kept corners no longer changes."""
+    """Return the least-squares solution on the kept corners; with `settle` outliers are determined again and the
+    solution repeated until the inliers no longer change."""
     norm = evaluate(state, observations).weighted(observations)
     return _settled(observations, state, norm, kept, SETTLE_ROUNDS if settle else 1)
 
 
 def fit_other_lens(observations: Observations, state: State, kept: BoolArray) -> Fit:
-    """Return the least-squares solution on the kept corners from a lens that was found with other boards."""
-    # Poses that go with another lens may lead the lens away from where it was.
+    """Return the least-squares solution on the kept corners from the lens of another fit."""
+    # Poses of another lens could lead the solver to another minimum: they are refined first.
     state, _ = refine_poses(observations, state, np.where(kept, observations.weight, 0.0))
-    # The scatter that priors are weighed by is known after the first round.
+    # The scatter, which weights the priors, is known after the first solve.
     return fit_kept(observations, fit_kept(observations, state, kept).state, kept)
 
 
@@ -199,12 +206,12 @@ def _settled(
     rounds: int,
     data: NormalEquations | None = None,
 ) -> Fit:
-    """As `fit_kept`, with the weighted residuals `norm` of the state, and the normal equations of the kept corners
-    there, where they are known."""
+    """As `fit_kept`, from the weighted residuals `norm` of the state, and the normal equations of the kept corners
+    there, if known."""
     for again in range(1, rounds + 1):
         weight = np.where(kept, observations.weight, 0.0)
         sigma = sigma_of(norm, kept)
-        # Where most corners do not even project there is nothing to weigh a prior by.
+        # Where most corners do not project there is no scatter to weight a prior by.
         prior = sigma if np.isfinite(sigma) else 0.0
         solution = solve(observations, state, weight=weight, prior_sigma_px=prior, at_start=data)
         data = None
@@ -218,14 +225,14 @@ def _settled(
 
 
 def _sigma(state: State, total: float, kept: BoolArray) -> float:
-    """Return the standard deviation per coordinate of a corner of median quality, degrees of freedom counted, from the
-    sum of squares of the weighted residuals.
+    """Return the standard deviation per coordinate of a corner of median quality, from the sum `total` of the squared
+    weighted residuals and the degrees of freedom.
 
-    Raises DegenerateError where there are none: the residuals are then next to nothing, whatever the camera.
+    Raises DegenerateError where there are none: any camera then fits exactly.
     """
     prior = float(((state.unknowns / state.shape.sigma) ** 2).sum()) if state.shape.count else 0.0
     views = int(kept.any(axis=1).sum())
-    # Each prior is a measurement too: it pays for the unknown that it holds.
+    # The prior of an unknown of the shape counts as a measurement, so that both cancel.
     freedom = 2 * int(kept.sum()) - state.camera.parameters.size - 6 * views
     if freedom <= 0:
         raise DegenerateError(
@@ -237,21 +244,21 @@ def _sigma(state: State, total: float, kept: BoolArray) -> float:
 
 
 def identifiable(fit: Fit) -> bool:
-    """Return whether the images tell the camera's parameters from each other, and each of them at all.
+    """Return whether the images determine all parameters of the camera.
 
-    A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may look told when its tiny
-    effects are compared with each other. Then its standard deviation leads out of the model on both sides.
+    A parameter without effect at the solution, such as eucm's beta where alpha vanishes, may pass the test of the
+    scaled normal equations. Then its standard deviation exceeds the model's limits on both sides.
     """
     if not fit.normal.identifiable:
         return False
     camera = fit.state.camera
     sigma = fit.sigma_px * np.sqrt(np.diag(fit.normal.covariance[0])[: camera.parameters.size])
-    # Models limit each parameter by itself: where all steps at once lead to a camera, each alone does.
+    # Models limit each parameter by itself: if all steps at once are within the limits, each alone is.
     return _exists(camera, sigma) or all(_exists(camera, step) or _exists(camera, -step) for step in np.diag(sigma))
 
 
 def _exists(camera: Camera, step: FloatArray) -> bool:
-    """Return whether the model has a camera with parameters `step` (P,) further on."""
+    """Return whether the parameters plus `step` (P,) are within the model's limits."""
     try:
         camera.with_parameters(camera.parameters + step)
     except InputError:
@@ -260,7 +267,7 @@ def _exists(camera: Camera, step: FloatArray) -> bool:
 
 
 def not_identifiable(model: str) -> DegenerateError:
-    """Return the error for a model whose parameters the images do not tell from each other."""
+    """Return the error for a model whose parameters the images do not determine."""
     return DegenerateError(
         f"calibration: a {model} camera is not identifiable from these images: other numbers show them as well; take a "
         "simpler model, or views with the board tilted by 20 to 50 degrees in several directions and towards the rim"

@@ -1,4 +1,4 @@
-"""Where a calibration starts, without any guess, from 30 degrees to beyond 200.
+"""Initial values of a calibration, from the views alone, for fields of view from 30 to more than 200 degrees.
 
 Each view gives two rows of its pose by radial alignment. With s the distance of a corner from the optical axis, all
 views together give the rest linearly. A point with |offset| = rho has depth z = s f(rho) / rho for Scaramuzza's
@@ -6,8 +6,8 @@ polynomial f(rho) = a0 + a2 rho^2 + a3 rho^3 + a4 rho^4, so
 
     s f(rho) / rho - t3 = +-(r31 x + r32 y)
 
-with one a for all views, one t3 and one sign a view. The signs are the vector that makes the joint residual smallest.
-The radial curve found so is handed to the model asked for, which fits itself to it.
+with one a for all views, and one t3 and one sign for each view. The signs minimise the joint residual. The model asked
+for is then fitted to the radial curve.
 """
 
 from __future__ import annotations
@@ -27,39 +27,39 @@ from rigkit.geometry.rotation import nearest_rotation
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 EXPONENTS = ((0, 2, 3, 4), (0, 2, 4), (0, 2), (0,))
-"""Polynomials tried from rich to poor, until the angle increases with the radius."""
+"""Exponents of the polynomials tried, until the angle increases with the radius."""
 POLYNOMIAL_ROUNDS = 2
 ENUMERATE = 6
-"""Up to this many views all patterns of signs are tried."""
+"""Up to this many views all combinations of signs are tried."""
 NARROW = 1.45
-"""Models that end at 90 degrees are fitted to the curve up to here, rad."""
+"""Models that are limited to 90 degrees are fitted to the curve up to this angle, rad."""
 FALLBACK_FOV_RAD = (0.7, 1.4, 2.1, 3.1)
 """Fields of view of the equidistant lenses tried where the views do not determine a curve (all boards parallel)."""
 RADIUS_SAMPLES = 96
 ORTHONORMAL = 1e-12
-"""Departure from a rotation that is rounding."""
+"""Deviation from a rotation matrix that is rounding."""
 MIN_ALIGNMENT_WEIGHT = 0.1
-"""Corners of less weight are outliers: they do not say how far out the image was seen."""
+"""Corners of less weight are outliers, and do not count for the largest radius."""
 ON_AXIS, NEAR_AXIS = 1e-4, 1e-3
-"""Radii, as shares of the largest: kept off zero, where they divide; and up to which a corner says nothing of depth."""
+"""Radii, as parts of the largest: smallest divisor; and limit up to which a corner gives no depth."""
 NOTHING = 1e-9
-"""Keeps lengths (px, mm) and what is of their size off zero, where they divide."""
+"""Smallest divisor, of lengths (px, mm)."""
 NOTHING_RAD = 1e-6
-"""The same of an angle."""
+"""Smallest divisor, of angles."""
 TINY = 1e-300
-"""The same of sums of squares of any scale."""
+"""Smallest divisor, of sums of squares of any scale."""
 POLYNOMIAL_RIDGE = 1e-12
-"""Of the unit diagonal: keeps the normal matrix of views that leave the polynomial open invertible."""
+"""Added to the unit diagonal: keeps the normal matrix invertible where the views do not determine the polynomial."""
 FLIPS = 10
-"""Rounds of the signs at the most; each lowers the residual, and the first that changes nothing is the last."""
+"""Maximal number of rounds for the signs; each lowers the residual, and they end when no sign changes."""
 
 
 def initialise(
     observations: Observations, size_px: tuple[int, int], model: type[Camera], order: int | None
 ) -> Iterator[State]:
-    """Yield start states for `model`: around the middle of the image, then around the centre of distortion that the
-    views give (better for a lens far off the middle, useless for one without distortion). None where no camera of the
-    model comes near."""
+    """Yield initial states for `model`: with the image centre as principal point, then with the centre of distortion
+    estimated from the views (better for a lens far off centre, undetermined without distortion). No state where the
+    model cannot represent the curve."""
     table = np.ascontiguousarray(observations.table()[:, :2].T)
     board = np.ascontiguousarray(np.swapaxes(np.take(table, observations.corner, axis=1), 0, 1))
     pixels = np.ascontiguousarray(np.swapaxes(observations.pixels, 1, 2))
@@ -120,7 +120,7 @@ def _posed(alignment: Alignment, sign: FloatArray, t3: FloatArray) -> tuple[Mat3
     x, y = columns[..., 0], columns[..., 1]
     third = np.stack([x[:, i] * y[:, j] - x[:, j] * y[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1)
     rotation = np.concatenate([columns, third[..., None]], axis=-1)
-    # The columns are orthonormal as they come, but for views that have no alignment.
+    # The columns are orthonormal, except for views without an alignment.
     odd = ~(np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(1, 2)) < ORTHONORMAL)
     if odd.any():
         rotation[odd] = nearest_rotation(rotation[odd])
@@ -128,7 +128,7 @@ def _posed(alignment: Alignment, sign: FloatArray, t3: FloatArray) -> tuple[Mat3
 
 
 class _Depths:
-    """What the corners say about depth: s f(rho) / rho - t3 = sign * depth, with f and the signs to be found.
+    """The linear equations s f(rho) / rho - t3 = sign * depth of all corners, with f, t3 and the signs unknown.
 
     `rho` (V, C) is relative to the largest used; `offset` and `board` are (V, 2, C).
     """
@@ -147,7 +147,7 @@ class _Depths:
         for k in range(2, len(EXPONENTS[0])):
             np.multiply(rows[:, k - 1], self._safe, out=rows[:, k])
         np.matmul(alignment.tilt[:, None], board, out=rows[:, -2:-1])
-        # Moments of numbers that are all far from zero would lose their digits: taken around a middle corner.
+        # Moments about the mean: about zero they would lose digits.
         self._middle = rows.mean(axis=-1)
         self._middle[:, -1] = 0.0
         rows -= self._middle[..., None]
@@ -157,7 +157,7 @@ class _Depths:
         does not increase."""
         which = [*(EXPONENTS[0].index(k) for k in exponents), -2]
         s, depth = self._s, self._rows[:, -2] + self._middle[:, -2, None]
-        # d rho / d z of the lens turns residuals of z into residuals of rho; at first for a lens of 45 degrees.
+        # d rho / d z of the lens converts residuals of z into residuals of rho; at first that of a 45 degree lens.
         slope = self._safe**2 / (np.maximum(s, NOTHING) * (1.0 + self._safe**2))
         weight = np.where(self._used, self._weight * slope, 0.0)
         a, sign, t3 = self._joint(which, weight, None)
@@ -175,7 +175,7 @@ class _Depths:
         return theta, sign, t3
 
     def known(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what `curve` does for a curve that is known, with all signs plus."""
+        """Return the result of `curve` for a known curve, with all signs positive."""
         angle = np.interp(self._rho, np.linspace(0.0, 1.0, RADIUS_SAMPLES), theta)
         weight = self._weight * np.sin(angle) ** 2
         z = self._s / np.tan(np.maximum(angle, NOTHING_RAD))
@@ -189,7 +189,7 @@ class _Depths:
         """Return the polynomial a, the signs (V,) and t3 (V,) that minimise
         sum weight^2 (a design - t3_v - sign_v depth)^2 with the rows `which` as design and, last, depth.
 
-        `sign` is where the search for the signs starts; None: from scratch.
+        `sign` are initial signs, if known.
         """
         moments = (self._rows * (weight * weight)[:, None]) @ np.swapaxes(self._rows, -1, -2)
         total = np.maximum(moments[:, -1, -1], TINY)
@@ -217,8 +217,8 @@ class _Depths:
 
 
 def _signs(explained: FloatArray, size2: FloatArray) -> FloatArray:
-    """Return the signs s that make s^T (diag(size2) - E^T E) s small, E (4, V) = `explained`: all patterns for few
-    views; for many the lowest eigenvector of the form scaled to unit diagonal, which E E^T gives in four dimensions."""
+    """Return signs s that minimise s^T (diag(size2) - E^T E) s, E (4, V) = `explained`: by trying all for few views,
+    else from the lowest eigenvector of the form scaled to unit diagonal, which E E^T gives in four dimensions."""
     views = len(size2)
     if views <= ENUMERATE:
         patterns = np.array([(1.0, *p) for p in itertools.product((1.0, -1.0), repeat=views - 1)])

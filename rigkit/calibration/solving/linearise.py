@@ -1,4 +1,4 @@
-"""Linearising the calibration: all corners' derivatives, block by block, and the normal equations that they make.
+"""Derivatives of all corners, block by block, and the normal equations from them.
 
 For a corner X of a board with pose (R, t): q = R X, p = q + t, pixel = project(p; k). With J = d pixel / d p,
 
@@ -18,7 +18,7 @@ from rigkit.core.arrays import FloatArray
 from rigkit.kernels.linearise import BoardViews, ViewSums
 
 CORNERS_AT_A_TIME = 8192
-"""Corners linearised at a time: their derivatives then stay in the cache, and memory does not grow with the views."""
+"""Corners linearised at a time: their derivatives stay in the cache, and memory does not grow with the views."""
 
 
 def normal_equations(
@@ -57,7 +57,7 @@ def normal_equations(
         g=shared[:, -1],
         p=products[:, count:-1, -1],
         costs=sums.costs,
-        # Coordinates first in memory: every later step takes u and v apart.
+        # Coordinates first in memory: every later step uses u and v separately.
         residuals=(Residuals(sums.residuals.transpose(1, 2, 0), sums.valid),),
         products=(products,),
     )
@@ -65,12 +65,12 @@ def normal_equations(
 
 
 def view_products(observations: Observations, state: State, weight: FloatArray) -> FloatArray:
-    """Return the products of every view (V, K, K) that are in the normal equations, released corners held."""
+    """Return `NormalEquations.products` (V, K, K) of every view, with released corners held."""
     return normal_equations(observations, state.with_corners_held(), weight).products[0]
 
 
 def _board_views(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> BoardViews:
-    """Return what the kernel needs of the views, the shape of their boards and the loss."""
+    """Return the kernel's input: views, board shapes and loss."""
     shape = state.shape
     place = np.full(len(shape.flat), -1)
     if shape.kind == "released":
@@ -91,8 +91,8 @@ def _board_views(observations: Observations, state: State, weight: FloatArray, l
 
 
 def _with_released(normal: NormalEquations, sums: ViewSums) -> NormalEquations:
-    """Return the normal equations with the released points after the other unknowns, three numbers each; a corner
-    touches only those of its own point."""
+    """Return the normal equations with three coordinates of each released point after the other unknowns; a corner
+    depends on those of its own point only."""
     points, p = len(sums.own), len(normal.g)
     total = p + 3 * points
     gg, g = np.zeros((total, total)), np.zeros(total)

@@ -1,4 +1,4 @@
-"""Normal equations of the calibration: priors, their damped solution by Schur complement, and their covariance."""
+"""Normal equations of the calibration: priors, damped solution by the Schur complement, covariance."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.kernels.linearise import schur_step
 
 MAX_CONDITION = 1e12
-"""A pose whose scaled block is worse has directions that its corners leave open: fewer than three of them."""
+"""Condition number of a pose's scaled block from which it is undetermined: it has fewer than three corners."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SchurStep:
-    """A proposed step and the decrease of the cost that the quadratic model promises for it."""
+    """A proposed step in globals (G,) and poses (V, 6), and the decrease of the cost that the quadratic model
+    predicts."""
 
     globals: FloatArray
     poses: FloatArray
@@ -31,7 +32,8 @@ class SchurStep:
 class Residuals:
     """Measured minus projected, (V, C, 2) px, and where the corner projects at all.
 
-    Where it does not, `px` is the diagonal of the image: worse than any other, so that no step gains by losing corners.
+    Where it does not, `px` is the diagonal of the image, more than any real residual, so that no step gains by losing
+    corners.
     """
 
     px: FloatArray
@@ -52,13 +54,12 @@ class NormalEquations:
     ----------
     gg (G, G), gp (V, G, 6), pp (V, 6, 6), g (G,), p (V, 6).
     costs : (V,) cost of each view's residuals, px^2.
-    residuals : of the corners, not weighted; those of all cameras of a rig one after the other.
-    products : of every view the sums of the products of its weighted rows (V, K, K): derivatives by the parameters of
-        the camera, by the warps of the boards and by the pose (w, t), and last the residual; without released corners
-        and priors. Those of all cameras of a rig one after the other.
-    prior_cost : what the priors add to the cost, px^2.
-    points_from : the globals from here on are released board points: three each, coupled within a point only. None
-        where there are none.
+    residuals : unweighted residuals of all corners, one entry for each camera of a rig.
+    products : (V, K, K) of each camera: J^T W J of every view, where the K columns are the derivatives by the camera's
+        parameters, the boards' warps and the pose (w, t), and last the residual; without released corners and priors.
+    prior_cost : cost of the priors, px^2.
+    points_from : index of the first coordinate of released board points among the globals, three for each point and
+        coupled within a point only; None without released points.
     """
 
     gg: FloatArray
@@ -80,9 +81,9 @@ class NormalEquations:
         unknowns: FloatArray,
         sigma_px: float,
     ) -> NormalEquations:
-        """Add the priors of cameras and zero-mean priors of the shape's unknowns, where each stands among the globals.
+        """Add the priors of cameras and the zero-mean priors of the shape's unknowns, at their slices of the globals.
 
-        `sigma_px` is the standard deviation of a corner: what a residual of one px weighs against a prior.
+        `sigma_px` is the standard deviation of a corner: it scales residuals in px against the priors.
         """
         gg, g, cost = self.gg.copy(), self.g.copy(), 0.0
         for own, camera in cameras:
@@ -100,7 +101,7 @@ class NormalEquations:
         return replace(self, gg=gg, g=g, prior_cost=cost)
 
     def with_quadratic(self, where: slice, off: FloatArray, information: FloatArray) -> NormalEquations:
-        """Add the cost off^T information off of globals that are `off` (n,) from where they are held."""
+        """Add the cost off^T information off of globals that deviate by `off` (n,) from their prior mean."""
         gg, g = self.gg.copy(), self.g.copy()
         gg[where, where] += information
         g[where] -= information @ off
@@ -108,7 +109,7 @@ class NormalEquations:
 
     @property
     def cost(self) -> float:
-        """The cost, priors included, infinite where the state makes no camera."""
+        """The cost, priors included; infinite where it is not finite."""
         total = float(self.costs.sum()) + self.prior_cost
         return total if np.isfinite(total) else np.inf
 
@@ -131,8 +132,8 @@ class NormalEquations:
         return SchurStep(step_g, step_p, predicted)
 
     def _eliminate_points(self, damping_g: FloatArray, damping_p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Eliminate the released points by their 3x3 blocks: with many points and few views the system of the other
-        globals and all poses is the smaller one."""
+        """Return the step with the released points eliminated by their 3x3 blocks: with many points and few views the
+        system of the other globals and all poses is the smaller one."""
         p, views = int(self.points_from or 0), len(self.pp)
         count = (len(self.g) - p) // 3
         each = np.arange(count)
@@ -144,7 +145,7 @@ class NormalEquations:
         system[p:, :p] = system[:p, p:].T
         blocks = system[p:, p:].reshape(views, 6, views, 6)
         blocks[np.arange(views), :, np.arange(views), :] = _damped(self.pp, damping_p)
-        # One long row for each coordinate of a point: its block multiplies three rows at once.
+        # One long row for each coordinate of a point: a block multiplies three rows at once.
         coupling = np.concatenate([self.gg[p:, :p], np.moveaxis(self.gp[:, p:], 0, 1).reshape(3 * count, -1)], axis=1)
         back = (inverse @ coupling.reshape(count, 3, -1)).reshape(coupling.shape)
         rhs = np.concatenate([self.g[:p], self.p.ravel()]) - self.g[p:] @ back
@@ -154,11 +155,11 @@ class NormalEquations:
 
     @property
     def identifiable(self) -> bool:
-        """Whether the equations tell every global from the others at all: combinations of which they say less than the
-        arithmetic can resolve have no inverse, and no covariance."""
+        """Whether the equations determine every global: its variance inflation factor is positive and below the limit
+        of floating-point arithmetic."""
         inverse, back, _ = self.covariance
         variance = np.diag(inverse)
-        # Against what it would be if all other globals were known.
+        # The inverse variance if all other globals were known.
         alone = np.diag(self.gg) - np.einsum("vgi,vig->g", self.gp, back)
         inflated = variance * alone
         limit = 1.0 / (len(inflated) * np.finfo(float).eps)
@@ -169,7 +170,7 @@ class NormalEquations:
         """S^-1 (G, G), W = pp^-1 gp^T (V, 6, G) and pp^-1 (V, 6, 6): the covariance of globals g and poses p
         for unit residuals is cov(g) = S^-1, cov(p_v, g) = -W_v S^-1, cov(p_v, p_u) = W_v S^-1 W_u^T + [v = u] pp_v^-1.
 
-        Directions that the data leave open get the pseudo-inverse's zero only after scaling to unit diagonal.
+        A singular matrix is pseudo-inverted after scaling to unit diagonal.
         """
         inverse = pose_inverses(self.pp)
         back = inverse @ np.swapaxes(self.gp, -1, -2)
@@ -184,8 +185,8 @@ class NormalEquations:
 
 
 def _diagonal(matrix: FloatArray) -> FloatArray:
-    """Return the diagonal (..., K) for Marquardt's scaling, one where it vanishes. Its entries are not compared: they
-    have units of their own, and those of a polynomial's coefficients lie 40 powers of ten apart."""
+    """Return the diagonal (..., K) for Marquardt's scaling, one where it vanishes. Entries are not compared with each
+    other: their units differ, and those of a polynomial's coefficients differ by 40 orders of magnitude."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     return np.where(diagonal > 0.0, diagonal, 1.0)
 
@@ -199,7 +200,7 @@ def _damped(matrices: FloatArray, damping: FloatArray) -> FloatArray:
 
 
 def pose_inverses(pp: FloatArray) -> FloatArray:
-    """Return the inverses of the poses' blocks (V, 6, 6); the pseudo-inverses where the corners leave a pose open."""
+    """Return the inverses of the poses' blocks (V, 6, 6); pseudo-inverses where the corners do not determine a pose."""
     scale = 1.0 / np.sqrt(_diagonal(pp))
     scale = scale[:, :, None] * scale[:, None]
     scaled = pp * scale
@@ -207,7 +208,7 @@ def pose_inverses(pp: FloatArray) -> FloatArray:
         inverse = np.linalg.inv(scaled)
     except np.linalg.LinAlgError:
         inverse = np.full_like(pp, np.inf)
-    # The scaled blocks have unit diagonals, so this bounds their condition within a factor of six.
+    # The scaled blocks have unit diagonals, so this bounds their condition number within a factor of six.
     doubtful = ~(np.abs(inverse).max(axis=(1, 2)) < MAX_CONDITION)
     inverse *= scale
     if doubtful.any():

@@ -1,5 +1,5 @@
-"""Which corners are outliers: by a stated rule, against what corners there in the image leave, and what those around
-them on the board do."""
+"""Outlier rejection: residuals are compared with the scatter in the same part of the image, and with their neighbours
+on the board."""
 
 from __future__ import annotations
 
@@ -12,19 +12,18 @@ from rigkit.optim.robust_scale import MEDIAN_OF_RAYLEIGH
 
 OUTLIER_SIGMAS = 5.0
 """A corner is an outlier when its weighted 2-D residual exceeds this many robust standard deviations per coordinate,
-sigma = median |r| / 1.177: by chance alone 4 corners in a million do."""
+sigma = median |r| / 1.177: 4 in a million do by chance."""
 MAX_RINGS, RING_CORNERS = 8, 50
-"""Corners scatter more towards the rim of the image, where squares are small and blurred: the rule takes the scatter of
-the ring around the middle that a corner lies in, of so many with as many corners each, but no fewer than 50."""
+"""The scatter increases towards the rim of the image, where squares are small and blurred. So it is estimated in up to
+8 rings about the image centre with equally many corners, at least 50 each."""
 RING_FACTOR = 4.0
-"""No ring scatters more than this many times as much as all corners: beyond it the corners in it are bad ones."""
+"""Largest scatter of a ring, as a multiple of that of all corners: more is caused by outliers."""
 SIGMA_FLOOR_PX = 1e-4
-"""Exact corners have no scatter to judge outliers by: below this rounding would make them."""
+"""Smallest standard deviation: exact corners would be outliers by rounding."""
 TURN_SIGMAS = 2.5
-"""Corners so many robust sigmas off a field count half in it."""
+"""Residual, in robust standard deviations, of a corner with half its weight in the fit of a field."""
 FIELD_NUMBERS, FIELD_ROUNDS, FIELD_RIDGE = 6, 5, 1e-9
-"""Of a quadratic field over a view, each axis; of the rounds in which it is made robust; and, of weights of about one,
-what keeps it solvable."""
+"""Coefficients of a quadratic field per axis, rounds of its robust fit, and the ridge of its normal matrix."""
 
 
 def sigma_of(norm: FloatArray, used: BoolArray | IntArray) -> float:
@@ -40,8 +39,8 @@ def inliers(
     size_px: tuple[int, int],
     px: FloatArray | None = None,
 ) -> BoolArray:
-    """Return which corners the rule keeps, (V, C), from their weighted residuals `norm` (V, C). With the residuals `px`
-    (V, C, 2) corners that lie off together with all around them are kept."""
+    """Return the inliers (V, C), from the weighted residuals `norm` (V, C). With the residuals `px` (V, C, 2), corners
+    displaced together with their neighbours are inliers too."""
     present = observations.present
     kept = present & (norm <= OUTLIER_SIGMAS * sigma_px)
     if (kept == present).all():
@@ -64,11 +63,11 @@ def inliers(
 def _with_neighbours(
     kept: BoolArray, px: FloatArray, norm: FloatArray, limit: FloatArray, observations: Observations
 ) -> None:
-    """Add to the corners `kept` (V, C) those that lie off together with all around them.
+    """Add to the inliers `kept` (V, C) the corners that are displaced together with their neighbours.
 
-    A board that bends, or moves, in one picture takes its corners along: they were found where they are. So in views
-    most of whose corners agree the `limit` (V, C) is for what a quadratic field over the view leaves of the residuals;
-    of these themselves it is RING_FACTOR times as high. A view most of whose corners disagree is for other rules.
+    A board that bends or moves in one image displaces its corners smoothly, and they are measured correctly. So in
+    views with a majority of inliers the `limit` (V, C) applies to the residuals less a quadratic field over the view,
+    and RING_FACTOR times it to the residuals themselves. Views without a majority are left to other tests.
     """
     count, agree = observations.present.sum(axis=1), kept.sum(axis=1)
     views = np.flatnonzero((agree < count) & (2 * agree > count) & (agree >= 2 * FIELD_NUMBERS))

@@ -1,4 +1,4 @@
-"""Poses of boards under a camera that stays as it is: every view is a problem of its own, all are solved at once."""
+"""Poses of boards for a fixed camera: one small problem for each view, all solved in one batch."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from rigkit.optim.damping import Damping, Stop
 
 MAX_POSE_ITERATIONS = 40
 VIEW_TOLERANCE = 1e-10
-"""Stop where a step promises less than this part of a view's cost,"""
+"""Relative predicted decrease of a view's cost at which it stops."""
 START_TOLERANCE = 1e-5
-"""or this, of a pose that is only where a solve begins: a robust loss takes dozens of steps for the last digits."""
+"""The same for initial poses: with a robust loss the last digits take dozens of steps."""
 VIEW_DAMPING = Damping(start=1e-6, floor=1e-12, ceiling=1e10)
-"""A view of which hardly a corner projects does not determine its pose: less than the floor would leave it singular."""
+"""The floor keeps the system regular for a view with too few projected corners to determine its pose."""
 
 
 def refine_poses(
@@ -35,7 +35,7 @@ def refine_poses(
     tolerance: float = VIEW_TOLERANCE,
 ) -> tuple[State, FloatArray]:
     """Return the state with each view's pose at its own minimum, and each view's cost (V,) in px^2. `loss_px` is the
-    scale of the Cauchy loss, `tolerance` the part of the cost that a step must promise to be worth another."""
+    scale of the Cauchy loss, `tolerance` the relative predicted decrease of the cost at which a view stops."""
 
     held = state.with_boards_held()
 
@@ -53,8 +53,8 @@ def refine_each(
     linearise: Callable[[Mat3, Points], NormalEquations],
     tolerance: float = VIEW_TOLERANCE,
 ) -> tuple[Mat3, Points, FloatArray]:
-    """Return poses (N, 3, 3), (N, 3) each at its own minimum and their costs (N,): Levenberg-Marquardt with a damping
-    of its own for each. `linearise` returns the normal equations at given poses."""
+    """Return poses (N, 3, 3), (N, 3), each at its own minimum, and their costs (N,), by Levenberg-Marquardt with a
+    separate damping for each. `linearise` returns the normal equations at given poses."""
 
     def around(poses: tuple[FloatArray, ...]) -> BatchedProblem:
         normal = linearise(*poses)
@@ -66,13 +66,14 @@ def refine_each(
 
 
 def steps_between(before: tuple[Mat3, Points], after: tuple[Mat3, Points]) -> FloatArray:
-    """Return the steps (N, 6) that take poses `before` to those `after`, (N, 3, 3) and (N, 3) each: see `stepped`."""
+    """Return the steps (N, 6) from poses `before` to poses `after`, (N, 3, 3) and (N, 3) each: the inverse of
+    `stepped`."""
     return np.concatenate([log_so3(after[0] @ np.swapaxes(before[0], -1, -2)), after[1] - before[1]], axis=1)
 
 
 def find_poses(observations: Observations, state: State, weight: FloatArray, loss_px: float | None) -> State:
-    """Return the state with every pose found anew from its corners: radial alignment around the camera's centre, both
-    signs of the tilt refined, and the pose in `state` as a third start; the cheapest of the three wins."""
+    """Return the state with every pose estimated again: the solution of least cost of three, from radial alignment with
+    both signs of the tilt and from the pose in `state`."""
     board = np.swapaxes(observations.table()[observations.corner][..., :2], 1, 2)
     alignment = align(np.swapaxes(observations.pixels - state.camera.axis_px, 1, 2), board, weight)
     rays, seen = state.camera.unproject(observations.pixels)

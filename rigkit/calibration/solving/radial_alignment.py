@@ -1,4 +1,4 @@
-"""What a view of a flat board says without knowing the lens: the radial alignment constraint.
+"""The radial alignment constraint: two rows of a board's pose, without knowing the lens.
 
 Around the centre of distortion c every radially symmetric lens, however wide, images a point of the camera frame
 (X, Y, Z) along the direction (X, Y): with (u, v) = pixel - c,   u Y - v X = 0. That is linear in two rows of the pose,
@@ -21,38 +21,38 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 ALIGNMENT_ROUNDS = 4
 SUBSETS = 16
 SUBSET_SIZE = 7
-"""With 5 % bad corners 70 % of such subsets are clean; 16 miss once in 10^8 views."""
+"""With 5 % outliers 70 % of such subsets have none; all 16 contain one in one of 10^8 views."""
 SUSPICIOUS = 8.0
-"""A largest residual of more than this many robust sigmas sends the view through random subsets."""
+"""A view whose largest residual exceeds this many robust standard deviations is fitted to random subsets."""
 TRACE_SHIFT = 1e-13
 """Of the trace, keeps the normal matrix of exact corners invertible."""
 TURN_SIGMAS = 2.5
-"""Residuals of so many robust sigmas count half."""
+"""Residual, in robust standard deviations, with half the weight."""
 MIN_SCATTER_PX = 1e-6
-"""Exact corners scatter by rounding alone, far below any noise; weights are one over it."""
+"""Smallest scatter, that of exact corners: weights are its inverse."""
 MIN_RADIUS_SHARE = 1e-3
-"""Of a view's largest radius: nearer to the axis a corner has no direction, and its weight no end."""
+"""Smallest radius as a part of a view's largest: closer to the axis the direction is undefined and weights diverge."""
 FAR_EPIPOLE = 1e-9
-"""Homogeneous coordinate of a unit vector that lies at infinity."""
+"""Homogeneous coordinate of a unit vector below which the epipole is at infinity."""
 INVERSE_STEPS = 3
-"""Each brings the vector nearer by the ratio of the two smallest eigenvalues, the noise against the view's tilt."""
+"""Steps of inverse iteration: each lowers the error by the ratio of the two smallest eigenvalues."""
 SQUARE_ROW, SQUARE_COLUMN = np.triu_indices(3)
-"""The six different products of two of three numbers."""
+"""Indices of the six different products of two of three numbers."""
 NORMAL_ENTRIES = 3 * np.tile([[0, 1, 2], [1, 3, 4], [2, 4, 5]], (2, 2)) + np.kron(
     [[0, 1], [1, 2]], np.ones((3, 3), dtype=int)
 )
-"""Where each entry of the 6x6 normal matrix lies in the (6, 3) moments: by product of (x, y, 1), by one of (-v, u)."""
+"""Index of each entry of the 6x6 normal matrix in the (6, 3) moments, of products of (x, y, 1) and of (-v, u)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Alignment:
-    """Two rows of each pose and the size of the third.
+    """Two rows of each pose, and the third up to a sign.
 
     Attributes
     ----------
-    rows : (V, 2, 3) r1 = (r11, r12, t1) and r2, t in mm for the board's own origin; r's of the right length.
+    rows : (V, 2, 3) r1 = (r11, r12, t1) and r2, scaled to a rotation, t in mm for the board's origin.
     tilt : (V, 2) r31, r32 up to a common sign.
-    weight : (V, C) in [0, 1], how far each corner takes part.
+    weight : (V, C) in [0, 1], robust weight of each corner.
     """
 
     rows: FloatArray
@@ -99,8 +99,8 @@ def align(offset: FloatArray, board: FloatArray, weight: FloatArray) -> Alignmen
 
 
 def _normalised(board: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return (x, y, 1) of the corners (V, 3, C) with the mean of those used at zero and unit size, that mean and
-    size."""
+    """Return (x, y, 1) of the corners (V, 3, C), normalised to zero mean and unit size of those used, and their mean
+    and size."""
     present = (weight > 0.0)[:, None]
     count = np.maximum(present.sum(axis=-1), 1)
     mean = (board * present).sum(axis=-1) / count
@@ -113,7 +113,7 @@ def _normalised(board: FloatArray, weight: FloatArray) -> tuple[FloatArray, Floa
 
 
 class _Views:
-    """Corners of views and what all fits to them share: offsets (..., 2, C), (x, y, 1) (..., 3, C)."""
+    """Corners of views with precomputed products: offsets (..., 2, C), (x, y, 1) (..., 3, C)."""
 
     def __init__(self, offset: FloatArray, local: FloatArray) -> None:
         self._u, self._v, self._local = offset[..., 0, :], offset[..., 1, :], local
@@ -122,8 +122,8 @@ class _Views:
         self._direction = np.stack([self._v * self._v, -self._u * self._v, self._u * self._u], axis=-2)
 
     def fit(self, weight: FloatArray, start: FloatArray | None = None) -> FloatArray:
-        """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2, from a `start` near it if there is one:
-        inverse iteration then costs half of all eigenvectors."""
+        """Return the unit h (..., 6) that minimises sum weight^2 (u Y - v X)^2. With an initial value `start` it is
+        found by inverse iteration, in half the time of an eigendecomposition."""
         moments = self._squares @ np.swapaxes(self._direction * (weight * weight)[..., None, :], -1, -2)
         normal = moments.reshape(*weight.shape[:-1], -1)[..., NORMAL_ENTRIES]
         if start is None:
@@ -141,8 +141,8 @@ class _Views:
         return np.asarray(h.reshape(*h.shape[:-1], 2, 3) @ self._local)
 
     def residual(self, h: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the distance in px of each pixel from the radial line through its corner, and the corner's |(X, Y)|,
-        kept off zero for corners that lie on the axis."""
+        """Return the distance in px of each pixel from the radial line of its corner, and the corner's |(X, Y)|, at
+        least MIN_RADIUS_SHARE of the largest."""
         xy = self.camera_xy(h)
         x, y = xy[..., 0, :], xy[..., 1, :]
         radius = np.sqrt(x * x + y * y)
@@ -160,7 +160,7 @@ def _sigma(residual: FloatArray, used: np.ndarray) -> FloatArray:
 
 def _best_subset(offset: FloatArray, local: FloatArray, used: np.ndarray) -> FloatArray:
     """Return, for each view, the fit to a random subset of its corners with the smallest median residual."""
-    # The same numbers for every view: what a view's are is not to depend on the others.
+    # The same random numbers for every view, so that a view's subsets do not depend on the other views.
     drawn = np.random.default_rng(0).random((SUBSETS, used.shape[1]))
     order = np.argsort(np.where(used[:, None], drawn, 2.0), axis=-1)
     chosen = order[..., None, :SUBSET_SIZE]
@@ -190,7 +190,7 @@ def _orthonormal(h: FloatArray, mean: FloatArray, size: FloatArray) -> tuple[Flo
 
 def distortion_centre(pixels: FloatArray, board: FloatArray, weight: FloatArray, guess: FloatArray) -> FloatArray:
     """Return the centre of distortion, (2,) px, from all views (V, 2, C): the common epipole of the radial fundamental
-    matrices (u, v, 1) F_v (x, y, 1)^T = 0. Meaningless without distortion, when every point of the image would do."""
+    matrices (u, v, 1) F_v (x, y, 1)^T = 0. Undetermined without distortion."""
     local, _, _ = _normalised(board, weight)
     offset = pixels - guess[:, None]
     size = float(np.abs(np.where((weight > 0.0)[:, None], offset, 0.0)).max()) or 1.0
@@ -198,7 +198,7 @@ def distortion_centre(pixels: FloatArray, board: FloatArray, weight: FloatArray,
     design = (left[:, :, None] * local[:, None]).reshape(len(weight), 9, -1) * weight[:, None]
     values, vectors = np.linalg.eigh(design @ np.swapaxes(design, -1, -2))
     F = vectors[..., 0].reshape(-1, 3, 3)
-    # A view whose second smallest eigenvalue is as small as the first leaves its F open.
+    # A view with two equally small eigenvalues does not determine its F.
     certain = np.clip(1.0 - np.maximum(values[:, 0], 0.0) / np.maximum(values[:, 1], np.finfo(float).tiny), 0.0, 1.0)
     epipole = np.linalg.eigh(np.einsum("v,vij,vkj->ik", certain, F, F))[1][:, 0]
     if abs(epipole[2]) < FAR_EPIPOLE:

@@ -1,8 +1,7 @@
-"""The shape of the boards as part of the solution: flat, warped (a few numbers a board), or every corner released.
+"""Board shapes as unknowns: flat, warped (a few parameters for each board), or every corner released.
 
-A shape is linear in its unknowns: points = flat points + basis @ unknowns, each unknown with a Gaussian prior around
-zero in its own unit, so that what the views do not determine stays at the flat board. How far released corners stray
-the views say themselves: see `rigkit.calibration.solving.evidence`.
+A shape is linear in its unknowns, points = flat points + basis @ unknowns. Each unknown has a Gaussian prior with zero
+mean, so that undetermined ones keep the board flat. `evidence` estimates the widths of the priors from the views.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ ASPECT_SIGMA = 3e-3
 SHEAR_SIGMA = 1e-3
 """Prior of the print's shear, rad."""
 STRETCH_SIGMA = 2e-3
-"""Prior of a stretch that changes over the print (a feed that does not run evenly), as a fraction of the board's half
+"""Prior of a stretch that varies over the print (a feed of varying speed), as a fraction of the board's half
 diagonal."""
 BOW_SIGMA = 1e-2
 """Prior of a bow, as a fraction of the board's half diagonal: weak, a board bent by more is visibly bent."""
 RELEASED_SIGMA_XY = 6e-4
-"""Prior of a released corner in the plane before the views have been asked, as a fraction of the board's half diagonal
-(0.09 mm on 9x6 x 30 mm)."""
+"""Initial prior of a released corner in the plane, as a fraction of the board's half diagonal (0.09 mm on 9x6 x
+30 mm)."""
 RELEASED_SIGMA_Z = 3e-3
-"""Prior of a released corner out of the plane, same unit (0.4 mm on 9x6 x 30 mm)."""
+"""Initial prior of a released corner out of the plane, same unit (0.4 mm on 9x6 x 30 mm)."""
 
 WARP_UNKNOWNS = 11
-"""Of a board: aspect, shear, bows, stretches."""
+"""Number of unknowns of a board's warp: aspect, shear, bows, stretches."""
 BOWS, STRETCHES = np.arange(2, 5), np.arange(5, 11)
-"""Which of them are lengths of one kind."""
+"""Indices of the unknowns with a common prior width."""
 MIN_VIEWS = 3
 """A board in fewer views stays flat."""
 
@@ -45,15 +44,15 @@ NONE: IntArray = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ShapeModel:
-    """How the board points depend on the shape's unknowns.
+    """The board points as a linear function of the shape's unknowns.
 
     Attributes
     ----------
     kind : "flat", "warp" or "released".
-    flat : (M, 3) mm, the boards as measured.
+    flat : (M, 3) mm, the declared boards.
     basis : (M, 3, B) mm per unknown of the warp; B = 0 for flat.
     sigma : prior standard deviation of each unknown: B of the warp, then three of each released corner, in mm.
-    released : (K,) rows of the released corners, those of the boards often seen.
+    released : (K,) rows of the released corners, of all boards in at least MIN_VIEWS views.
     """
 
     kind: str
@@ -77,18 +76,17 @@ class ShapeModel:
         return points
 
     def richer(self, kind: str, observations: Observations, unknowns: FloatArray) -> tuple[ShapeModel, FloatArray]:
-        """Return the shape of a richer kind, with the priors of the unknowns that this one has, and all its unknowns:
-        the further ones zero."""
+        """Return the model of a richer kind with the priors of this one, and its unknowns, the added ones zero."""
         shape = shape_model(kind, observations)
         sigma = np.concatenate([self.sigma, shape.sigma[self.count :]])
         return replace(shape, sigma=sigma), np.concatenate([unknowns, np.zeros(shape.count - self.count)])
 
     def held(self, unknowns: FloatArray) -> ShapeModel:
-        """Return the shape with nothing left to solve for: boards as the unknowns have them."""
+        """Return the model without unknowns, with the boards in the given shape."""
         return _rigid(self.points(unknowns))
 
     def with_corners_held(self, unknowns: FloatArray) -> ShapeModel:
-        """Return the shape with released corners held where the unknowns have them, on boards that still warp."""
+        """Return the model in which released corners are held and only warps are unknown."""
         count = self.basis.shape[-1]
         flat = self.points(unknowns) - self.basis @ unknowns[:count]
         return ShapeModel("warp", flat, self.basis, self.sigma[:count], NONE)
@@ -106,7 +104,7 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
     warp = _warp(observations, flat)
     if kind == "warp":
         return warp
-    # Released corners move against a warp: a bow costs a few numbers, not the prior of every corner.
+    # Released corners move relative to a warp: a bow costs a few numbers, not the prior of every corner.
     often = often_seen(observations)
     released = np.flatnonzero(np.repeat(often, np.diff(observations.first_row)))
     each = [flat[_rows(observations, board)] for board in np.flatnonzero(often).tolist()]
@@ -115,20 +113,19 @@ def shape_model(kind: str, observations: Observations) -> ShapeModel:
 
 
 def often_seen(observations: Observations) -> BoolArray:
-    """Say of which boards, (boards,), the shape can be told: those in several views (in one view a bow is a pose)."""
+    """Return which boards, (boards,), are in enough views to determine their shape (in one view a bow is a pose)."""
     return np.bincount(observations.board, minlength=len(observations.boards)) >= MIN_VIEWS
 
 
 def warp_groups(observations: Observations) -> Iterator[IntArray]:
-    """Yield the unknowns of the warp that have one size together, board by board: bows, stretches."""
+    """Yield the unknowns of the warp with a common prior width, board by board: bows, stretches."""
     for i in range(int(often_seen(observations).sum())):
         yield from (WARP_UNKNOWNS * i + part for part in (BOWS, STRETCHES))
 
 
 def released_groups(observations: Observations, first: int) -> Iterator[IntArray]:
-    """Yield the unknowns of the released corners, `first` the first of them, that have one size together: in the plane
-    and out of it. Those at a board's border are apart: paper ends or curls there, and a detector sees one neighbour
-    less."""
+    """Yield the unknowns of the released corners, from index `first` on, with a common prior width: in the plane, and
+    out of it. Border corners have widths of their own: paper curls there, and a detector sees one neighbour less."""
     for board in (b for b, often in zip(observations.boards, often_seen(observations), strict=True) if often):
         grid = board.grid()
         border = ((grid == 0) | (grid == np.array(board.size) - 1)).any(axis=1)
@@ -143,8 +140,7 @@ def _rows(observations: Observations, board: int) -> slice:
 
 
 def released_sigma(points: Points) -> FloatArray:
-    """Return the prior standard deviation of a released corner before the views have been asked, (3,) mm, from the flat
-    corners of its board."""
+    """Return the initial prior standard deviation of a released corner, (3,) mm, from the flat corners of its board."""
     return _half_diagonal(points) * np.array([RELEASED_SIGMA_XY, RELEASED_SIGMA_XY, RELEASED_SIGMA_Z])
 
 
@@ -166,9 +162,9 @@ def _warp(observations: Observations, flat: Points) -> ShapeModel:
 
 def warp_of_board(points: Points) -> ShapeModel:
     """Return the warp of a board with its corners at `points` (N, 3): aspect, shear, bow along x, bow along y, twist,
-    and six of a stretch that changes over the print (x and y, each quadratic in x and y). Bows are in mm at the centre,
-    the twist at the corner, the stretch at the rim. An overall scale would only move the board away: it is not among
-    them."""
+    and six of a stretch that varies over the print (in x and y, each quadratic in x and y). Bows are in mm at the
+    centre, the twist at the corner, the stretch at the rim. An overall scale is excluded: it is equivalent to another
+    distance."""
     centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
     half = 0.5 * np.ptp(points, axis=0)
     x, y = ((points - centre)[:, :2]).T
@@ -177,7 +173,7 @@ def warp_of_board(points: Points) -> ShapeModel:
     basis[:, 0, 1], basis[:, 1, 1] = 0.5 * y, 0.5 * x
     x, y = x / half[0], y / half[1]
     basis[:, 2, 2], basis[:, 2, 3], basis[:, 2, 4] = 1.0 - x**2, 1.0 - y**2, x * y
-    # Legendre's polynomials: a stretch is not to be taken for a shift.
+    # Legendre polynomials, orthogonal to a shift of the board.
     stretch = np.stack([1.5 * x**2 - 0.5, x * y, 1.5 * y**2 - 0.5], axis=-1)
     basis[:, 0, 5:8] = basis[:, 1, 8:11] = stretch
     size = _half_diagonal(points)

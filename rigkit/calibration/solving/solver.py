@@ -1,8 +1,8 @@
 """Levenberg-Marquardt over intrinsics, board shapes and board poses, with the poses eliminated by 6x6 blocks.
 
-One camera, V views padded to C corners. Unknowns are ordered globals (intrinsics, then shape) and, per view, a pose
-perturbation (w, dt): R <- exp(w) R, t <- t + dt, so that no rotation is singular. The normal matrix of all views comes
-from one batched product; the reduced (Schur) system has the size of the globals only, so the cost is linear in views.
+One camera, V views padded to C corners. Unknowns are the globals (intrinsics, then shape) and, for each view, a pose
+perturbation (w, dt): R <- exp(w) R, t <- t + dt, so that no rotation is singular. The normal matrix of all views is one
+batched product. The reduced (Schur) system has the size of the globals only, so the cost is linear in views.
 
 Damping follows Marquardt (scaled by the diagonal) with Nielsen's update. The loss is least squares or Cauchy's
 c^2 log(1 + |r|^2 / c^2) of the 2-D residual, as iteratively reweighted least squares.
@@ -28,17 +28,18 @@ S = TypeVar("S")
 
 MAX_SOLVER_ITERATIONS = 60
 COST_TOLERANCE = 1e-11
-"""Stop when the quadratic model promises less than this part of the cost: Gauss-Newton converges quadratically here, so
-the optimum is then known to about 1e-10 in cost."""
+"""Relative predicted decrease of the cost at which the solver stops: Gauss-Newton converges quadratically here, so the
+cost is then within about 1e-10 of its minimum."""
 FROM_OPTIMUM = 1e-6
-"""A solve that begins at the optimum of nearly the same problem (all images but some, another lens) stops here: a step
-that promises less of the cost changes no digit shown."""
+"""The same for a solve that starts at the optimum of nearly the same problem (some images less, another lens): smaller
+steps change no digit that is shown."""
 MIN_GAIN_RATIO = 0.5
-"""A step that gains little, and less than this share of what it promised, was too far: the next one may gain more."""
+"""A step with a small gain is the last one only if its gain ratio is above this: a step that was too long is no sign of
+convergence."""
 SOLVER_DAMPING = Damping(start=1e-13, shrink=0.01, growth=4.0, acceleration=2.0, ceiling=1e12, by_gain=True)
-"""Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6): more
-than 1e-13 would hold their combinations back, and with a shrink of 1/3 it would be dozens of steps. A step that goes
-too far is refused and the damping grows quickly."""
+"""Monomials of a polynomial are nearly dependent (eigenvalues down to 1e-12 of the scaled system at degree 6). A larger
+damping would suppress their combinations, and a shrink of 1/3 would take dozens of steps. A step that is too long is
+refused, and the damping grows quickly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,8 @@ class Convergence:
 
     Attributes
     ----------
-    iterations : steps taken.
-    converged, reason : whether it ended where it should, and how in words.
+    iterations : number of steps tried.
+    converged, reason : whether it converged, and why it stopped, in words.
     """
 
     iterations: int
@@ -58,7 +59,7 @@ class Convergence:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Linearised(LinearisedProblem):
-    """The problem around a state: the normal equations of the corners, and those with all priors added."""
+    """The problem linearised at a state: normal equations of the corners, and with all priors added."""
 
     data: NormalEquations
     normal: NormalEquations
@@ -75,8 +76,7 @@ class Linearised(LinearisedProblem):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solution(Generic[S]):
-    """The state found, the normal equations there, of the corners alone and with all priors, and how the solver
-    ended."""
+    """The solution, its normal equations, of the corners alone and with all priors, and how the solver ended."""
 
     state: S
     data: NormalEquations
@@ -103,17 +103,17 @@ def solve(
     cost_tolerance: float = COST_TOLERANCE,
     at_start: NormalEquations | None = None,
 ) -> Solution[State]:
-    """Return the state that minimises the weighted residuals from `start`, and how the solver ended. Never raises for
-    lack of data: what is not determined stays where it started.
+    """Return the state that minimises the weighted residuals, from the initial state `start`. Never raises for lack of
+    data: undetermined unknowns keep their initial values.
 
     Parameters
     ----------
     weight : (V, C) weights of the residuals (not squared), zero for corners to ignore; the observations' own by
         default.
     loss_px : scale of the Cauchy loss; None for least squares.
-    prior_sigma_px : standard deviation of a corner, which sets residuals against the priors of shape and camera; zero
-        for none.
-    at_start : the normal equations at `start`, without priors, where they are known.
+    prior_sigma_px : standard deviation of a corner, which scales residuals against the priors of shape and camera; zero
+        for no priors.
+    at_start : the normal equations at `start`, without priors, if known.
     """
     weight = observations.weight if weight is None else weight
 
@@ -135,11 +135,11 @@ def minimise(
     tolerance: float = COST_TOLERANCE,
     here: Linearised | None = None,
 ) -> Solution[S]:
-    """Return the state of least cost near `state`: Levenberg-Marquardt.
+    """Return the local minimum near `state`, by Levenberg-Marquardt.
 
-    `linearise` gives cost and normal equations together: nearly every step is taken, so hardly any are in vain.
-    `moved` returns the state after a step; where its parameters make no camera it raises, and the step is refused.
-    `here` is the problem around the start, where it is known.
+    `linearise` returns cost and normal equations together, as nearly every step is taken. `moved` returns the state
+    after a step; where the parameters are invalid for the model it raises, and the step is refused. `here` is the
+    problem linearised at `state`, if known.
     """
 
     def attempt(state: S, step: SchurStep) -> S | None:

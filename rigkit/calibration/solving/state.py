@@ -1,4 +1,4 @@
-"""Everything that is solved for when one camera is calibrated, and the residuals that it leaves."""
+"""The unknowns of the calibration of one camera, and the residuals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rigkit.geometry.rotation import exp_so3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class State:
-    """Camera, poses (V, 3, 3) and (V, 3) mm, shape and its unknowns."""
+    """Camera, poses (V, 3, 3) and (V, 3) mm, shape model and its unknowns."""
 
     camera: Camera
     rotation: Mat3
@@ -35,7 +35,7 @@ class State:
         return replace(self, rotation=self.rotation[chosen], translation_mm=self.translation_mm[chosen])
 
     def moved(self, step: SchurStep) -> State:
-        """Return the state after a step; raises InputError or DegenerateError where the parameters make no camera."""
+        """Return the state after a step; raises InputError or DegenerateError where the parameters are invalid."""
         p = self.camera.parameters.size
         return replace(
             self,
@@ -46,11 +46,11 @@ class State:
         )
 
     def with_boards_held(self) -> State:
-        """Return the state with nothing of the boards' shape left to solve for."""
+        """Return the state with the boards' shapes held."""
         return replace(self, shape=self.shape.held(self.unknowns), unknowns=np.zeros(0))
 
     def with_corners_held(self) -> State:
-        """Return the state with released corners held where they are, and the boards' warps left to solve for."""
+        """Return the state with released corners held, and only the boards' warps unknown."""
         count = self.shape.basis.shape[-1]
         if not count:
             return self.with_boards_held()
@@ -75,7 +75,7 @@ def evaluate(state: State, observations: Observations) -> Residuals:
 
 
 def weighted_squares(state: State, observations: Observations, weight: FloatArray) -> FloatArray:
-    """Return the sum of the squared residuals of each view (V,), px^2, times the squares of the weights (V, C)."""
+    """Return the weighted sum of squares of each view (V,), px^2, for weights (V, C) of the residuals."""
     return np.asarray((weight**2 * (evaluate(state, observations).px ** 2).sum(axis=-1)).sum(axis=-1))
 
 
