@@ -1,1 +1,1 @@
-"""How sure a calibration is, over the image and beyond its model."""
+"""The uncertainty of a calibration: of parameters and projection, model inadequacy included."""

@@ -1,9 +1,9 @@
-"""The covariance of all that was solved for, from what repeats, and of each camera with the boards' mean motion.
+"""Cluster-robust covariance of all unknowns, and of each camera with the boards' mean motion.
 
-One moment is what repeats (`clustered`): of a camera its image, of a rig its frame, whatever all cameras saw of all
-boards then. Light, a board that bends, cameras that are not quite of one moment touch all of it. The unknowns are the
-globals, but for released corners, which follow: the intrinsics and warps of the boards, in a rig also mounts and places
-of boards. Nothing here asks which it is: how views follow from poses and globals is `PoseJacobians`.
+A cluster (`clustered`) is everything seen at one moment: an image of a camera, a frame of a rig. Light, a board that
+bends and imperfect synchronisation affect all of it. The cluster-robust part is that of all globals except released
+corners, which follow by regression: intrinsics and warps of the boards, in a rig also mounts and places of boards.
+`PoseJacobians` describes how the views depend on poses and globals, for a camera alone and for a rig.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from rigkit.geometry.rotation import skew
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseJacobians:
-    """How N views of one camera, of different poses each, follow from the poses and the globals.
+    """Derivatives of N board poses in a camera, each with another unknown pose, by these poses and by globals.
 
     Attributes
     ----------
-    views : (N,) which of the camera's.
-    poses : (N,) the pose of each among those solved for.
-    target : (N, 6, 6) or (6, 6), how the pose in the camera (w, dt) follows from that.
-    index : (K,) the globals that it follows beside it.
-    globals : (N, 6, K) how.
+    views : (N,) indices of the camera's views.
+    poses : (N,) index of each view's pose among the unknown poses.
+    target : (N, 6, 6) or (6, 6), d pose in the camera (w, dt) / d unknown pose.
+    index : (K,) indices of the globals that the views depend on.
+    globals : (N, 6, K) d pose in the camera / d those globals.
     """
 
     views: IntArray
@@ -41,15 +41,15 @@ class PoseJacobians:
 
     @classmethod
     def alone(cls, count: int) -> Self:
-        """Return the views of a camera alone: the poses are those in the camera."""
+        """Return those of a camera alone: the unknown poses are the poses in the camera."""
         views = np.arange(count)
         return cls(views, views, np.eye(6), np.zeros(0, dtype=np.int64), np.zeros((count, 6, 0)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class GlobalCovariance:
-    """How sure a solution is: the normal equations there, priors included, the standard deviation of a corner, and what
-    the clusters say of the first n globals, all but released corners."""
+    """The uncertainty of a solution: its normal equations, priors included, the standard deviation of a corner, and the
+    cluster-robust covariance of the first n globals, all but released corners."""
 
     normal: NormalEquations
     sigma_px: float
@@ -66,9 +66,9 @@ class GlobalCovariance:
         *,
         in_order: bool = False,
     ) -> GlobalCovariance:
-        """Return it from the `products` (F, n + 7, n + 7) of every pose, as `reduced_by_cluster` has them, the
-        information (n, n) of the priors, the number of the cluster of every pose, (F,), and the standard deviation of a
-        corner from all residuals; `in_order` as for `clustered_covariance`."""
+        """Return it from the `products` (F, n + 7, n + 7) of every pose as for `reduced_by_cluster`, the information
+        `prior` (n, n), the `cluster` of every pose (F,), and the standard deviation of a corner from all residuals;
+        `in_order` as for `clustered_covariance`."""
         unit, _, own = normal.covariance
         n = len(prior)
         information, score = reduced_by_cluster(products, n, cluster, own)
@@ -77,20 +77,20 @@ class GlobalCovariance:
 
     @property
     def covariance(self) -> FloatArray:
-        """That of all globals, (G, G)."""
+        """Covariance of all globals, (G, G)."""
         return self._of(self.normal.covariance[0])
 
     def of_camera(
         self, lens: slice, parts: Sequence[PoseJacobians], translation_mm: Points, more: FloatArray | None = None
     ) -> FloatArray:
-        """Return the covariance (P + 6, P + 6) of the P parameters of a camera and of the mean motion (w, t) of the
-        boards before it. They move a point x in the camera frame by W x x + T, W and T the means of `motion_of_world`.
+        """Return the covariance (P + 6, P + 6) of the P parameters of a camera and the mean motion (W, T) of its
+        boards: it moves a point x in the camera frame by W x x + T, with the means of `motion_of_world`.
 
         Parameters
         ----------
-        lens : where the parameters stand among the globals.
-        parts : how all its V views follow, with the boards at `translation_mm` (V, 3).
-        more : (G, G) what is not sure of the globals beside.
+        lens : slice of the parameters among the globals.
+        parts : derivatives of all its V views, with the boards at `translation_mm` (V, 3).
+        more : (G, G) further covariance of the globals, added.
         """
         n, unit = len(self.clustered.covariance), self.normal.covariance[0]
         mean, spread = self._mean_motion(parts, translation_mm)
@@ -107,13 +107,13 @@ class GlobalCovariance:
         return np.asarray(out + design @ more @ design.T)
 
     def _of(self, unit: FloatArray) -> FloatArray:
-        """Return the covariance of unknowns, the globals first, from theirs for independent corners of variance one."""
+        """Return the covariance of unknowns, the globals first, from that for independent corners of unit variance."""
         found = self.clustered
         return with_block(unit * self.sigma_px**2, found.covariance, found.overdispersion**2)
 
     def _mean_motion(self, parts: Sequence[PoseJacobians], translation_mm: Points) -> tuple[FloatArray, FloatArray]:
-        """Return how the mean motion of the boards follows the globals, (6, G), and the covariance of what is its own,
-        (6, 6), for corners of variance one."""
+        """Return the derivatives of the boards' mean motion by the globals, (6, G), and its covariance (6, 6) given the
+        globals, for corners of unit variance."""
         _, back, own = self.normal.covariance
         known = self.normal.pp.trace(axis1=-2, axis2=-1) > 0.0
         shown = np.zeros(len(translation_mm), dtype=bool)
@@ -123,7 +123,7 @@ class GlobalCovariance:
         mean, each = np.zeros((6, len(self.normal.g))), np.zeros((len(own), 6, 6))
         for part in parts:
             through = lever[part.views] @ part.target
-            # Poses follow the globals, pose = -W globals + what is their own.
+            # pose = -W globals + an independent part.
             mean -= through.transpose(1, 0, 2).reshape(6, -1) @ back[part.poses].reshape(-1, mean.shape[1])
             mean[:, part.index] += (lever[part.views] @ part.globals).sum(axis=0)
             each[part.poses] += through
@@ -131,10 +131,10 @@ class GlobalCovariance:
 
 
 def motion_of_world(translation_mm: Points) -> FloatArray:
-    """Return how the motions (dw, dt) of boards at `translation_mm` (V, 3) become motions (W, T) of the world,
-    (V, 6, 6).
+    """Return the matrices (V, 6, 6) that convert motions (dw, dt) of boards at `translation_mm` (V, 3) to motions
+    (W, T) about the camera.
 
-    A point x in the camera frame that sticks to the board moves by dw x (x - t) + dt = W x x + T, with W = dw and
+    A point x in the camera frame that is fixed to the board moves by dw x (x - t) + dt = W x x + T, with W = dw and
     T = dt + t x dw.
     """
     lever = np.zeros((len(translation_mm), 6, 6))

@@ -1,4 +1,4 @@
-"""Where in the image boards were, and how far away: elsewhere a calibration extrapolates."""
+"""The part of the image that boards covered, and their distances: elsewhere a calibration extrapolates."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from rigkit.core.arrays import BoolArray, FloatArray, Pixels
 from rigkit.kernels.coverage import covered_pixels
 
 REACH = 1.0
-"""A pixel within this many spacings of a corner (of its board in its view) lies on a board: discs of 0.71 would leave
-no gap inside a regular grid, and perspective makes spacings differ within a view."""
+"""A pixel within this many corner spacings of a corner is covered. 0.71 would leave no gap in a regular grid, but
+spacings differ within a view by perspective."""
 
 
 def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
-    """Say which of `pixels` (..., 2) lie where boards of the calibration were, (...,)."""
+    """Return which of `pixels` (..., 2) boards of the calibration covered, (...,)."""
     every, flat = calibration.corners, np.reshape(pixels, (-1, 2))
     kept = every.kept
     counts = np.bincount(every.view[kept])
@@ -23,11 +23,11 @@ def covered_by_boards(calibration: Calibration, pixels: Pixels) -> BoolArray:
 
 
 def outline_of_corners(calibration: Calibration) -> Pixels:
-    """Return the convex outline of all corners used, (N, 2), each of its corners once."""
+    """Return the convex hull of all corners used, (N, 2), each vertex once."""
     from scipy.spatial import ConvexHull
 
     corners, _ = calibration.corners.used
-    # QJ: corners on one line have an outline as well, a thin one.
+    # QJ joggles the input: collinear corners have a thin hull.
     return np.asarray(corners[ConvexHull(corners, qhull_options="QJ").vertices])
 
 

@@ -1,18 +1,18 @@
-"""What a lens may do beyond its model: smooth displacements of its image, as large as the images leave open.
+"""Model inadequacy of a lens: smooth displacements of its image that no parameter of its model describes.
 
-A covariance is that of the numbers of one model. Where boards were all views agree on them, though the lens departs a
-little from every model; where no board was, the next term of the model that nobody asked for may be anything. Both are
-one question: the image of the lens is that of the model, moved by
+The covariance of the parameters assumes that the model is right. But real lenses deviate a little from every model, and
+where no board was, the next term of the model is unconstrained. So the image of the lens is that of the model,
+displaced by
 
     d(pixel) = sum_j a_j b_j(pixel),    a_j ~ N(0, tau_j^2),
 
-with b_j what models leave out: higher powers of the radius, decentring of two orders, thin prisms, shear and aspect
-ratio, each of one px at the corners of the image. What poses and parameters take up of the b_j in the images given is
-taken out of them (Schur complement), and the residuals are compared with what is left. They say how large tau is, along
-the radius and otherwise; what they leave open of it is averaged over, all orders of magnitude between limits alike.
-What the camera is wrong by has the covariance B E[a a^T] B^T, with B the displacements less what the fitted parameters
-and the rotation of the rays have taken up of them. Images that disagree for other reasons say less of a: the variance
-of residuals is that between images.
+where the b_j are terms that models leave out: higher powers of the radius, decentring of two orders, thin prisms, shear
+and aspect ratio, each of one px at the corners of the image. Poses and parameters absorb a part of the b_j, which the
+Schur complement eliminates; the residuals are compared with the rest. They determine tau, for radial terms and for the
+others; where they do not, it is integrated out with a prior that is uniform in log tau. The error of the camera has the
+covariance B E[a a^T] B^T, where B are the displacements less the part that the fitted parameters and the rotation of
+the rays absorb. The variance of the residuals is that between images, as other disagreements of the images make them
+less informative.
 
 References: D. J. C. MacKay, "Bayesian interpolation", Neural Computation 4 (1992), section 4, on the evidence. M. C.
 Kennedy, A. O'Hagan, "Bayesian calibration of computer models", J. R. Statist. Soc. B 63 (2001), on a model's
@@ -34,24 +34,30 @@ from rigkit.core.arrays import FloatArray, IntArray, Mat3, Pixels
 from rigkit.kernels.departures import DISPLACEMENTS, POSE, LensCorners, averaged_amounts, displacements
 
 SMALLEST_PX, LARGEST_PX = 1e-3, 1.0
-"""A departure at the corners of the image between these: lens models leave hundredths to tenths of a pixel. Residuals
-smaller than the first are rounding, and tell nothing."""
+"""Limits of tau: lens models leave hundredths to tenths of a pixel at the image corners. Residuals below the first are
+rounding."""
 SIZES_TRIED = np.geomspace(SMALLEST_PX, LARGEST_PX, 17)[1::2]
-"""The sizes between them that are tried: the middles of eight equal parts of their logarithm."""
+"""Values of tau for the integration: the midpoints of eight equal intervals of its logarithm."""
 ENOUGH_CORNERS, CORNERS_OF_VIEW = 4096, 16
-"""Of at least so many corners every second (third ...) is taken, where as many of each view are left."""
+"""Every second (third ...) corner is used if so many are left in all, and in each view."""
 RIDGE = 1e-12
-"""Added to the information of parameters, as a part of its mean: those that do not move take up nothing."""
+"""Added to the information of the parameters, as a part of its mean: unused parameters absorb nothing."""
 
 Fields = Callable[[FloatArray], FloatArray]
-"""Displacements (2, F, N) px at places with the derivatives (2, P + 3, N) by parameters and turns of the rays."""
+"""Displacements (2, F, N) px, from the derivatives (2, P + 3, N) by parameters and rotations of the rays."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Departures:
-    """How far a lens may depart from its model: covariance (J, J) px^2 of the J displacements (about zero, what the
-    images say of them counted in), by how much the parameters (P, J) have followed each, and the pupil's terms (2, J),
-    where that moves."""
+    """How far a lens may deviate from its model.
+
+    Attributes
+    ----------
+    size_px : (width, height) of the images.
+    covariance : (J, J) px^2, second moments about zero of the amounts of the J displacements, given the images.
+    followed : (P, J) change of the fitted parameters with each displacement.
+    followed_by_pupil : (2, J) the same of the pupil's terms; (0, J) for a central lens.
+    """
 
     size_px: tuple[int, int]
     covariance: FloatArray
@@ -60,69 +66,74 @@ class Departures:
 
     @classmethod
     def of(cls, calibration: Calibration) -> Departures:
-        """Return what the images of a calibration leave open."""
+        """Return those of a calibrated lens."""
         sigmas = _sigmas(calibration)
-        p = len(sigmas)
         products, freedom = _products(calibration, calibration.near, sigmas, np.eye(3))
         if not (np.isfinite(products).all() and products[-1, -1] >= 0.0):
-            # A lens beyond all numbers, as a damaged file may have it.
+            # A lens beyond the range of floating-point numbers, from a damaged file.
             products = np.zeros_like(products)
-        of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
-        followed = np.linalg.solve(of_parameters, products[:p, p:])
-        left = products[p:, p:] - products[p:, :p] @ followed
-        variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
+        followed, left, variance = _without_parameters(calibration, products, len(sigmas), freedom)
         covariance = _averaged(left[:-1, :-1] / variance, left[:-1, -1] / variance)
         moved = sigmas[:, None] * followed[:, :-1]
         own = calibration.camera.parameters.size
         return cls(calibration.camera.size_px, covariance, moved[:own], moved[own:])
 
     def left_over(self, pixels: Pixels, design: FloatArray) -> FloatArray:
-        """Return the displacements (2, J, M) at pixels (M, 2) less what the parameters have followed; `design`
-        (2, K, M) are the projection's derivatives there, by the parameters first."""
+        """Return the displacements (2, J, M) at pixels (M, 2) less the part that the parameters absorb; `design`
+        (2, K, M) are the projection's derivatives there, those by the parameters first."""
         own = design[:, : len(self.followed)]
         return displacements(pixels, self.size_px) - np.swapaxes(np.swapaxes(own, 1, 2) @ self.followed, 1, 2)
 
 
 def _averaged(information: FloatArray, score: FloatArray) -> FloatArray:
-    """Return E[a a^T] (J, J) of amounts a of which the images give the information (J, J) and the score (J,), averaged
-    over the sizes that those along the radius, and the others, may have beforehand."""
-    # Where nothing is known, rounding may say less than nothing.
+    """Return E[a a^T] (J, J) of amounts a with the information (J, J) and score (J,), averaged over the prior widths of
+    radial and of other displacements."""
+    # Eigenvalues that should be zero may be negative by rounding.
     values, axes = np.linalg.eigh(information)
     information = (axes * np.maximum(values, 0.0)) @ axes.T
     return averaged_amounts(information, score, SIZES_TRIED)
 
 
 def amounts_of(calibration: Calibration, fields: Fields) -> FloatArray:
-    """Return E[a a^T] (F, F) of the amounts a of F further displacements, `fields`: independent and of variance one
-    beforehand, with what the images say of them, poses and parameters eliminated."""
+    """Return E[a a^T] (F, F) of the amounts a of F further displacements `fields`, given the images, with poses and
+    parameters eliminated; a priori they are independent with unit variance."""
     sigmas = _sigmas(calibration)
     p = len(sigmas)
     products, freedom = _products(calibration, calibration.near, sigmas, np.eye(3), fields)
     count = len(products) - p - DISPLACEMENTS - 1
     if not np.isfinite(products).all():
         return np.eye(count)
-    of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
-    # The fields stand after the parameters, the residual last.
-    chosen = [*range(p, p + count), -1]
-    left = products[np.ix_(chosen, chosen)] - products[chosen, :p] @ np.linalg.solve(
-        of_parameters, products[:p, chosen]
-    )
-    variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
+    # The fields are after the parameters, the residual is last.
+    chosen = [*range(p + count), -1]
+    _, left, variance = _without_parameters(calibration, products[np.ix_(chosen, chosen)], p, freedom)
     values, axes = np.linalg.eigh(left[:-1, :-1] / variance)
     known = (axes / (1.0 + np.maximum(values, 0.0))) @ axes.T
     mean = known @ left[:-1, -1] / variance
     return np.asarray(known + np.outer(mean, mean))
 
 
+def _without_parameters(
+    calibration: Calibration, products: FloatArray, p: int, freedom: int
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the regression (p, K - p) of the other rows on the first p of `products` (K, K), the parameters, the
+    products (K - p, K - p) of the others without those, and the variance of the residuals, the last row, between
+    images."""
+    of_parameters = products[:p, :p] + RIDGE * max(np.trace(products[:p, :p]), 1.0) / p * np.eye(p)
+    followed = np.linalg.solve(of_parameters, products[:p, p:])
+    left = products[p:, p:] - products[p:, :p] @ followed
+    variance = max(float(left[-1, -1]) / max(freedom - p, 1), SMALLEST_PX**2) * calibration.overdispersion**2
+    return followed, left, variance
+
+
 def information_of_lens(calibration: Calibration, camera: Camera, turn: Mat3) -> FloatArray:
-    """Return what the corners of a calibration would tell of the parameters (P,) of another `camera`, poses eliminated,
-    (P, P) for corners of unit variance; `turn` takes rays of the calibrated camera to its own."""
+    """Return the information (P, P) of the calibration's corners, of unit variance, on the parameters of another
+    `camera`, with poses eliminated; `turn` rotates rays of the calibrated camera to those of `camera`."""
     p = camera.parameters.size
     return _products(calibration, camera, np.ones(p), turn)[0][:p, :p]
 
 
 def _sigmas(calibration: Calibration) -> FloatArray:
-    """Return the standard deviations of the parameters of a calibrated camera, and of its pupil where that moves."""
+    """Return the standard deviations of the parameters of a calibrated camera, and of a moving pupil."""
     sigmas, pupil = calibration.parameter_sigmas, calibration.pupil
     if pupil is None:
         return sigmas
@@ -132,16 +143,16 @@ def _sigmas(calibration: Calibration) -> FloatArray:
 def _products(
     calibration: Calibration, camera: Camera, sigmas: FloatArray, turn: Mat3, fields: Fields | None = None
 ) -> tuple[FloatArray, int]:
-    """Return the sums of products (K, K) of derivatives by the parameters of a camera in units of `sigmas` (P,), the
-    `fields` if given, the displacements and the residuals, of all kept corners, poses eliminated; and how many
-    residuals there are for the parameters. `turn` takes rays of the calibrated camera to those of `camera`."""
+    """Return J^T J (K, K) of all kept corners with poses eliminated, and its degrees of freedom. The columns of J are
+    derivatives by the parameters of a camera in units of `sigmas` (P,), the `fields` if given, the displacements and
+    the residuals. `turn` rotates rays of the calibrated camera to those of `camera`."""
     corners = calibration.corners
     used, count = _enough(np.flatnonzero(corners.kept), corners.view)
     view = corners.view[used]
     lever = np.einsum("nij,nj->in", corners.rotation[view], corners.points_mm[used])
     centre = corners.translation_mm.T[:, view]
     if isinstance(calibration.near, NearCamera) and camera is not calibration.near:
-        # Other lenses are shown what this one sees as from its pupil.
+        # A central lens gets the points relative to the pupil of this one.
         centre = calibration.near.seen((lever + centre).T).T - lever
     lever = turn @ lever
     x, y, z = lever + turn @ centre
@@ -155,7 +166,6 @@ def _products(
             np.append(sigmas, np.ones(more.shape[1])),
         )
     residuals = corners.residuals_px[used]
-    # Corners that do not project tell nothing.
     usable = valid & np.isfinite(residuals[:, 0]) & np.isfinite(residuals[:, 1])
     rows = LensCorners.make(
         d_pixels_d_point, d_pixels_d_parameters, sigmas, lever, (u, v), residuals, usable, count, camera.size_px
@@ -168,7 +178,7 @@ def _products(
 
 
 def turned_rays(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
-    """Return d pixel / d W (2, 3, N) of a turn W of the rays to points `along` (3, N), from d pixel / d point there."""
+    """Return d pixel / d W (2, 3, N) for a rotation W of the points `along` (3, N), from d pixel / d point there."""
     out = np.empty_like(d_pixels_d_point)
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -177,8 +187,8 @@ def turned_rays(along: FloatArray, d_pixels_d_point: FloatArray) -> FloatArray:
 
 
 def _enough(kept: IntArray, view: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the corners to take of those `kept` (N,), by their numbers, and how many they are of every view that has
-    any: of very many corners some tell enough. `view` is that of each corner."""
+    """Return the indices of a subset of the corners `kept` (N,), all unless there are very many, and the number in
+    every view that has any. `view` is that of each corner."""
     count = np.bincount(view[kept])
     count = count[count > 0]
     every = max(1, min(len(kept) // ENOUGH_CORNERS, int(count.min(initial=len(kept))) // CORNERS_OF_VIEW))

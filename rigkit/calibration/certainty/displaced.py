@@ -1,16 +1,17 @@
-"""A calibrated camera with what it may do beyond its model as further parameters.
+"""A calibrated camera with its model inadequacy as further parameters.
 
-Whatever propagates the covariance of a camera's parameters (certificates, planes, clouds) takes the lens's departures
-from its model (`departures`) along with them: a camera whose image is moved by
+So everything that propagates the covariance of a camera's parameters (certificates, planes, clouds) includes the
+departures of the lens from its model (`departures`). The image of the camera is displaced by
 
     q' = q + sum_m c_m sum_j E_jm b_j(q),      q = the model's pixel,
 
-with b_j the displacements and E (J, M) a few modes of one standard deviation each, has the amounts c, all zero, as
-parameters after those of its model. The model's parameters follow each mode as the images make them.
+with the displacements b_j and a few modes E (J, M) of one standard deviation each. The amounts c, all zero, are
+parameters after those of the model. The model's parameters change with each mode as a fit to the images would change
+them.
 
-Which way such a lens looks only its model says: a lens that is not round has no axis. The frame of the camera is that
-in which the model, as it was calibrated, is nearest to the lens where boards were, so that a camera alone turns with
-each mode by what hides it there best. In a rig the mounts follow instead.
+A displaced lens without symmetry has no optical axis. Its frame is the one in which the calibrated model is closest to
+it where boards were: so a single camera rotates with each mode by the rotation that compensates it best. In a rig the
+mounts change instead.
 """
 
 from __future__ import annotations
@@ -34,22 +35,27 @@ from rigkit.geometry.rotation import exp_so3, left_jacobian, skew
 from rigkit.kernels.departures import DISPLACEMENTS, displacement, displacements
 
 MODES_GRID = (24, 18)
-"""Columns and rows of pixels at which modes are weighed against the whole uncertainty."""
+"""Columns and rows of pixels at which modes are compared with the total uncertainty."""
 MAX_LEFT_OUT = 0.02
-"""Modes that together make up less than this part of the variance at every pixel are left out: 1 % of a sigma."""
+"""Modes that together are less than this part of the variance at every pixel are left out: 1 % of a sigma."""
 SOFTEST, HARDEST, PENALTIES = 1e-6, 1.0, 19
-"""Amounts that stand for a rival are looked for with so many penalties on their size, as parts of what moves most."""
+"""Range and number of the ridge penalties tried, relative to the largest singular value, for a rival's amounts."""
 SLOPE_STEP_PX = 1e-2
-"""For the slope of displacements, which are polynomials over hundreds of pixels: exact to eight digits."""
+"""Step of central differences of displacements, which vary over hundreds of pixels: exact to eight digits."""
 MAX_INVERSION_ROUNDS, ROUNDING_PX = 20, 1e-10
-"""Each round of going back through displacements takes their slope, a hundredth, off the error."""
+"""Rounds of the fixed-point iteration that inverts displacements: each multiplies the error by their slope, 0.01."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DisplacedCamera(Camera):
-    """A camera whose image is moved by amounts of the modes (J, M), px, of displacements; `parameters` are those of
-    its `lens` and the amounts. Beyond the corners of the image displacements stay as they are there. With the modes the
-    rays turn by `turns` (3, M), rad, before the lens sees them; None: they do not."""
+    """A camera whose image is displaced by amounts of modes.
+
+    Attributes
+    ----------
+    lens : the camera without displacements; `parameters` are its parameters, then the M amounts.
+    modes : (J, M) px, the modes in terms of the J displacements, which are constant beyond the corners of the image.
+    turns : (3, M) rad, rotation of the rays in front of the lens with each mode; None: no rotation.
+    """
 
     lens: Camera
     modes: FloatArray
@@ -79,7 +85,8 @@ class DisplacedCamera(Camera):
         return self.lens.max_angle_rad
 
     def _basis(self, u: FloatArray, v: FloatArray) -> FloatArray:
-        """Return the displacements (2, J, N) at pixels, those beyond the corners as on the circle through them."""
+        """Return the displacements (2, J, N) at pixels; pixels outside the circle through the image's corners are moved
+        to it."""
         pixels, centre = np.stack([u, v], axis=-1), image_center(self.size_px)
         off = pixels - centre
         reach = 0.5 * np.hypot(*self.size_px) / np.maximum(np.linalg.norm(off, axis=-1), 1.0)
@@ -91,7 +98,7 @@ class DisplacedCamera(Camera):
         return displacement(u, v, self._amounts, self.size_px)
 
     def _turn(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return points as the lens sees them."""
+        """Return points rotated into the frame of the lens."""
         if self._turned is None:
             return x, y, z
         x, y, z = self._turned @ np.stack([x, y, z])
@@ -144,19 +151,19 @@ class DisplacedCamera(Camera):
 
 
 def lens_of(camera: Camera) -> Camera:
-    """Return a camera as its model alone has it."""
+    """Return a camera without displacements."""
     return camera._own if isinstance(camera, DisplacedCamera) else camera
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LensModes:
-    """What a lens may do beyond its model, in M independent modes of one standard deviation each.
+    """Model inadequacy of a lens, in M independent modes of one standard deviation each.
 
     Attributes
     ----------
     modes : (J, M) px, the amounts of the displacements.
-    moves : (G, M) by how much all that was solved for is off with each mode.
-    turns : (3, M) rad, how the rays of a camera alone turn with each; None: they do not.
+    moves : (G, M) error of all unknowns with each mode.
+    turns : (3, M) rad, rotation of the rays of a single camera with each mode; None: no rotation.
     """
 
     modes: FloatArray
@@ -165,12 +172,12 @@ class LensModes:
 
 
 def uncertain_camera(calibration: Calibration, *, quoted: bool = True, near: bool = False) -> UncertainCamera:
-    """Return a calibrated camera and its covariance, with modes of what it may do beyond its model where these matter:
-    with boards all over the image and a model that fits none do, and the camera is the calibration's own.
+    """Return a calibrated camera and its covariance, with its model inadequacy as further parameters where that is
+    significant; with a model that fits and boards all over the image it is not, and the camera is the calibration's.
 
-    The covariance is that which is `quoted`; otherwise Student's, for what counts the calibration's degrees of freedom
-    itself. It is of what is far away; with `near` of points in mm, a `NearCamera` where the pupil moves: before boards
-    lens and pupil are off by less together than each alone.
+    The covariance is widened as it is `quoted`; with quoted=False it is that of Student's t, for callers that use the
+    calibration's degrees of freedom. The camera is for far points; with `near` for points in mm, a `NearCamera` where
+    the pupil moves, as the errors of lens and pupil are correlated.
     """
     pupil = calibration.pupil if near else None
     known = calibration.covariance if pupil is None else calibration.near_covariance[:-6, :-6]
@@ -181,8 +188,8 @@ def uncertain_camera(calibration: Calibration, *, quoted: bool = True, near: boo
 
 
 def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
-    """Return what a calibrated lens may do beyond its model, and how much its parameters are off with it, and those of
-    its pupil with `near`."""
+    """Return the model inadequacy of a calibrated lens, with the errors of its parameters, and with `near` those of its
+    pupil."""
     far = FarProjection.of(calibration)
     modes, followed = significant_modes(far), far.departures.followed
     if near:
@@ -193,9 +200,9 @@ def lens_modes(calibration: Calibration, *, near: bool = False) -> LensModes:
 def with_modes(
     cameras: Sequence[Camera], covariance: FloatArray, modes: Sequence[LensModes]
 ) -> tuple[tuple[Camera, ...], FloatArray]:
-    """Return cameras with the amounts of their modes as further parameters, and the covariance of all that was solved
-    for: of the parameters, camera by camera, then of the rest, as `covariance` (G, G) has it without modes. No
-    modes at all: of models that are followed."""
+    """Return cameras with the amounts of their modes as further parameters, and the covariance of all unknowns: the
+    parameters of each camera, then the rest, in the order of `covariance` (G, G), which is that without modes. Without
+    any `modes` both are returned unchanged."""
     if not modes:
         return tuple(cameras), covariance
     out: list[Camera] = []
@@ -220,8 +227,8 @@ def with_modes(
 
 
 def significant_modes(far: FarProjection) -> FloatArray:
-    """Return modes (J, M) of displacements, px, of one standard deviation each, independent of each other: those of
-    what a lens may do beyond its model, its rivals too, that matter beside its parameters."""
+    """Return independent modes (J, M) px of displacements, one standard deviation each: those of the model inadequacy,
+    rivals included, that are significant against the uncertainty of the parameters."""
     pixels = grid_pixels(far.camera.size_px, MODES_GRID).reshape(-1, 2)
     rays, valid = far.camera.unproject(pixels)
     rays = rays[valid]
@@ -230,7 +237,7 @@ def significant_modes(far: FarProjection) -> FloatArray:
     known = np.isfinite(whole) & (whole > 0.0)
     if not known.any():
         return np.zeros((DISPLACEMENTS, 0))
-    # In sigmas of the whole: what matters where boards were is not less than what matters far from them.
+    # In units of the total sigma, so that places count alike.
     at, whole = at[known], whole[known]
     relative = far.left_over(at).transpose(1, 2, 0) / whole[:, None]
     fields = relative.reshape(DISPLACEMENTS, -1)
@@ -241,7 +248,7 @@ def significant_modes(far: FarProjection) -> FloatArray:
     values, axes = np.linalg.eigh(covariance)
     root = axes * np.sqrt(np.maximum(values, 0.0))
     flat = root.T @ fields
-    # Smallest first: the shares add up until they matter at some pixel.
+    # From the smallest on: parts of the variance add up until they matter at some pixel.
     turn = np.linalg.eigh(flat @ flat.T)[1]
     share = ((turn.T @ flat) ** 2).reshape(DISPLACEMENTS, -1, 2).sum(axis=-1)
     matters = np.cumsum(share, axis=0).max(axis=1) > MAX_LEFT_OUT
@@ -249,14 +256,13 @@ def significant_modes(far: FarProjection) -> FloatArray:
 
 
 def _amounts_like(far: FarProjection, at: Along, whole: FloatArray, fields: FloatArray, away: FloatArray) -> FloatArray:
-    """Return the amounts (J,) with which the displaced camera, its parameters following, shows M rays nearest to `away`
-    (M, 2) px from where it has them, in units of `whole` (M,) px. `fields` (J, 2 M) are the displacements, in these
-    units, less what parameters and a rotation have taken up.
+    """Return the amounts (J,) with which the displaced camera, its parameters adapted, moves M rays closest to `away`
+    (M, 2) px, in units of `whole` (M,) px. `fields` (J, 2 M) are the displacements, in these units, less the part that
+    parameters and a rotation absorb.
 
-    Displacements of many pixels that parameters and a turned camera take up again but for a little would show any
-    difference at first order. Of a camera that is moved so far that is not true, and what is seen in its frame turns
-    with it. So the turn is to be none, large amounts are penalised, and of all penalties that is taken with which the
-    camera that is really moved comes nearest.
+    At first order, huge displacements that parameters and a rotation compensate almost completely could represent any
+    difference, but the exact camera would not. So the rotation is fitted to zero and large amounts are penalised
+    (ridge); the penalty is the one with which the exact displaced camera has the least error.
     """
     p = len(far.sigmas)
     turned = np.einsum("wj,iwm->jmi", far.hides_departures, at.design[:, p:]) / whole[:, None]

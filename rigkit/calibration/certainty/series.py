@@ -1,19 +1,18 @@
-"""What a lens's series leaves out: the terms after its last.
+"""Truncation error of a lens model that is a series: the terms after its last one.
 
-Polynomials of the radius or of the angle are the first terms of a series. Boards in the middle of an image bear out as
-few terms as show the middle; the next one may be thousandths of a pixel there, and pixels beyond them. No residual
-tells of it, but the terms that there are do: let F_n(pixel) be by how far the last term moves the projection where all
-other parameters follow as the images make them, F_(n-1) the same of the term before it. A series that falls by as much
-with each further term leaves out
+Polynomials of the radius or of the angle are truncated series. Boards in the middle of an image support few terms; the
+next one may be thousandths of a pixel there, and several pixels outside. No residual shows it, but the kept terms give
+its size. Let F_n(pixel) be the displacement of the projection by the last term, with all other parameters refitted to
+the images, and F_(n-1) that by the term before it. If the series decreases geometrically, the truncated terms are
 
     sum_k a_k F_n q^k,    q = min(1, |F_n| / |F_(n-1)|) at each pixel,    a_k ~ N(0, 1),
 
-next to nothing where boards were. A term counts as far as it is there: its value squared, less its variance. What the
-images say of the a_k is counted in, as with other departures of a lens from its model.
+almost zero where boards were. The size of a term is its value squared less its variance. The a_k are estimated from the
+images like other departures of a lens from its model.
 
 Reference: R. J. Furnstahl, N. Klco, D. R. Phillips, S. Wesolowski, "Quantifying truncation errors in effective field
-theory", Phys. Rev. C 92, 024005 (2015): a series is cut off with an error of the size of the term left out, which those
-kept tell.
+theory", Phys. Rev. C 92, 024005 (2015): the truncation error has the size of the first omitted term, which the kept
+terms predict.
 """
 
 from __future__ import annotations
@@ -27,19 +26,20 @@ from rigkit.calibration.result import Calibration
 from rigkit.core.arrays import FloatArray
 
 TERMS, LEFT_OUT = 2, 3
-"""So many terms tell how a series falls, and so many after the last are counted: of a series that falls to two thirds
-with each term, 95 % of the squares of all."""
+"""Number of terms that give the ratio of the series, and number of truncated terms included: 95 % of their squares for
+a ratio of two thirds."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Remainder:
-    """The terms that the series of a lens leaves out.
+    """The truncated terms of the series of a lens.
 
     Attributes
     ----------
-    last, before : (P + 3,) how parameters move with the last term, and with that before it, and the rotation that hides
-        it best where boards were.
-    amounts : (LEFT_OUT, LEFT_OUT) independent sums of the terms left out, one standard deviation each.
+    last, before : (P + 3,) change of the parameters with the last term and with the one before it, and the rotation
+        that compensates it best where boards were.
+    amounts : (LEFT_OUT, LEFT_OUT) rows are independent combinations of the truncated terms, one standard deviation
+        each.
     """
 
     last: FloatArray
@@ -48,9 +48,9 @@ class Remainder:
 
     @classmethod
     def of(cls, calibration: Calibration, covariance: FloatArray, hides: FloatArray) -> Remainder | None:
-        """Return that of a calibrated lens whose parameters have the `covariance` (P, P); `hides` (3, P) are the
-        rotations that hide a step of each where boards were. None where the lens is no series, or its last term is not
-        there."""
+        """Return that of a calibrated lens with the `covariance` (P, P) of its parameters; `hides` (3, P) are the
+        rotations that compensate a step of each best where boards were. None where the model is no series, or its last
+        term is not significant."""
         terms = calibration.camera.series[-TERMS:][::-1]
         if len(terms) < TERMS:
             return None
@@ -59,7 +59,7 @@ class Remainder:
             variance, size = float(left[term, term]), float(value[term])
             if variance <= 0.0:
                 return None
-            # By how much each parameter goes with this one.
+            # Regression of the parameters on this one.
             along = left[:, term] / variance
             step = along * np.sign(size) * np.sqrt(max(size * size - variance, 0.0))
             steps.append(np.concatenate([step, -hides @ step]))
@@ -72,13 +72,13 @@ class Remainder:
         return cls(last, before, (axes * np.sqrt(np.maximum(values, 0.0))).T)
 
     def away(self, design: FloatArray) -> FloatArray:
-        """Return by how far (LEFT_OUT, M, 2) px its parts move the projection, one standard deviation each; `design`
-        (2, P + 3, M) are the derivatives by parameters and turns."""
+        """Return the displacements (LEFT_OUT, M, 2) px of the projection by its independent parts, one standard
+        deviation each; `design` (2, P + 3, M) are the derivatives by parameters and rotations."""
         return np.asarray(np.einsum("kj,ijm->kmi", self.amounts, _left_out(design, self.last, self.before)))
 
 
 def _left_out(design: FloatArray, last: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the terms that a series leaves out (2, LEFT_OUT, M), from its two last ones."""
+    """Return the displacements (2, LEFT_OUT, M) by the truncated terms, from those by the last two."""
     moved, larger = (np.einsum("ipm,p->im", design, step) for step in (last, before))
     size, whole = np.linalg.norm(moved, axis=0), np.linalg.norm(larger, axis=0)
     falls = np.divide(size, whole, out=np.ones_like(size), where=whole > size)

@@ -1,21 +1,21 @@
-"""How far a calibrated projection may be off, over the image, in pixels.
+"""Uncertainty of a calibrated projection over the image, in pixels.
 
-The covariance of the parameters alone says too much: a changed principal point and a turned camera are the same image
-of the world, and a camera calibrated from boards alone has a free rotation. At infinity a change dk of the parameters
-goes with the rotation W that hides it best where the boards were,
+Propagating the covariance of the parameters alone overestimates it: a shift of the principal point is almost
+equivalent to a rotation of the camera, and a camera calibrated from boards alone has a free rotation. So for far points
+a change dk of the parameters is combined with the rotation W that compensates it best where the boards were,
 
     dq = (Q - R (R^T R)^-1 R^T Q) dk,      Q = d q / d k,      R = d q / d W,
 
-sums over the corners used. Of points at a known distance what counts is where a point that is fixed to the boards
-appears: the boards' solved motions, averaged, are the motion of the world (W, T) that goes with dk, and
+with sums over the corners used. For points at a known distance the uncertainty is that of the image of a point fixed to
+the boards: the mean motion of the boards is the motion (W, T) that goes with dk, and
 
     dq = d q / d k  dk + d q / d x (W x x + T)
 
-has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`). To both is added
-what the lens may do beyond its model (`departures`, `series`): next to nothing where many boards were and it fits.
+has the covariance M F M^T, with F the joint covariance of (k, W, T) (`Calibration.frame_covariance`). Model inadequacy
+(`departures`, `series`) is added to both: almost zero where many boards were and the model fits.
 
-Reference: D. Kogan, mrcal, "Projection uncertainty" and "Projection differences" (the mean over the frames and the
-rotation that is taken out are the same; here in closed form).
+Reference: D. Kogan, mrcal, "Projection uncertainty" and "Projection differences" (the same mean over the frames and the
+same rotation; here in closed form).
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from rigkit.calibration.certainty.departures import Departures, information_of_l
 from rigkit.calibration.certainty.series import TERMS, Remainder
 from rigkit.calibration.result import Calibration, CalibrationCorners, Rival
 from rigkit.cameras.base import Camera
-from rigkit.cameras.compare import best_rotation
+from rigkit.cameras.compare import best_rotation, grid_pixels
 from rigkit.core.arrays import BoolArray, FloatArray, IntArray, Mat3, Pixels, Points, Rays, scaled_pinv, symmetric_pinv
 from rigkit.geometry.rotation import exp_so3, skew
 
 CORNERS = 400
-"""So many corners, spread over all views, are enough to see how sure the projection is where the boards were."""
+"""Number of corners, spread over all views, at which the uncertainty is evaluated."""
 FOLLOWED = 1e-6
-"""Combinations of parameters with less than this part of the largest effect at the corners stay where they are."""
+"""Relative singular value up to which a combination of parameters has no effect at the corners and is not changed."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,9 +45,9 @@ class Uncertainty:
 
     Attributes
     ----------
-    pixels : (..., 2) where.
+    pixels : (..., 2) where it is evaluated.
     covariance : (..., 2, 2) px^2, NaN where the pixel has no ray.
-    valid : (...,)
+    valid : (...,) whether the pixel has a ray.
     """
 
     pixels: Pixels
@@ -61,8 +61,8 @@ class Uncertainty:
 
 
 def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm: float = np.inf) -> Uncertainty:
-    """Return the uncertainty of the projection at `pixels` (..., 2) of points `range_mm` away: at infinity (default)
-    after the rotation that boards leave open, nearer relative to the boards."""
+    """Return the uncertainty of the projection at `pixels` (..., 2) for points at the distance `range_mm`: at infinity
+    (default) after the free rotation, at a finite distance relative to the boards."""
     pixels = np.asarray(pixels, dtype=np.float64)
     rays, valid = calibration.camera.unproject(pixels)
     flat = np.where(valid[..., None], rays, [0.0, 0.0, 1.0]).reshape(-1, 3)
@@ -78,15 +78,15 @@ def projection_uncertainty(calibration: Calibration, pixels: Pixels, *, range_mm
 
 
 def worst_direction(covariance: FloatArray) -> FloatArray:
-    """Return the standard deviation in the worst direction (...,) of covariances (..., 2, 2)."""
+    """Return the standard deviation in the worst direction (...,) for covariances (..., 2, 2)."""
     a, b, c = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     return np.asarray(np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b)))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Along:
-    """What a camera makes of `rays` (M, 3): their `pixels` (M, 2), NaN where it has none, and the `design`
-    (2, P + 3, M) of `projection_design`."""
+    """Rays (M, 3) with their pixels (M, 2) in a camera, NaN outside its field of view, and their `projection_design`
+    (2, P + 3, M)."""
 
     rays: Rays
     pixels: Pixels
@@ -104,22 +104,21 @@ class Along:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FarProjection:
-    """How sure a calibration is of the projection of points at infinity, after the rotation that hides a change of the
+    """Uncertainty of the projection of points at infinity, after the rotation that compensates a change of the
     parameters best where the boards were.
 
     Attributes
     ----------
-    camera : the camera.
+    calibration, camera : the calibration and its camera.
     correlation, sigmas : (P, P) and (P,) of its parameters.
     rays_valid : (M,) which of up to 400 corners, spread over all views, have a ray.
     corners : the projection along those N rays.
-    hides : (3, P) the rotation that hides a step of one standard deviation of each parameter.
-    departures, hides_departures : what the lens may do beyond its model, and (3, J) the rotations that hide that.
-    corners_left : (2, P + J, N) what that leaves, at the corners, of such steps and of the displacements.
-    rivals : lenses of other models, each with how the parameters (P,) follow it and the rotation of its rays (3, 3):
-        where boards were it is followed, elsewhere the two go apart.
-    remainder : what the lens's series leaves out; None: it is no series.
-    calibration : whose it is.
+    hides : (3, P) the rotation that compensates a step of one standard deviation of each parameter.
+    departures, hides_departures : model inadequacy of the lens, and (3, J) the rotations that compensate displacements.
+    corners_left : (2, P + J, N) displacement of the corners by such steps and displacements after these rotations.
+    rivals : cameras of other models, each with the change of the parameters (P,) that fits `camera` to it where boards
+        were, and the rotation of its rays (3, 3). Elsewhere the two differ.
+    remainder : truncation error of the lens's series; None if the model is no series.
     """
 
     calibration: Calibration
@@ -137,8 +136,8 @@ class FarProjection:
 
     @classmethod
     def of(cls, calibration: Calibration, *, from_boards: bool = False) -> FarProjection:
-        """Return it for a calibration; the rays to the corners `from_boards` as they were solved, where all are known
-        to project: it saves the way back from the pixels."""
+        """Return that of a calibration. With `from_boards` the rays are those to the solved corners, which all have to
+        project: this saves the unprojection of the pixels."""
         camera, corners = calibration.camera, calibration.corners
         chosen = _spread(corners)
         if from_boards and calibration.pupil is None:
@@ -148,17 +147,13 @@ class FarProjection:
             rays, valid = camera.unproject(corners.pixels[chosen])
             rays = rays[valid]
         p = camera.parameters.size
-        # Parameters have units of their own: in standard deviations they can be compared.
+        # Parameters have different units; in standard deviations they are comparable.
         known = calibration.widening**2 * calibration.covariance
         sigmas = np.sqrt(np.maximum(np.diag(known), 0.0))
         at, departures = Along.of(camera, rays), Departures.of(calibration)
         left = np.concatenate([sigmas[:, None] * at.design[:, :p], departures.left_over(at.pixels, at.design)], axis=1)
         turned = at.design[:, p:]
-        square, across = (
-            (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0),
-            (turned @ np.swapaxes(left, 1, 2)).sum(axis=0),
-        )
-        hides = symmetric_pinv(square) @ across
+        hides = _hiding_rotations(turned, left)
         left -= hides.T @ turned
         safe = np.where(sigmas > 0.0, sigmas, 1.0)
         correlation = known / np.outer(safe, safe)
@@ -183,14 +178,15 @@ class FarProjection:
         return self._of_parameters(at.design) + self.beyond_model(at)
 
     def beyond_model(self, at: Along) -> FloatArray:
-        """Return what of the covariance (M, 2, 2) is what the lens may do beyond its model."""
+        """Return the part of the covariance (M, 2, 2) from model inadequacy and rivals."""
         return self._beyond(self.left_over(at), at) + self._less_sure(at.rays)
 
     def _less_sure(self, rays: Rays) -> FloatArray:
-        """Return by how much (M, 2, 2) rivals know less of `rays` (M, 3) than the lens chosen: where it is a rival that
-        is right, its own covariance is the true one (Buckland et al. 1997, eq. 9). Where boards were that is nothing;
-        elsewhere a richer model leaves open what the chosen one takes for known. Of a series with more terms that would
-        be what nobody knows of a term that is there no more than the others let expect: the `remainder` stands for it.
+        """Return the excess (M, 2, 2) of the rivals' own covariances along `rays` (M, 3) over that of the chosen lens,
+        weighted by their probabilities (Buckland et al. 1997, eq. 9): if a rival is right, its covariance is.
+
+        It is zero where boards were; elsewhere a model with more parameters is less certain. Longer series of the same
+        model are left out: the `remainder` stands for their further terms.
         """
         out = np.zeros((len(rays), 2, 2))
         if not self._others:
@@ -199,20 +195,20 @@ class FarProjection:
         known = own.along(rays)
         for (rival, turn), other in zip(self._others, others, strict=True):
             more = other.along(rays @ turn.T) - known
-            # As with `away`: what one of the two does not see is not compared.
+            # Outside the field of view of either lens the excess is zero.
             values, axes = np.linalg.eigh(np.where(np.isfinite(more).all(axis=(1, 2), keepdims=True), more, 0.0))
             out += rival.likely * (axes * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(axes, 1, 2)
         return out
 
     @property
     def _others(self) -> list[tuple[Rival, Mat3]]:
-        """Rivals that are not the same series with other terms."""
+        """Rivals that are not of the same series with another number of terms."""
         same = self.camera.model if len(self.camera.series) >= TERMS else ""
         return [(rival, turn) for rival, _, turn in self.rivals if rival.camera.model != same]
 
     @cached_property
     def _alone(self) -> list[_Alone]:
-        """The lens and its rivals, each as if there were no other."""
+        """The lens and its rivals, each with its own covariance."""
         rays = self.corners.rays
         lenses = [(self.camera, np.eye(3)), *((rival.camera, turn) for rival, turn in self._others)]
         return [_Alone.of(self.calibration, camera, turn, rays) for camera, turn in lenses]
@@ -224,15 +220,14 @@ class FarProjection:
         return out
 
     def left_over(self, at: Along) -> FloatArray:
-        """Return what parameters and rotation leave of the displacements, (2, J, M) px."""
+        """Return the displacements less the part that parameters and rotation absorb, (2, J, M) px."""
         left = self.departures.left_over(at.pixels, at.design)
-        left -= np.einsum("wj,iwm->ijm", self.hides_departures, at.design[:, len(self.sigmas) :])
-        return left
+        return _less_rotation(left, self.hides_departures, at.design[:, len(self.sigmas) :])
 
     def away(self, at: Along) -> list[FloatArray]:
-        """Return how far other lenses that may be the true one project the rays elsewhere, (M, 2) px each, times the
-        root of how likely they are: each rival, followed where the boards were, and the lens with the terms that its
-        series leaves out."""
+        """Return the displacements (M, 2) px of the rays in other lenses that may be the true one: each rival, with the
+        chosen lens fitted to it where boards were, times the root of its probability, and the truncated terms of the
+        series."""
         out, p = [], len(self.sigmas)
         for rival, step, turn in self.rivals:
             there, seen = rival.camera.project(at.rays @ turn.T)
@@ -250,7 +245,7 @@ class FarProjection:
 
     @property
     def of_parameters_px(self) -> FloatArray:
-        """The same (M,) where the model were known to be right."""
+        """The same (M,) without model inadequacy."""
         return self._over_all(self._corners_of_parameters)
 
     @cached_property
@@ -264,26 +259,27 @@ class FarProjection:
 
     @property
     def usual_px(self) -> float:
-        """Standard deviation where the boards were: rms over the corners; infinite where none has a ray."""
+        """Standard deviation where the boards were: rms over the corners; infinite if none has a ray."""
         known = self.at_corners_px[np.isfinite(self.at_corners_px)]
         return float(np.sqrt(np.mean(known**2))) if known.size else float("inf")
 
     @property
     def worst_px(self) -> float:
-        """The same of the worst corner."""
+        """Standard deviation at the worst corner."""
         known = self.at_corners_px[np.isfinite(self.at_corners_px)]
         return float(known.max()) if known.size else float("inf")
 
     def _of_parameters(self, design: FloatArray) -> FloatArray:
         p = len(self.sigmas)
-        left = self.sigmas[:, None] * design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:])
-        return _propagated(self.correlation, left)
+        return _propagated(
+            self.correlation, _less_rotation(self.sigmas[:, None] * design[:, :p], self.hides, design[:, p:])
+        )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Alone:
-    """A lens with the covariance (P, P) that it would have by itself for these corners, and the rotations (3, P) that
-    hide its parameters best where boards were."""
+    """A lens with the covariance (P, P) of its own parameters for the same corners, and the rotations (3, P) that
+    compensate its parameters best where boards were."""
 
     camera: Camera
     covariance: FloatArray
@@ -291,25 +287,34 @@ class _Alone:
 
     @classmethod
     def of(cls, calibration: Calibration, camera: Camera, turn: Mat3, rays: Rays) -> _Alone:
-        """Return it for a `camera` whose rays are those of the calibrated one, of which these are `rays` (N, 3) to
-        corners, after a `turn`."""
-        # A lens gone astray may know nothing of a parameter, or by rounding less.
+        """Return that of a `camera`; `rays` (N, 3) are those to corners in the calibrated camera, and `turn` rotates
+        them to those of `camera`."""
+        # A rival may leave a parameter undetermined.
         covariance = scaled_pinv(information_of_lens(calibration, camera, turn))
         sigma = calibration.sigma_px * calibration.overdispersion * calibration.widening
         design, p = projection_design(camera, rays @ turn.T), len(covariance)
-        turned = design[:, p:]
-        square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
-        hides = symmetric_pinv(square) @ (turned @ np.swapaxes(design[:, :p], 1, 2)).sum(axis=0)
-        return cls(camera, covariance * sigma**2, hides)
+        return cls(camera, covariance * sigma**2, _hiding_rotations(design[:, p:], design[:, :p]))
 
     def along(self, rays: Rays) -> FloatArray:
         """Return the covariance (M, 2, 2) of the projection along rays (M, 3) of the lens itself."""
         design, p = projection_design(self.camera, rays), len(self.covariance)
-        return _propagated(self.covariance, design[:, :p] - np.einsum("wp,iwm->ipm", self.hides, design[:, p:]))
+        return _propagated(self.covariance, _less_rotation(design[:, :p], self.hides, design[:, p:]))
+
+
+def _hiding_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray:
+    """Return the rotations (3, K) that compensate displacements `moved` (2, K, M) of M pixels best; `turned` (2, 3, M)
+    is d pixel / d rotation."""
+    square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
+    return symmetric_pinv(square) @ (turned @ np.swapaxes(moved, 1, 2)).sum(axis=0)
+
+
+def _less_rotation(moved: FloatArray, hides: FloatArray, turned: FloatArray) -> FloatArray:
+    """Return displacements (2, K, M) after the rotations `hides` (3, K) that compensate them."""
+    return np.asarray(moved - np.einsum("wk,iwm->ikm", hides, turned))
 
 
 def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
-    """Return the covariances (M, 2, 2) of what has the derivatives `design` (2, K, M) by K unknowns."""
+    """Return covariances (M, 2, 2) from that of K parameters (K, K) and the derivatives `design` (2, K, M) by them."""
     moved = parameters @ design
     covariance = np.empty((design.shape[-1], 2, 2))
     for i, j in ((0, 0), (0, 1), (1, 1)):
@@ -318,13 +323,13 @@ def _propagated(parameters: FloatArray, design: FloatArray) -> FloatArray:
 
 
 def projection_design(camera: Camera, rays: FloatArray, range_mm: float = np.inf) -> FloatArray:
-    """Return d pixel / d (k, W, T), (2, P + 6, M), along rays (M, 3); at infinity the world's shift shows nothing, and
-    it is (2, P + 3, M)."""
+    """Return d pixel / d (k, W, T), (2, P + 6, M), along rays (M, 3); at infinity, where a translation has no effect,
+    (2, P + 3, M)."""
     return _projected(camera, rays, range_mm)[1]
 
 
 def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixels, FloatArray]:
-    """Return the pixels (M, 2), NaN where there is none, and `projection_design`."""
+    """Return the pixels (M, 2), NaN outside the field of view, and `projection_design`."""
     # Unknowns first, pixels last: one matrix product for each coordinate.
     p = camera.parameters.size
     count = p + 3 if np.isinf(range_mm) else p + 6
@@ -341,13 +346,13 @@ def _projected(camera: Camera, rays: FloatArray, range_mm: float) -> tuple[Pixel
 
 
 def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> tuple[FloatArray, Mat3]:
-    """Return by how much the parameters (P,) of a camera change for it to project `rays` (N, 3) as another one does,
-    and the rotation other_from_camera (3, 3) of the rays that goes with it; `sigmas` (P,) make them comparable."""
+    """Return the change of the parameters (P,) of a camera that fits it to another one along `rays` (N, 3), and the
+    rotation other_from_camera (3, 3) of the rays fitted with it; `sigmas` (P,) scale the parameters."""
     pixels, valid = camera.project(rays)
     rays, pixels = rays[valid], pixels[valid]
     turn = best_rotation(rays, pixels, np.ones(len(rays)), other)
     there, seen = other.project(rays @ turn.T)
-    # Part of that rotation may be the parameters': both are found together.
+    # Parameters and rotation are correlated: both are fitted together.
     rows = projection_design(camera, rays[seen]).transpose(2, 0, 1).reshape(-1, len(sigmas) + 3)
     rows[:, :-3] *= sigmas
     size = np.linalg.norm(rows, axis=0)
@@ -359,16 +364,16 @@ def followed(camera: Camera, other: Camera, rays: Rays, sigmas: FloatArray) -> t
 def pose_covariance_of_lens(
     camera: Camera, covariance: FloatArray, points_in_cam: Points, origin_in_cam: FloatArray, sigma_px: FloatArray
 ) -> FloatArray:
-    """Return the lens's share in the covariance of a pose that was found with it: (6, 6) of (w, v), R' = exp([w]x) R,
+    """Return the part of a board pose's covariance that comes from the lens: (6, 6) of (w, v), R' = exp([w]x) R,
     t' = t + v, rad and mm.
 
-    A changed lens and a moved board show one image: with dq = A dp + K dk = 0, dp = -(A^T W A)^-1 A^T W K dk.
+    The corners fix the pixels: from dq = A dp + K dk = 0 follows dp = -(A^T W A)^-1 A^T W K dk.
 
     Parameters
     ----------
     covariance : (P, P) of the camera's parameters.
-    points_in_cam, origin_in_cam, sigma_px : (N, 3) and (3,) the board's points and its origin, mm, and (N,) the
-        standard deviations that weighted them.
+    points_in_cam, origin_in_cam : (N, 3) and (3,) the board's points and its origin, mm.
+    sigma_px : (N,) standard deviations of the corners.
     """
     _, _, d_pixels_d_point, by_lens = camera.project_with_jacobians(points_in_cam)
     by_pose = np.concatenate([-d_pixels_d_point @ skew(points_in_cam - origin_in_cam), d_pixels_d_point], axis=-1)
@@ -378,8 +383,8 @@ def pose_covariance_of_lens(
 
 
 def _spread(corners: CalibrationCorners) -> IntArray:
-    """Return the numbers of up to 400 kept corners, of views in the order of where they lie in the image: the same ones
-    in whatever order the views are."""
+    """Return the indices of up to 400 kept corners, with the views ordered by their place in the image: the choice does
+    not depend on the order of the views."""
     chosen = np.flatnonzero(corners.kept)
     view = corners.view[chosen]
     shown, first = np.unique(view, return_index=True)
@@ -390,7 +395,5 @@ def _spread(corners: CalibrationCorners) -> IntArray:
 
 
 def uncertainty_map(calibration: Calibration, *, grid: tuple[int, int] = (40, 30)) -> Uncertainty:
-    """Return how sure far points are at `grid` (columns, rows) pixels of the image, as arrays (rows, columns, ...)."""
-    width, height = calibration.camera.size_px
-    u, v = np.meshgrid(np.linspace(0.0, width - 1.0, grid[0]), np.linspace(0.0, height - 1.0, grid[1]))
-    return projection_uncertainty(calibration, np.stack([u, v], axis=-1))
+    """Return the uncertainty for far points at `grid` (columns, rows) pixels, as arrays (rows, columns, ...)."""
+    return projection_uncertainty(calibration, grid_pixels(calibration.camera.size_px, grid))
