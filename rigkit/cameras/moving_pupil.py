@@ -168,6 +168,11 @@ def as_other_with_fixed_pupil(pixels: Pixels, points: Points, camera: Camera, ot
     return np.where(np.isfinite(again), again, pixels)
 
 
+def with_pupil_of(lens: Camera, camera: Camera) -> Camera:
+    """Return the central camera `lens` with the moving pupil of `camera`; `lens` itself if that is central."""
+    return NearCamera.of(lens, camera.pupil) if isinstance(camera, NearCamera) else lens
+
+
 def far_camera(camera: Camera) -> Camera:
     """Return the central camera that is exact far away: of one with a moving pupil its lens, else the camera."""
     return camera.lens if isinstance(camera, NearCamera) else camera

@@ -1,1 +1,1 @@
-"""Which lens, which shape of the board, and which end of it is which: several are fitted, other images decide."""
+"""Model selection: camera models and board shapes are compared by held-out error; orientation of symmetric boards."""

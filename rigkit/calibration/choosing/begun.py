@@ -1,6 +1,6 @@
-"""One camera with all models in question fitted: what `calibrate` of it alone and that of its rig have in common.
+"""One camera with all candidate models fitted: the common part of calibrating it alone and in its rig.
 
-Steps that are done are kept: whoever asks of the same images once more does not wait for them again.
+Results are cached, so that a second calibration of the same images does not repeat them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rigkit.core.errors import DegenerateError, InputError
 
 @contextmanager
 def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
-    """Name the camera in errors; where its images repeat each other, nothing else needs to be looked for."""
+    """Add the camera's name to errors, and the cause where all images are near-duplicates."""
     try:
         yield
     except (InputError, DegenerateError) as error:
@@ -46,8 +46,16 @@ def about_camera(name: str, views: Sequence[BoardView]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class BegunCalibration:
-    """A camera (`name` in messages, "" for one alone) with all models in question fitted to its `views`; `tried` are
-    compared on flat boards where there are several. What each model comes to is found once."""
+    """A camera with all candidate models fitted to its views.
+
+    Attributes
+    ----------
+    name : name of the camera in messages, "" for a single camera.
+    request : options of the calibration.
+    views, dropped, observations : all views, (image, reason) of those not usable, and the usable ones as arrays.
+    wanted, options, failed : models to fit, those fitted, and those that failed.
+    tried : the options compared on flat boards; with a single model the options themselves.
+    """
 
     name: str
     request: Request
@@ -62,7 +70,7 @@ class BegunCalibration:
     _on_boards: dict[str, dict[str, FittedModel]] = field(default_factory=dict)
 
     def solved(self, model: str) -> ModelOutcome:
-        """Return what a camera model comes to."""
+        """Return the outcome of a camera model."""
         if model not in self._solved:
             with about_camera(self.name, self.observations.views):
                 own, wanted = only(self.options, self.wanted, model)
@@ -70,13 +78,13 @@ class BegunCalibration:
         return self._solved[model]
 
     def on_boards(self, model: str, names: Sequence[str]) -> list[FittedModel]:
-        """Return the lenses tried, those of the `names`, on boards as a camera model found them."""
+        """Return the options of the given `names`, compared on the board shapes that a camera model found."""
         done = self._on_boards.setdefault(model, {})
         return lenses_on_boards(self.solved(model), self.tried, names, self.request, done)
 
     def asked(self, name: str, views: Sequence[BoardView], request: Request) -> Self | None:
-        """Return it as a camera of another name, or alone, with the pupil asked for; None where it is of other views,
-        or was begun otherwise. What is found of either is kept for both."""
+        """Return this camera under another name and pupil option, sharing the cached results; None where the views or
+        the other options differ."""
         then, now = ((h.size_px, h.model, h.degree, h.board, h.folds) for h in (self.request, request))
         if then != now or len(views) != len(self.views) or not all(map(_same, self.views, views)):
             return None
@@ -84,14 +92,14 @@ class BegunCalibration:
 
 
 def _same(a: BoardView, b: BoardView) -> bool:
-    """Say whether two views are one; they may have come from another process."""
+    """Return whether two views are equal; they may be copies from another process."""
     arrays = ((a.grid, b.grid), (a.pixels, b.pixels), (a.sigma_px, b.sigma_px), (a.points(), b.points()))
     named = (a.image, a.board.board_id) == (b.image, b.board.board_id)
     return named and all(np.array_equal(x, y) for x, y in arrays)
 
 
 def begin(name: str, views: Sequence[BoardView], request: Request) -> BegunCalibration:
-    """Return a camera with all models fitted that `request` asks for; errors as of `calibrate`, with its name."""
+    """Return a camera with all models of `request` fitted; raises as `calibrate`, with the camera's name."""
     with about_camera(name, views):
         wanted = wanted_models(request)
         used, dropped = usable_views(views, request.size_px)

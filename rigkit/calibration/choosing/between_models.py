@@ -1,15 +1,13 @@
-"""What nobody knows of a lens because nobody knows its model: the difference between models that the images support
-about as well.
+"""Uncertainty of the model selection: the difference between models that the images support about as well.
 
-A covariance is that of one model's numbers. Where others predict images that took no part as well, each of them may be
-the better one, and the lens chosen is wrong by the difference: with weights w_m that say how likely that is,
+The covariance of the parameters assumes that the chosen model is right. Where others have about the same held-out
+error, each of them may be the better one, and the chosen lens is wrong by the difference. With their probabilities w_m
 
     Cov = Cov_chosen + sum_m w_m d_m d_m^T,
 
-where d_m is how the unknowns of the chosen model move to follow model m where the boards were, after the rotation of
-the rays that boards leave open, and with the boards' motions that go with it. Where one model is clearly the best all
-w_m are zero. A board's shape is a model, too: flat, warped or of free shape, a board that few images show bends the
-lens to itself.
+where d_m is the change of the chosen model's unknowns that fits it to model m where the boards were, after the free
+rotation of the rays, together with the motions of the boards. Where one model is clearly the best all w_m are zero. A
+board shape (flat, warped, released) is a model, too: the shape of a board in few images biases the lens.
 
 Reference: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference", Biometrics
 53 (1997), eq. 9, about the estimate chosen in place of the average.
@@ -31,19 +29,19 @@ from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.state import State
 from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
-from rigkit.cameras.moving_pupil import NearCamera, far_camera
+from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
 from rigkit.core.arrays import FloatArray, Rays
 from rigkit.core.errors import DegenerateError, InputError
 
 MIN_LIKELY = 0.05
-"""A model that is less likely the better one adds next to nothing, however far it is off."""
+"""A less probable model adds almost nothing to the covariance, however different it is."""
 RAYS = 400
-"""So many corners are enough to follow another lens."""
+"""Number of corners at which a lens is fitted to another one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RivalFit:
-    """A rival, and the state with its lens that fits the views."""
+    """A rival and its fit to the views."""
 
     rival: Rival
     state: State
@@ -52,21 +50,19 @@ class RivalFit:
 def rival_fits(
     observations: Observations, chosen: Fit, options: Sequence[FittedModel], likely: Mapping[str, float]
 ) -> list[RivalFit]:
-    """Return the `options` that are likely enough the better ones, fitted to the corners kept, with the boards as the
-    chosen fit has them but for their warps."""
+    """Return the `options` with a probability of at least MIN_LIKELY, fitted to the inliers of the chosen fit with its
+    released corners held."""
     own = far_camera(chosen.state.camera)
     cameras = [far_camera(option.fit.state.camera) for option in options]
     alike = [same_model(camera, own) for camera in cameras]
     if not any(alike):
-        # The chosen lens stands among them in another size.
+        # The chosen lens is among the options in another size.
         alike = [camera.model == own.model for camera in cameras]
     found = []
     for option, camera, same in zip(options, cameras, alike, strict=True):
         if same or likely.get(option.name, 0.0) < MIN_LIKELY:
             continue
-        if isinstance(chosen.state.camera, NearCamera):
-            camera = NearCamera.of(camera, chosen.state.camera.pupil)
-        start = replace(chosen.state.with_corners_held(), camera=camera)
+        start = replace(chosen.state.with_corners_held(), camera=with_pupil_of(camera, chosen.state.camera))
         try:
             fit = fit_other_lens(observations, start, chosen.kept)
         except (InputError, DegenerateError):
@@ -76,12 +72,12 @@ def rival_fits(
 
 
 def same_model(one: Camera, other: Camera) -> bool:
-    """Say whether two cameras are of one model and size."""
+    """Return whether two cameras are of one model and size."""
     return one.model == other.model and one.parameters.size == other.parameters.size
 
 
 def rival_shapes(chosen: FittedModel, shapes: Sequence[FittedModel]) -> list[RivalFit]:
-    """Return the same lens as boards of the other `shapes` show it, of those that are likely enough the better ones."""
+    """Return the fits with the other board `shapes` that have a probability of at least MIN_LIKELY."""
     likely = HeldOut.of([shapes]).likely()
     return [
         RivalFit(
@@ -94,7 +90,7 @@ def rival_shapes(chosen: FittedModel, shapes: Sequence[FittedModel]) -> list[Riv
 
 
 def with_rivals(candidates: Sequence[Candidate], rivals: Sequence[Rival]) -> tuple[Candidate, ...]:
-    """Return the candidates with what is to be said of the rivals among them."""
+    """Return the candidates, with the probability added to the reason of those that are rivals."""
     likely = {_lens(rival.name): f"{100.0 * rival.likely:.0f} %" for rival in rivals}
     counted = "of images drawn anew; by how much it differs is in all sigmas"
     return tuple(
@@ -106,16 +102,16 @@ def with_rivals(candidates: Sequence[Candidate], rivals: Sequence[Rival]) -> tup
 
 
 def _lens(name: str) -> str:
-    """Return the name of a lens without what it was fitted on."""
+    """Return the name of a lens without the boards it was fitted on."""
     return name.partition(",")[0]
 
 
 def between_models(
     observations: Observations, chosen: Fit, rivals: Sequence[RivalFit], sigmas: FloatArray
 ) -> FloatArray:
-    """Return what the rivals add to the covariance (P + 6, P + 6) of the chosen camera's parameters, its pupil among
-    them where that moves, and of the mean motion of the boards; `sigmas` (P,) are the standard deviations of the
-    parameters without that."""
+    """Return the rivals' contribution to the covariance (P + 6, P + 6) of the chosen camera's parameters, a moving
+    pupil's included, and of the mean motion of the boards; `sigmas` (P,) are the parameters' standard deviations
+    without it."""
     p = chosen.state.camera.parameters.size
     out = np.zeros((p + 6, p + 6))
     if not rivals:
@@ -125,10 +121,10 @@ def between_models(
     here, far = chosen.state, far_camera(chosen.state.camera)
     for one in rivals:
         step, turn = followed(far, one.rival.camera, rays, sigmas[: far.parameters.size])
-        # Terms of the pupil are along the axis of either lens.
+        # The pupil moves along the axis of its own lens: its terms are compared directly.
         terms = one.state.camera.parameters[one.rival.camera.parameters.size :]
         pupil = terms - here.camera.parameters[far.parameters.size :]
-        # As the axes of the chosen lens have it.
+        # Poses in the frame of the chosen lens.
         there = (turn.T @ one.state.rotation, one.state.translation_mm @ turn)
         moved = steps_between((here.rotation, here.translation_mm), there)
         motions = motion_of_world(here.translation_mm) @ moved[..., None]

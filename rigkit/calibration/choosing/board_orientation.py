@@ -1,14 +1,14 @@
-"""Boards that look the same turned: which views count such a board from another end than the others do.
+"""Orientation of boards with rotational symmetry: which views number such a board from the other end.
 
-No image tells its first corner, and a flat board does not care. Where corners are not quite where a flat board has
-them, a view that counts from the other end shows them elsewhere. Of the departure, what stays the same under the turn
-says nothing; the rest changes its sign. So every view has a sign, and the signs under which the views agree best on one
-departure are sought (the largest s^T K s, with K from what each view says alone). Then each view is judged by the
-others: is the departure that they have in common found in it as it is numbered, or turned?
+The first corner of such a board is ambiguous, and for a flat board it does not matter. But if the corners deviate from
+the flat board, a view numbered from the other end has these deviations rotated. The part of the deviations that is
+invariant under the rotation gives no information; the rest changes its sign. So each view has a sign, and the signs
+that agree best on one common deviation maximise s^T K s, with K from the single views. Each view is then tested against
+the others: is their common deviation in it as it is numbered, or rotated?
 
-A lens that is not quite its model, or a sheet bent differently from view to view, displaces neighbours alike. It must
-not pass for the board: from each view every displacement that is a quadratic field over the board is taken out, its
-pose among them. What is left are the errors of the print and bends of higher order, and these are the board's own.
+Errors of the lens model, or a board bent differently in each view, are smooth. They must not count as deviations of the
+board: in each view all displacements that are quadratic over the board, its pose included, are projected out. What is
+left are printing errors and bends of higher order, which belong to the board.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from rigkit.core.detections import grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 SURE = 10.0
-"""Log odds from which a view is turned: 20000 to 1, as most views are numbered alike to begin with. Measured on boards
+"""Log odds from which a view is renumbered: 20000 to 1, as most views are numbered alike a priori. Measured on boards
 whose first corner is known: up to 4.3 for the wrong end, 8 to 70 for views that were turned."""
 KNOWN = 0.5
-"""A departure that this part of the views does not show for sure is none: its signs are those of chance."""
+"""Part of the views that must be certain of their orientation: otherwise the common deviation is chance."""
 
 
 def same_looks(board: Board) -> tuple[int, ...]:
@@ -39,19 +39,19 @@ def same_looks(board: Board) -> tuple[int, ...]:
 
 
 def board_turn(board: Board, quarter_turns: int) -> Rigid3:
-    """Return numbered_from_old: the frame of a board numbered from another corner, from the old frame."""
+    """Return numbered_from_old: from the frame of a board to that of the board numbered from another corner."""
     angle = 0.5 * np.pi * quarter_turns
     turn = np.rint([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     corners = board.points(np.array([[0, 0], [board.columns - 1, board.rows - 1]]))
-    # After the turn the grid must again begin at zero.
+    # The rotated grid must begin at zero again.
     return Rigid3(turn, -(corners @ turn.T).min(axis=0))
 
 
 def with_views_turned(
     observations: Observations, state: State, views: BoolArray, quarter_turns: int
 ) -> tuple[Observations, State]:
-    """Return the same with the boards of the chosen `views` (V,) numbered from another end. Residuals of flat boards do
-    not change."""
+    """Return observations and state with the boards of the chosen `views` (V,) numbered from another corner. Residuals
+    of flat boards do not change."""
     rotation, translation, corner = state.rotation.copy(), state.translation_mm.copy(), observations.corner.copy()
     turned = list(observations.views)
     for i in np.flatnonzero(views).tolist():
@@ -67,7 +67,7 @@ def with_views_turned(
 
 
 def turned_views(observations: Observations, fit: Fit, quarter_turns: int) -> BoolArray:
-    """Return the views (V,) that surely count their board by so many quarter turns otherwise than most do."""
+    """Return the views (V,) whose board is certainly numbered by so many quarter turns differently from most others."""
     out = np.zeros(len(observations.views), dtype=bool)
     often = often_seen(observations)
     for b, board in enumerate(observations.boards):
@@ -76,15 +76,15 @@ def turned_views(observations: Observations, fit: Fit, quarter_turns: int) -> Bo
             odds = _Patterns.of(observations, fit, b, views, _Turn.of(board, quarter_turns)).log_odds()
             alike, turned = odds > SURE, odds < -SURE
             if alike.sum() + turned.sum() > KNOWN * len(views):
-                # Which end is the first is for most views to say.
+                # The majority decides which end is the first.
                 out[views] = turned if turned.sum() <= alike.sum() else alike
     return out
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Turn:
-    """What a turn does to M corners: corner i becomes number `place[i]`, a displacement d there `rotation` d. After
-    `order` turns all is as before."""
+    """A symmetry of a board with M corners: corner i becomes corner `place[i]`, a displacement d `rotation` d. After
+    `order` applications it is the identity."""
 
     place: IntArray
     rotation: Mat3
@@ -97,8 +97,8 @@ class _Turn:
         return cls(place, rotation, 4 // quarter_turns)
 
     def summed(self, values: FloatArray, sign: float) -> FloatArray:
-        """Return the part of vectors (..., M, 3) that the turn leaves as it is (`sign` 1) or makes its opposite (-1),
-        times the order; of matrices (..., M, 3, 3) where `sign` is 0 the sum over the corners that are tied by it."""
+        """Return `order` times the part of vectors (..., M, 3) that is invariant under the turn (`sign` 1) or changes
+        its sign (-1); with `sign` 0 the sum of matrices (..., M, 3, 3) over the orbit of each corner."""
         total, here, turn = np.zeros_like(values), np.arange(len(self.place)), np.eye(3)
         for k in range(self.order):
             if sign:
@@ -111,17 +111,17 @@ class _Turn:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Patterns:
-    """What is left of the residuals of one board in V views, in standard deviations.
+    """Residuals of one board in V views, in standard deviations, with quadratic fields projected out.
 
     Attributes
     ----------
-    left : (V, 2 C) residuals without the quadratic fields.
+    left : (V, 2 C) the residuals.
     by_board : (V, 2 C, 3) derivatives by the displacement of each corner.
-    fields : (V, 2 C, K) orthonormal basis of what was taken out.
-    corner : (V, C) number of each corner on the board.
-    pull : (V, M, 3) what each view says about the departure that changes its sign under the turn,
-    information : (V, M, 3, 3) and how much.
-    prior : (3,) inverse variances of a corner's departure.
+    fields : (V, 2 C, K) orthonormal basis of the quadratic fields.
+    corner : (V, C) index of each corner on the board.
+    pull, information : (V, M, 3) and (V, M, 3, 3) score and information of each view on the deviation of each corner,
+        of the part that changes its sign under the turn.
+    prior : (3,) inverse prior variances of a corner's deviation.
     """
 
     left: FloatArray
@@ -143,7 +143,7 @@ class _Patterns:
         in_cam, _ = state.points_in_cam(part)
         pixels, valid, d_pixels_d_point, _ = state.camera.project_with_jacobians(in_cam)
         weight = np.where(valid & fit.kept[views], part.weight, 0.0)
-        # What does not project is NaN: no multiple of it is zero.
+        # Corners that do not project are NaN, also with zero weight.
         residual = np.where(weight[..., None] > 0.0, weight[..., None] * (part.pixels - pixels), 0.0)
         by_board = weight[..., None, None] * (d_pixels_d_point @ state.rotation[:, None])
         by_board = np.where(weight[..., None, None] > 0.0, by_board, 0.0)
@@ -174,7 +174,7 @@ class _Patterns:
         )
 
     def log_odds(self) -> FloatArray:
-        """Return for each view (V,) the log odds that it is numbered as the others are, rather than turned."""
+        """Return the log odds (V,) that a view is numbered as the others, rather than turned."""
         views = len(self.left)
         prior = self.prior * np.eye(3)
         total = self.information.sum(axis=0) + prior
@@ -187,7 +187,7 @@ class _Patterns:
         expected = (self.by_board * here).sum(axis=-1)
         expected = expected - _within(self.fields, expected)
         size = np.maximum(np.linalg.norm(expected, axis=1), np.finfo(float).tiny)
-        # Of a view that is numbered like the others, `size` on average, with a spread of one if the others are right.
+        # For a view numbered as the others the mean is `size`, with unit variance if the others' deviation is exact.
         found = (self.left * expected).sum(axis=1) / size
         spread = max(1.0, float(((np.abs(found) - size) ** 2).mean()))
         return np.asarray(2.0 * found * size / spread)
@@ -199,8 +199,8 @@ def _within(basis: FloatArray, values: FloatArray) -> FloatArray:
 
 
 def _agreeing_without_each(alike: FloatArray) -> FloatArray:
-    """Return for each view (V, V) the signs on which the others agree without what it says, zero for itself: those that
-    make s^T `alike` s large, most of them plus. The diagonal of `alike` is zero."""
+    """Return for each view (V, V) the signs of the others that maximise s^T `alike` s without that view, most of them
+    positive, and zero for itself. The diagonal of `alike` is zero."""
     signs = _improved(alike, np.where(np.linalg.eigh(alike)[1][:, -1:].T < 0.0, -1.0, 1.0))
     own = np.where(np.eye(len(alike)) > 0.0, 0.0, signs if signs.sum() >= 0.0 else -signs)
     found = _improved(alike, own)
@@ -208,11 +208,11 @@ def _agreeing_without_each(alike: FloatArray) -> FloatArray:
 
 
 def _improved(alike: FloatArray, signs: FloatArray) -> FloatArray:
-    """Return sets of signs (N, V), each with the worst one turned as long as its s^T `alike` s gains by it; what is
-    zero stays zero and says nothing."""
+    """Return sets of signs (N, V), each with its worst sign flipped as long as that increases s^T `alike` s; zeros stay
+    zero."""
     signs = signs.copy()
     left = np.arange(len(signs))
-    # Every turn gains; the end is for gains that are rounding.
+    # Every flip increases the form; the limit is for increases that are rounding.
     for _ in range(signs.shape[1] ** 2):
         gain = signs[left] * (signs[left] @ alike)
         worst = np.argmin(gain, axis=1)

@@ -1,4 +1,4 @@
-"""Which lens model and which board shape: of those that predict other images best, the one with the fewest numbers."""
+"""Model selection: among the options with the smallest held-out error, the one with the fewest parameters."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from rigkit.calibration.solving.fit import Fit
 from rigkit.core.arrays import BoolArray, FloatArray
 
 MARGIN = 0.02
-"""A model or a board shape with more numbers must lower the held-out error by this part to be chosen,"""
+"""A model or a board shape with more parameters must lower the held-out error by this part to be chosen,"""
 MIN_SIGMAS = 1.0
-"""or, a model, by this many standard errors of the difference, as images have it: a lens that is not quite right hides
-in the poses, and 0.3 % of held-out error may be three times the error of the lens."""
+"""or, a model, by this many standard errors of the difference between images: the poses absorb much of the error of a
+lens, so that 0.3 % of held-out error may be three times the error of the lens."""
 MORE_NUMBERS = 1
-"""Models of other kinds come with a number more or less for the same freedom; large ones of a kind swing where no board
-was."""
+"""Models of different kinds with the same flexibility differ by one parameter; larger ones of a kind oscillate where no
+board was."""
 BOOTSTRAP_DRAWS = 2000
-"""Draws that tell how likely an option is the best one: to 0.01."""
+"""Bootstrap samples: probabilities are accurate to 0.01."""
 CLEARLY = 2.0
-"""A camera has a lens of its own, and not that of its twins, where theirs errs by so many standard errors more."""
+"""Standard errors by which the common model of like cameras must be worse than its own for a camera to leave them."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FittedModel:
-    """A camera model with boards of one shape, in the running: its name and how it fits."""
+    """An option of the model selection: a camera model of one size with boards of one shape, and its fit."""
 
     name: str
     fit: Fit
@@ -37,7 +37,7 @@ class FittedModel:
 
     @property
     def model(self) -> str:
-        """The camera model, of whatever size."""
+        """Name of the camera model, without its size."""
         return self.fit.state.camera.model
 
     @property
@@ -50,21 +50,20 @@ class FittedModel:
 
 
 def models_of(options: Sequence[FittedModel]) -> list[str]:
-    """Return the camera models among the options."""
+    """Return the names of the camera models of the options, each once."""
     return list(dict.fromkeys(option.model for option in options))
 
 
 def settled(options: Sequence[FittedModel]) -> Sequence[FittedModel]:
-    """Return the options whose solver converged, where any did. The others creep along a ridge: a model with more
-    numbers than the lens has (a double sphere for a lens without distortion) shows the images with many of them."""
+    """Return the options whose solver converged, if any did. The others are unidentifiable: a model with more
+    parameters than the lens needs (a double sphere for a lens without distortion) has many solutions."""
     return [option for option in options if option.fit.convergence.converged] or options
 
 
 def choose(options: Sequence[FittedModel], min_sigmas: float | None = None) -> FittedModel:
-    """Return the option with the fewest numbers among those whose held-out error is the smallest, within MARGIN and
-    (if given) `min_sigmas` standard errors of the difference; with too few images for that, the one with the
-    smallest BIC. One whose solver was stopped is taken only where all were; two images leave too much open to say
-    that of it.
+    """Return the option with the fewest parameters among those with the smallest held-out error, within MARGIN and (if
+    given) `min_sigmas` standard errors of the difference; with too few images for cross-validation, the option with
+    the smallest BIC. Options whose solver did not converge are excluded if others did, except with too few images.
 
     Reference: L. Breiman et al., "Classification and Regression Trees" (1984), section 3.4.3: the one-standard-error
     rule, here paired over images.
@@ -89,17 +88,23 @@ def _as_good(heldout: FloatArray, min_sigmas: float | None) -> BoolArray:
 
 
 def _against(heldout: FloatArray, best: int) -> tuple[FloatArray, FloatArray]:
-    """Return by how much more options (M, N) err than the `best` one, and the standard error of that, (M,) each."""
+    """Return the excess of the options' squared residuals (M, N) over the `best` one's, and its standard error, (M,)
+    each."""
     more = heldout - heldout[best]
     return more.sum(axis=1), np.sqrt(more.shape[1]) * more.std(axis=1, ddof=1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class HeldOut:
-    """What the images of one camera, or of several that are alike, say of the options that all of them have: names,
-    numbers (most of the cameras') and squared held-out residuals (M, N). Those of each camera are in units of its
-    smallest mean, as cameras differ in how sharp they are. Options whose means differ by less than `alike` err as if by
-    rounding. Those whose solver was stopped say nothing where others converged."""
+    """Held-out errors of one camera, or of several like ones, for the M options that all of them have.
+
+    Attributes
+    ----------
+    names, counts : names of the options and their numbers of parameters, the largest of all cameras.
+    heldout : (M, N) squared held-out residuals of all N images, those of each camera in units of its smallest mean, as
+        cameras differ in sharpness. Options whose solver did not converge are left out if others did.
+    alike : differences of the means below this are rounding.
+    """
 
     names: list[str]
     counts: list[int]
@@ -108,7 +113,7 @@ class HeldOut:
 
     @classmethod
     def of(cls, cameras: Sequence[Sequence[FittedModel]]) -> HeldOut:
-        """Put the evidence of cameras with their options together."""
+        """Combine the held-out errors of several cameras."""
         known = [{o.name: o for o in settled(options) if o.heldout is not None} for options in cameras]
         names = [name for name in known[0] if all(name in own for own in known)]
         counts = [max(own[name].count for own in known) for name in names]
@@ -122,29 +127,29 @@ class HeldOut:
         return cls(names, counts, scaled, rounding / scaled.shape[1])
 
     def chosen(self) -> str:
-        """Return the name that `choose` prefers."""
+        """Return the name of the option that `choose` would choose."""
         good = np.flatnonzero(_as_good(self.heldout, MIN_SIGMAS)).tolist()
         return self.names[min(good, key=lambda k: self.counts[k])]
 
     def contradicts(self, name: str, own: str) -> bool:
-        """Say whether `name` is clearly worse than `own`."""
+        """Return whether the option `name` is significantly worse than `own`."""
         more, chance = _against(self.heldout, self.names.index(own))
         k = self.names.index(name)
         return bool(more[k] > CLEARLY * chance[k])
 
     def likely(self) -> dict[str, float]:
-        """Return how likely each option is the best one: how often it has the smallest held-out error where images
-        count by chance more or less (the Bayesian bootstrap). Where others with about as many numbers err as little but
-        for rounding, images do not decide between them, sure as the order may be: they share.
+        """Return the probability of each option to be the best one: the part of the Bayesian bootstrap samples
+        in which it has the smallest held-out error. Options with about as many parameters and an error equal within
+        rounding share a sample.
 
         References: S. T. Buckland, K. P. Burnham, N. H. Augustin, "Model selection: an integral part of inference",
-        Biometrics 53 (1997): weights by how often data like these would choose each model. D. B. Rubin, "The Bayesian
-        bootstrap", Annals of Statistics 9 (1981).
+        Biometrics 53 (1997): bootstrap selection frequencies as weights. D. B. Rubin, "The Bayesian bootstrap", Annals
+        of Statistics 9 (1981).
         """
         if not self.names:
             return {}
         drawn = np.random.default_rng(0).dirichlet(np.ones(self.heldout.shape[1]), BOOTSTRAP_DRAWS)
-        # Sorted: the draws of an image are not to depend on where it stands among the others.
+        # Sorted, so that the result does not depend on the order of the images.
         error = drawn @ self.heldout[:, np.lexsort(self.heldout)].T
         least = error.min(axis=1, keepdims=True)
         few = np.array(self.counts) <= self.counts[self.names.index(self.chosen())] + MORE_NUMBERS
@@ -154,14 +159,15 @@ class HeldOut:
 
 
 def _bic(option: FittedModel) -> float:
-    """Return Schwarz's criterion, n log(mean squared residual) + parameters log n."""
+    """Return the Bayesian information criterion, n log(mean squared residual) + parameters log n."""
     n = 2 * int(option.fit.kept.sum())
     error = option.fit.rms_px
     return float(n * np.log(error**2 + np.finfo(float).tiny) + option.count * np.log(n))
 
 
 def described(options: list[FittedModel], chosen: FittedModel, *, rivals: bool = False) -> list[Candidate]:
-    """Return what was tried, and why it was chosen or not; `rivals`: others than these were tried as well."""
+    """Return the options as candidates, with the reason for choosing each or not; `rivals`: other models than these
+    were tried too."""
     out = []
     for o in options:
         if len(options) == 1 and not rivals:

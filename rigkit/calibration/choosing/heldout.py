@@ -1,4 +1,4 @@
-"""The error of a fit on images that took no part in it: what lenses and shapes of boards are chosen by."""
+"""Cross-validation: the error of a fit on images that were left out of it."""
 
 from __future__ import annotations
 
@@ -14,17 +14,15 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.core.arrays import FloatArray
 
 MIN_IMAGES_OF_FIT = 3
-"""So many images can be left out one at a time: two others still show a camera."""
+"""Smallest number of images for leave-one-out: two others still determine a camera."""
 
 
 def heldout_squares(observations: Observations, fit: Fit, folds: int) -> FloatArray | None:
-    """Return the sum of squared residuals, px^2, of the kept corners of each image while it took no part: camera and
-    shape from the other images, only the poses of its boards refitted. Images that repeat each other take part
-    together, or not: else those that are left out would be known. Of fewer images than folds each is one. None with
-    less than MIN_IMAGES_OF_FIT that differ.
+    """Return the sum of squared held-out residuals, px^2, of the inliers of each image: camera and board shapes are
+    those of the other folds, only the poses of its boards are fitted. Near-duplicate images are in one fold. With fewer
+    images than folds each image is a fold. None with less than MIN_IMAGES_OF_FIT different images.
 
-    Residuals are weighted as in the solution, those of a corner of median quality: what blurred images say of a lens
-    decides no more than it is worth.
+    Residuals are weighted as in the solution, so that blurred images count less.
     """
     if folds < 2:
         return None

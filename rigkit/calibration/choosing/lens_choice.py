@@ -1,9 +1,9 @@
-"""Which camera model shows the views of a camera best; twins, cameras that are alike, share one.
+"""Choice of the camera model, jointly for like cameras of a rig.
 
-Models are compared on the same corners: with flat boards first, and, since boards that are not flat bend the lenses to
-themselves, again with boards as they were found. Cameras of one rig with images of one size and (nearly) one focal
-length are two pieces of one product: what the images of each say of the models is put together, and all get the same
-model, unless the images of one contradict it clearly.
+Models are compared on the same corners: with flat boards first and, as a board that is not flat biases the lens, again
+with the board shapes that were found. Cameras of a rig with the same image size and nearly the same focal length are
+taken to be of one make: their held-out errors are combined and all get the same model, unless the images of one
+contradict it significantly.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from rigkit.calibration.views.observations import Observations
 from rigkit.cameras.base import Camera
 
 SAME_FOCAL = 0.05
-"""Lenses of one kind have focal lengths within this part of each other: makers state no more."""
+"""Relative difference of the focal lengths of lenses of one type: makers do not specify them more accurately."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ModelChoice:
-    """The camera model chosen, and how likely each option is the best one, by name."""
+    """The chosen camera model, and the probability of each option, by name, to be the best one."""
 
     model: str
     likely: dict[str, float]
@@ -36,7 +36,7 @@ class ModelChoice:
 def lenses_on_flat_boards(
     observations: Observations, options: list[FittedModel], request: Request
 ) -> list[FittedModel]:
-    """Return the options as they compare on the same corners of the views that agree with them."""
+    """Return the options refitted to the same corners of the views that agree with them, with held-out errors."""
     keep, _ = agreeing(observations, options)
     seen = observations.subset(np.flatnonzero(keep))
     same = options if keep.all() else [replace(o, fit=fit_of_views(seen, o.fit, keep)) for o in options]
@@ -45,7 +45,7 @@ def lenses_on_flat_boards(
 
 
 def best_sizes(cameras: Sequence[Sequence[FittedModel]]) -> list[str]:
-    """Return the name of the best size of each model, as flat boards tell well enough, of cameras that are alike."""
+    """Return the name of the best size of each model, compared with flat boards, for a group of like cameras."""
     sizes = []
     for model in models_of([option for options in cameras for option in options]):
         own = [[option for option in options if option.model == model] for options in cameras]
@@ -62,19 +62,18 @@ def lenses_on_boards(
     tried: Sequence[FittedModel],
     names: Sequence[str],
     request: Request,
-    done: dict[str, FittedModel] | None = None,
+    done: dict[str, FittedModel],
 ) -> list[FittedModel]:
-    """Return the lenses tried, those of the `names`, fitted to boards with their corners as they were found and warps
-    that are free again. `done` are those that were fitted before, by name; what is fitted now comes to them."""
+    """Return the options of the given `names`, fitted with the released corners found held and warps free. `done`
+    caches the results by name."""
     observations, kept = found.observations, found.chosen.fit.kept
     state = found.chosen.fit.state.with_corners_held()
-    done = {} if done is None else done
     for option in tried:
         if option.name in names and option.name not in done:
             start = replace(state, camera=option.fit.state.camera)
             fit = fit_other_lens(observations, start, kept)
             done[option.name] = replace(option, name=f"{option.name}, boards as found", fit=fit, heldout=None)
-    # What does not even show the images that it was fitted to as well as another one predicts them is no better.
+    # An option with a training error above another's held-out error cannot be the best.
     order = sorted((o.name for o in tried if o.name in names), key=lambda name: done[name].fit.rms_px)
     judged: list[FittedModel] = []
     for name in order:
@@ -86,8 +85,8 @@ def lenses_on_boards(
 
 
 def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]:
-    """Return the model of each of some cameras that are alike: what their images say is put together, and who clearly
-    contradicts the others has a lens of its own."""
+    """Return the model of each of a group of like cameras, from their combined held-out errors; a camera that
+    contradicts the common model significantly gets its own."""
     own = [choose(options, MIN_SIGMAS) for options in cameras]
     each = [HeldOut.of([options]) for options in cameras]
     out = [ModelChoice(option.model, evidence.likely()) for option, evidence in zip(own, each, strict=True)]
@@ -108,7 +107,7 @@ def choose_lenses(cameras: Sequence[Sequence[FittedModel]]) -> list[ModelChoice]
 
 
 def twins(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Return which cameras are alike, as lists of their numbers: images of one size, nearly one focal length."""
+    """Return groups of like cameras, as lists of their indices: same image size, nearly the same focal length."""
     groups: list[list[int]] = []
     for k, camera in enumerate(cameras):
         for group in groups:

@@ -1,4 +1,4 @@
-"""Camera models in question: each fitted to all views, and all of them compared on the same corners."""
+"""Candidate camera models: each is fitted to all views, and all are compared on the same corners."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from rigkit.core.errors import DegenerateError, InputError
 from rigkit.core.progress import Progress
 
 COMPARABLE = 1.5
-"""Corners are outliers only if every model with a scatter within this factor of the best one says so."""
+"""A corner is an outlier only if it is one for every model whose scatter is within this factor of the smallest."""
 MIN_KEPT_SHARE = 0.5
-"""A view in which fewer of the corners agree with the other views is dropped."""
+"""A view with a smaller part of inliers is dropped."""
 DISAGREES_WITH_VIEWS = "agree with the other views; retake it"
-"""How the reason for it ends."""
+"""End of the reason for dropping such a view."""
 DEGREES_TRIED: dict[str, tuple[int | None, ...]] = {"scaramuzza": (4, 5, 6, 7, 8), "brown": (5,)}
-"""Sizes tried of models that come in several, where none is asked for,"""
+"""Sizes tried of models that have several, if none is given,"""
 DEGREES_BEYOND: dict[str, tuple[int, ...]] = {"scaramuzza": (9, 10)}
-"""and those tried where the largest of them is the best: precise corners, or lenses of more than 200 degrees."""
+"""and those tried if the largest of them is the best: for precise corners, or lenses of more than 200 degrees."""
 
 
 class ModelInQuestion(NamedTuple):
-    """A camera model of one size (`order`, where it has several) that is to be fitted, and what it is called."""
+    """A camera model of one size (`order`, None if it has only one) to be fitted, and its name."""
 
     name: str
     camera: type[Camera]
@@ -42,7 +42,7 @@ class ModelInQuestion(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Request:
-    """What `calibrate` was asked for."""
+    """The options of `calibrate`."""
 
     size_px: tuple[int, int]
     model: str
@@ -55,7 +55,7 @@ class Request:
 
 
 def wanted_models(request: Request) -> list[ModelInQuestion]:
-    """Return the camera models that are to be fitted. Raises InputError for options without a meaning."""
+    """Return the camera models to fit. Raises InputError for invalid options."""
     if request.board not in (*SHAPES, "auto"):
         raise InputError(f"board shape '{request.board}' is unknown; known: auto, {', '.join(SHAPES)}")
     if request.folds < 0 or request.folds == 1:
@@ -71,7 +71,7 @@ def wanted_models(request: Request) -> list[ModelInQuestion]:
 
 
 def larger_sizes(chosen: FittedModel) -> list[ModelInQuestion]:
-    """Return the larger sizes to try of the model chosen, if it is of the largest size tried so far."""
+    """Return the larger sizes to try of the chosen model, if it is of the largest size tried so far."""
     camera = chosen.fit.state.camera
     tried, more = DEGREES_TRIED.get(camera.model, (None,)), DEGREES_BEYOND.get(camera.model, ())
     if chosen.name != f"{camera.model} {tried[-1]}":
@@ -86,7 +86,8 @@ def fit_all(
     progress: Progress,
     known: Sequence[FittedModel] = (),
 ) -> tuple[list[FittedModel], list[Candidate]]:
-    """Return the options `known` and those `wanted`, fitted, and which could not be; raises where there is none."""
+    """Return the options `known` and those `wanted`, fitted, and the failed ones; raises the last error if there is no
+    option at all."""
     options = list(known)
     failed: list[Candidate] = []
     error: Exception | None = None
@@ -108,13 +109,13 @@ def fit_all(
 
 
 def fit_of_views(observations: Observations, fit: Fit, keep: BoolArray) -> Fit:
-    """Return the fit of the views to keep (V,), `observations`, from that of all of them."""
+    """Return the fit of the views `keep` (V,), whose `observations` are given, from the fit of all views."""
     chosen = np.flatnonzero(keep)
     return fit_kept(observations, fit.state.subset(chosen), fit.kept[chosen], settle=True)
 
 
 def agreeing(observations: Observations, options: list[FittedModel]) -> tuple[BoolArray, tuple[tuple[str, str], ...]]:
-    """Return which views to keep, and the reason for each that goes, judged by the model with the least scatter."""
+    """Return which views agree with the model of the least scatter, and (image, reason) of the others."""
     best = _best(observations, options)
     kept = best.fit.kept.sum(axis=1)
     total = observations.present.sum(axis=1)
@@ -130,7 +131,7 @@ def agreeing(observations: Observations, options: list[FittedModel]) -> tuple[Bo
 
 
 def enough_agree(kept: IntArray, total: IntArray) -> BoolArray:
-    """Return which views have enough corners `kept` (V,) of their `total` (V,) for the view to agree with others."""
+    """Return which views have enough inliers `kept` (V,) among their `total` (V,) corners."""
     return np.asarray(kept >= np.maximum(MIN_KEPT_SHARE * total, 4))
 
 
@@ -142,7 +143,8 @@ def _best(observations: Observations, options: list[FittedModel]) -> FittedModel
 
 
 def reweighted(observations: Observations, options: list[FittedModel]) -> Observations:
-    """Return the observations with weights that count the error which the best model leaves to all corners alike."""
+    """Return the observations with weights that include the error common to all corners, from the best model's
+    residuals."""
     if float(np.ptp(observations.sigma_px[observations.present])) == 0.0:
         return observations
     best = _best(observations, options)
@@ -153,7 +155,7 @@ def reweighted(observations: Observations, options: list[FittedModel]) -> Observ
 def compared(
     observations: Observations, options: list[FittedModel], folds: int, progress: Progress
 ) -> list[FittedModel]:
-    """Return the options refitted to the same corners, with their held-out errors, where they are not yet."""
+    """Return the options refitted to the same corners where they are not yet, with their held-out errors."""
     sigma = [robust_sigma(o.fit, observations) for o in options] if len(options) > 1 else [0.0]
     near = [o.fit.kept for o, s in zip(options, sigma, strict=True) if s <= COMPARABLE * min(sigma)]
     kept = np.any(near, axis=0)

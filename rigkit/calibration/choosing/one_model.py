@@ -1,4 +1,4 @@
-"""What one camera model comes to: which views agree with it, its size, and the boards' shape that goes with it."""
+"""The outcome of one camera model: the views that agree with it, its best size, and the best board shape."""
 
 from __future__ import annotations
 
@@ -30,9 +30,16 @@ from rigkit.core.progress import Progress
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ModelOutcome:
-    """What one camera model came to: the observations used, which of all views (V,) these are and why others were left
-    out, the size and board shape chosen, what was tried, which larger sizes were, the sizes compared on flat boards,
-    and the board shapes compared."""
+    """The outcome of one camera model.
+
+    Attributes
+    ----------
+    observations, used, reasons : the views used, which of all views (V,) these are, and (image, reason) of the others.
+    chosen : the best size with the best board shape.
+    candidates : all options tried.
+    beyond : larger sizes that were tried.
+    sizes, shapes : the sizes compared with flat boards, and the board shapes compared.
+    """
 
     observations: Observations
     used: BoolArray
@@ -47,7 +54,7 @@ class ModelOutcome:
 def only(
     options: list[FittedModel], wanted: Sequence[ModelInQuestion], model: str
 ) -> tuple[list[FittedModel], list[ModelInQuestion]]:
-    """Return the options and what was wanted of one camera model."""
+    """Return the options, and the models to fit, of one camera model."""
     own = [option for option in options if option.model == model]
     return own, [one for one in wanted if one.camera.model == model]
 
@@ -59,7 +66,7 @@ def solved(
     failed: list[Candidate],
     request: Request,
 ) -> ModelOutcome:
-    """Return what one camera model comes to; what else was tried changes nothing."""
+    """Return the outcome of one camera model, independent of the other models."""
     size_px, folds, progress = request.size_px, request.folds, request.progress
     keep, reasons = agreeing(observations, options)
     if reasons:
@@ -85,7 +92,7 @@ def chosen_of_sizes(
     failed: Sequence[Candidate] = (),
     beyond: Sequence[ModelInQuestion] = (),
 ) -> ModelOutcome:
-    """Return a camera model with the best of its `sizes`, compared on flat boards, and then the best shape of those."""
+    """Return the outcome with the best of the `sizes`, compared with flat boards, and then the best board shape."""
     chosen = choose(sizes, MIN_SIGMAS)
     candidates = [*described(sizes, chosen, rivals=request.model == "auto"), *failed]
     observations, chosen, shapes, tried = with_board_shape(
@@ -104,8 +111,8 @@ def chosen_of_sizes(
 
 
 def on_same_images(found: ModelOutcome, again: ModelOutcome, names: tuple[str, str]) -> list[FittedModel]:
-    """Return what two solutions of a camera chose, judged on the images that both have: each leaves out those that
-    disagree with its own model. They are called `names`."""
+    """Return the chosen options of two outcomes, with the given `names` and the held-out errors of the images that both
+    used: each drops views that disagree with its own model."""
     images = [list(dict.fromkeys(one.observations.images)) for one in (found, again)]
     out = []
     for name, one, own, other in zip(names, (found, again), images, images[::-1], strict=True):
@@ -117,24 +124,24 @@ def on_same_images(found: ModelOutcome, again: ModelOutcome, names: tuple[str, s
 def with_board_shape(
     observations: Observations, flat: FittedModel, board: str, folds: int, progress: Progress
 ) -> tuple[Observations, FittedModel, list[FittedModel], list[Candidate]]:
-    """Return the fit with boards of the shape asked for, `board`, from that with `flat` ones, the shapes compared, and
-    what was tried: with "auto" the shape that predicts other images best. The views are those with boards that look the
-    same turned numbered from one end."""
+    """Return the views, the fit with the board shape `board` from that with `flat` boards, the shapes compared, and
+    those as candidates. With "auto" the shape has the smallest held-out error. In the views returned, boards with
+    rotational symmetry are numbered from the same corner."""
     if board == "flat" or not often_seen(observations).any():
         return observations, flat, [flat], []
     observations, flat, fits = _fit_shapes(observations, flat, board)
     shapes, spared = _shapes(observations, flat, fits, board, folds, progress)
     chosen = choose(shapes)
     candidates = [*(c for c in described(shapes, chosen) if "board" in c.name), *spared]
-    # Corners that only another shape follows were taken in to compare the two, not to be believed.
+    # Corners that are inliers only of another shape were added for the comparison: the flat fit is without them.
     return observations, flat if chosen.name == flat.name else chosen, shapes, candidates
 
 
 def _fit_shapes(
     observations: Observations, flat: FittedModel, board: str
 ) -> tuple[Observations, FittedModel, dict[str, Fit]]:
-    """Return the shapes fitted, and views and flat boards with every board that looks the same turned numbered from the
-    same end, where the shapes tell."""
+    """Return the fits by shape, and views and flat fit with boards of rotational symmetry numbered from the same corner
+    where the shapes determine it."""
     fits = fit_shapes(observations, flat.fit, board)
     for quarter_turns in (1, 2):
         *_, richest = fits.values()
@@ -150,7 +157,7 @@ def _fit_shapes(
 def _shapes(
     observations: Observations, flat: FittedModel, fits: dict[str, Fit], board: str, folds: int, progress: Progress
 ) -> tuple[list[FittedModel], list[Candidate]]:
-    """Return the shapes in the running, compared on the same corners, and what was not tried."""
+    """Return the shapes compared on the same corners, and as a candidate the one that was not tried."""
     options = [FittedModel(f"board {kind}", fit) for kind, fit in fits.items()]
     options = [flat, *options] if board == "auto" else options
     spared = []

@@ -1,7 +1,6 @@
-"""What nobody knows of a rig because nobody knows its lenses' models: `choosing.between_models` for a rig.
+"""Uncertainty of the model selection in a rig: `choosing.between_models` for several cameras.
 
-The rig is solved again with each rival of its lenses, of all cameras that have it at once: cameras that are alike have
-one model, whichever that is.
+The rig is solved again with each rival model, for all cameras that have it at once: like cameras have one model.
 """
 
 from __future__ import annotations
@@ -18,16 +17,15 @@ from rigkit.calibration.rig.solving.solver import solve_rig
 from rigkit.calibration.rig.solving.state import RigState
 from rigkit.calibration.solving.poses import steps_between
 from rigkit.calibration.solving.solver import FROM_OPTIMUM
-from rigkit.cameras.base import Camera
-from rigkit.cameras.moving_pupil import NearCamera, far_camera
+from rigkit.cameras.moving_pupil import far_camera, with_pupil_of
 from rigkit.core.arrays import FloatArray, Mat3, Rays
 from rigkit.core.errors import DegenerateError, InputError
 
 
 def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
-    """Return what the rivals of the lenses add to the covariance (G, G) of all globals; `sigmas` (G,) are the standard
-    deviations without that. Lenses that are held near what each camera says alone bring their rivals with them. What
-    shape the boards have is a question to all cameras together: the same lens from another one is no rival here."""
+    """Return the rivals' contribution to the covariance (G, G) of all globals; `sigmas` (G,) are the standard
+    deviations without it. Zero where lenses are held: their own covariances include it. Rivals of another board shape
+    do not count, as the cameras choose that together."""
     here, layout = joint.solution.state, joint.solution.state.layout(joint.observations)
     out = np.zeros((layout.count, layout.count))
     if joint.observations.held or joint.known is not None:
@@ -41,7 +39,9 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
         own = [next((r for r in calibration.rivals if r.name == name), None) for calibration in single]
         start = replace(
             here,
-            cameras=tuple(c if r is None else _near(r.camera, c) for c, r in zip(here.cameras, own, strict=True)),
+            cameras=tuple(
+                c if r is None else with_pupil_of(r.camera, c) for c, r in zip(here.cameras, own, strict=True)
+            ),
         )
         try:
             turns = _turns(here, start, rays, sigmas, joint)[1]
@@ -57,27 +57,23 @@ def between_rig_models(joint: JointRig, sigmas: FloatArray) -> FloatArray:
 def _turns(
     here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
 ) -> tuple[list[FloatArray], list[Mat3]]:
-    """Return how the parameters of each camera follow the others, and the rotations there_from_here of their rays."""
+    """Return the change of each camera's parameters that fits it to the other one, and the rotations there_from_here of
+    the rays."""
     steps, turns = [], []
     layout = here.layout(joint.observations)
     for camera, other, own, run in zip(here.cameras, there.cameras, rays, layout.cameras, strict=True):
         far, far_other = far_camera(camera), far_camera(other)
         p = far.parameters.size
         step, turn = followed(far, far_other, own, sigmas[run][:p])
-        # Terms of the pupil are along the axis of either lens.
+        # The pupil moves along the axis of its own lens: its terms are compared directly.
         pupil = other.parameters[far_other.parameters.size :] - camera.parameters[p:]
         steps.append(np.concatenate([step, pupil]))
         turns.append(turn)
     return steps, turns
 
 
-def _near(lens: Camera, camera: Camera) -> Camera:
-    """Return another lens with the pupil of a camera, where that moves."""
-    return NearCamera.of(lens, camera.pupil) if isinstance(camera, NearCamera) else lens
-
-
 def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
-    """Return the state with camera c turned by `turns[c]`, the rig with the first."""
+    """Return the state with camera c rotated by `turns[c]`, the rig with the first."""
     turn, first = np.array(turns), turns[0]
     return replace(
         state,
@@ -92,7 +88,7 @@ def _turned(state: RigState, turns: Sequence[Mat3]) -> RigState:
 def _global_step(
     here: RigState, there: RigState, rays: Sequence[Rays], sigmas: FloatArray, joint: JointRig
 ) -> FloatArray:
-    """Return how far the globals (G,) must move for the rig to be as it is there."""
+    """Return the change of the globals (G,) from the state `here` to the state `there`."""
     layout = here.layout(joint.observations)
     steps, turns = _turns(here, there, rays, sigmas, joint)
     back = _turned(there, [turn.T for turn in turns])
