@@ -305,7 +305,7 @@ def _hiding_rotations(turned: FloatArray, moved: FloatArray) -> FloatArray:
     """Return the rotations (3, K) that compensate displacements `moved` (2, K, M) of M pixels best; `turned` (2, 3, M)
     is d pixel / d rotation."""
     square = (turned @ np.swapaxes(turned, 1, 2)).sum(axis=0)
-    return symmetric_pinv(square) @ (turned @ np.swapaxes(moved, 1, 2)).sum(axis=0)
+    return np.asarray(symmetric_pinv(square) @ (turned @ np.swapaxes(moved, 1, 2)).sum(axis=0))
 
 
 def _less_rotation(moved: FloatArray, hides: FloatArray, turned: FloatArray) -> FloatArray:
