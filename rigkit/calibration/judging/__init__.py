@@ -1,1 +1,1 @@
-"""What a person should know of a calibration: are its images enough, and of one camera that stayed as it was?"""
+"""Diagnosis of a calibration: are the images sufficient, and of one camera that did not change between them?"""

@@ -1,4 +1,4 @@
-"""What the solved shapes say of the boards: bent, stretched, or not as they are declared."""
+"""Findings about the boards from their solved shapes: bent, stretched, or not as declared."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from rigkit.core.findings import Finding
 from rigkit.core.patterns.aprilgrid import AprilGrid
 
 ASPECT = 2e-3
-"""Squares that are longer one way by this part are worth measuring again."""
+"""Relative difference of the squares' sides from which they should be measured again."""
 BOW = 2e-3
-"""So is a board that departs from a plane by this part of its extent."""
+"""Deviation from a plane, as a part of the board's extent, from which it is reported."""
 OFF_SPACING = 0.01
-"""And one whose tags are apart by this part of a tag's side more or less than declared: a ruler reads half a millimetre
-of 50 amiss. A REAL board of 88 mm tags shows 0.001 at most, however it is declared, and an entry for another print is
-off by 0.05."""
+"""Deviation of the gap between tags, as a part of a tag's side, from which it is reported: a ruler's error is half a
+millimetre of 50. A REAL board of 88 mm tags shows 0.001 at most, however it is declared; the declaration of another
+print is wrong by 0.05."""
 
 
 def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> list[Finding]:
-    """Return what is to be said of the boards whose shape was solved for.
+    """Return findings about the boards whose shape was solved for.
 
-    Squares longer one way than the other are told `provided` that something holds; a lens that is not `sure` does not
-    tell them from its own two focal lengths.
+    `provided` is the condition added to a finding about the squares' aspect ratio. That is omitted unless the lens is
+    `sure`: otherwise it is correlated with the ratio of the focal lengths.
     """
     out = []
     for board in c.boards:
@@ -52,12 +52,13 @@ def diagnose_boards(c: Calibration, provided: str, *, sure: bool) -> list[Findin
 
 
 def _spacing(name: str, board: BoardShape) -> list[Finding]:
-    """Tags nearer or farther than declared are part of the shape that is solved for; lengths in mm are off."""
+    """Return a finding where the gap between tags differs from the declared one: the solved shape absorbs that, but
+    lengths in mm are wrong."""
     pattern = None if board.declared is None else board.declared.pattern
     if board.declared is None or not isinstance(pattern, AprilGrid):
         return []
     lattice = board.points_mm.reshape(board.declared.rows, board.declared.columns, 3)
-    # Sides of tags and gaps between them take turns, along both axes; a single tag has no gap.
+    # Sides of tags and gaps between them alternate along both axes; a single tag has no gap.
     steps = [np.linalg.norm(np.diff(lattice, axis=axis), axis=-1) for axis in (1, 0)]
     sides = np.concatenate([steps[0][:, ::2].ravel(), steps[1][::2].ravel()])
     gaps = np.concatenate([steps[0][:, 1::2].ravel(), steps[1][1::2].ravel()])

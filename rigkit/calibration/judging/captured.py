@@ -1,7 +1,7 @@
-"""What a person should know about how the images were taken: too few, too alike, or not of one camera.
+"""Findings about how the images were taken: too few, too similar, or boards at unsuitable poses.
 
-None of this shows in the error of the corners. A calibration that rests on such images is not called good, whatever its
-held-out error.
+Reprojection errors do not show any of this. A calibration from such images is not called good, whatever its held-out
+error.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from rigkit.core.printing import digits
 
 FEW_IMAGES = 8
 FAR_TOO_FEW = 3
-"""Fewer images show a lens, but nothing by which one could tell that it is wrong."""
+"""Fewer images determine a lens, but not its error."""
 TILTED_DEG = 15.0
 TILTED_VIEWS = 3
 PARALLEL_DEG = 8.0
-"""Root of the mean squared angle of the boards against their middle direction. Hands that tilt have 20 and more."""
+"""Root mean squared angle of the boards' normals to their mean. Boards tilted by hand have 20 and more."""
 UPRIGHT_DEG = 20.0
-"""Boards turned in the image by no more than this against each other, NEARLY_ALL of them, are the same way up."""
+"""Boards are the same way up where NEARLY_ALL of them are rotated in the image by less than this."""
 NEARLY_ALL = 0.9
 ONE_DISTANCE = 1.15
-"""Corners from near to far within this factor are at one distance."""
+"""Boards are at one distance where the far corners are within this factor of the near ones."""
 ASKED_DEG = 95.0
-"""Beyond this angle off the axis nobody is asked to hold a board: it would have to be beside the camera."""
+"""Largest angle from the axis at which boards are expected: beyond it they would have to be beside the camera."""
 GRID = (16, 12)
-"""Pixels (columns, rows) at which it is asked whether boards were there."""
+"""Pixels (columns, rows) at which coverage is evaluated."""
 MIN_SHARE_COVERED = 2.0 / 3.0
-"""Where boards were in less of the image than this, the projection's uncertainty in the rest is judged, too."""
+"""Below this coverage the projection's uncertainty in the rest of the image is judged, too."""
 MAX_TIMES_ERROR = 2.0
-"""It may be this many times the error of the corners ..."""
+"""Largest uncertainty there, as a multiple of the error of the corners,"""
 SMALL_PX = 0.1
-"""... or of a good corner on real images, where that is larger."""
+"""or of that of a good corner on real images, if that is larger."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Extent:
-    """Where in the image boards were: `pixels` (N, 2) of a grid over what boards can reach, their `rays` (N, 3), and
-    which are `covered` (N,) by a board."""
+    """Coverage of the image: `pixels` (N, 2) of a grid where boards are expected, their `rays` (N, 3), and which are
+    `covered` (N,) by a board."""
 
     pixels: Pixels
     rays: Rays
@@ -61,20 +61,20 @@ class Extent:
 
     @property
     def share(self) -> float:
-        """Part of the image that is asked for in which boards were."""
+        """Covered part of the image, of where boards are expected."""
         return float(self.covered.mean()) if len(self.covered) else 0.0
 
     @property
     def where(self) -> str:
-        """In words, of which part of the image an error is that boards show; nothing for nearly all of it."""
+        """Words for the covered part of the image, for which an error holds; empty for nearly all of it."""
         return (
             "" if self.share >= NEARLY_ALL else f" over the {100.0 * self.share:.0f} % of the image where boards were"
         )
 
 
 def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Finding]:
-    """Return what is wrong with how the images were taken, the gravest first; `clusters` (V,) numbers the images of the
-    views, those that repeat others as those."""
+    """Return findings about how the images were taken, the most severe first; `clusters` (V,) are the cluster numbers
+    of the views' images, equal for near-duplicates."""
     images = [view.image for view in calibration.views]
     number = clusters.tolist()
     return [
@@ -86,18 +86,18 @@ def diagnose_capture(calibration: Calibration, clusters: IntArray) -> list[Findi
 
 
 def hardly_tilted(c: Calibration) -> list[Finding]:
-    """Return findings where boards are not tilted against the image, or all alike."""
+    """Return findings where boards are not tilted against the image, or all in the same way."""
     return [*_tilts(c), *_parallel(c)]
 
 
 def few_repeated(calibration: Calibration, clusters: IntArray) -> list[Finding]:
-    """Return which images repeat others where enough are left: they count as one, and the rest is none the worse."""
+    """Return a finding about near-duplicate images where enough others are left."""
     images, number = [view.image for view in calibration.views], clusters.tolist()
     return [] if _hardly_any(images, number) else _repeated(images, number)
 
 
 def _hardly_any(images: Sequence[str], number: Sequence[int]) -> bool:
-    """Say whether few images are left, or no more than half, where those that repeat others count as these."""
+    """Return whether few different images are left, or no more than half of all."""
     return len(set(number)) < FEW_IMAGES or 2 * len(set(number)) <= len(set(images))
 
 
@@ -107,7 +107,7 @@ def _axes(c: Calibration, axis: int) -> FloatArray:
 
 
 def _tilts(c: Calibration) -> list[Finding]:
-    """Boards parallel to the image plane say nothing about the focal length."""
+    """Return a finding where few boards are tilted: boards parallel to the image do not determine the focal length."""
     tilted = int((np.abs(_axes(c, 2)[:, 2]) < np.cos(np.radians(TILTED_DEG))).sum())
     if tilted >= min(TILTED_VIEWS, len(c.views)):
         return []
@@ -121,7 +121,7 @@ def _tilts(c: Calibration) -> list[Finding]:
 
 
 def _parallel(c: Calibration) -> list[Finding]:
-    """Boards parallel to each other show one vanishing line, wherever they are."""
+    """Return a finding where all boards are parallel to each other: they have the same vanishing line."""
     normals = _axes(c, 2)
     middle = normals.sum(axis=0)
     cosines = normals @ middle / np.linalg.norm(middle)
@@ -137,9 +137,9 @@ def _parallel(c: Calibration) -> list[Finding]:
 
 
 def boards_never_rotated(c: Calibration) -> list[Finding]:
-    """Return a finding where no board was turned: pixels that are longer one way, and squares that are longer one way,
-    look alike but for what tilted boards show."""
-    # Half a turn changes nothing: angles are doubled.
+    """Return a finding where no board was rotated about its normal: the aspect ratios of pixels and squares are then
+    correlated."""
+    # Half a turn is equivalent to none: angles are doubled.
     along = _axes(c, 0) @ np.array([1.0, 1.0j, 0.0])
     doubled = (along / np.maximum(np.abs(along), np.finfo(float).tiny)) ** 2
     turned = 0.5 * np.degrees(np.abs(np.angle(doubled * np.conj(doubled.sum()))))
@@ -172,7 +172,7 @@ def _too_few(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
 
 
 def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
-    """Say which images show the boards where another one does."""
+    """Return a finding about images that show the boards at the same place as another one."""
     first = dict(reversed(list(zip(number, images, strict=True))))
     again = {image: first[n] for n, image in zip(number, images, strict=True) if first[n] != image}
     if not again:
@@ -188,7 +188,7 @@ def _repeated(images: Sequence[str], number: Sequence[int]) -> list[Finding]:
 
 
 def _distances(c: Calibration) -> list[Finding]:
-    """Say where all boards were equally far away: then depth was seen on their tilts alone."""
+    """Return a finding where all boards were at one distance: only tilts then give depth."""
     if len(c.views) < 2:
         return []
     near, far = quantiles_of(corner_ranges(c), [0.05, 0.95])
@@ -198,7 +198,7 @@ def _distances(c: Calibration) -> list[Finding]:
 
 
 def extrapolated(c: Calibration, extent: Extent, far: FarProjection) -> list[Finding]:
-    """Say where most of the image is known from elsewhere, and not well."""
+    """Return a finding where much of the image is extrapolated and uncertain."""
     if extent.share >= MIN_SHARE_COVERED or not len(extent.pixels):
         return []
     worst = worst_direction(far.covariance(extent.rays[~extent.covered]))

@@ -1,9 +1,9 @@
-"""What changes from image to image: focus, a stabilised sensor, a picture read row by row, a board that bends.
+"""Changes between images: focus, image stabilisation, rolling shutter, a board that bends.
 
-One lens and one board explain all images but for the poses. What else an image shows of its own is told by residuals:
-after its pose, how much of them is a longer focal length, a shifted picture, a motion while the rows were read, a board
-bent otherwise. A lens or a board that is not what the model says, the same in all images, has a little of each; what
-changes from image to image is one of them far above the others.
+The model has one lens and one board for all images. For each kind of change, the residuals of every image (after its
+pose) are regressed on it: another focal length, a shift of the image, a motion during readout, another bend of the
+board. An error of the lens or board model that is common to all images explains a little of each kind; a real change
+explains far more by one kind than by all others.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from rigkit.core.arrays import IntArray
 from rigkit.core.findings import Finding
 
 MIN_VARIANCE_RATIO = 6.0
-"""Variance along a kind of change over that of the rest."""
+"""Variance explained by a kind of change, for each degree of freedom, over that of the rest."""
 MIN_SHARE_EXPLAINED = 0.5
-"""The main part: a kind of change that explains less of all squares may be a little of something else. A board held in
-hand before two cameras is bent by the residuals of one, sheared by those of the other, with a third of each."""
+"""Part of the sum of squares that it must explain; less may be a side effect of another cause. A board held by hand in
+front of two cameras is bent according to the residuals of one, sheared according to the other, a third each."""
 MIN_NEIGHBOUR_CORRELATION = 0.1
-"""All kinds of change are smooth over a board: where one is the main part, the residuals of neighbouring corners agree,
-by half of 0.5 and more. Those of mere noise have a correlation of 0, a little less after a pose."""
+"""All kinds of change are smooth over a board: if one explains half of the squares, the residuals of neighbouring
+corners have a correlation of 0.25 and more. That of noise is 0, slightly less after fitting a pose."""
 MIN_LEAD_OF_CRITERION = 10.0
-"""By so much its Bayesian information criterion must be below that of nothing and of every other kind: very strong
-evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
+"""Difference of its Bayesian information criterion to that of no change and of every other kind: very strong evidence
+(Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995)."""
 MIN_LEAD_OF_GAIN = 0.1
-"""And by this part of its own lead over nothing: kinds of change that follow the same images nearly as well leave open
-which of them it was, however many corners there are."""
+"""The same as a part of the difference to no change: kinds that explain the images almost equally well cannot be
+distinguished, however many corners there are."""
 
 
 MAX_LEFT_OF_CONTROL = 0.85
-"""A motion over rows leaves no more than this part of the squares that one over columns leaves: both follow half of
-what any lens or board unlike its model leaves, in captures held still, too."""
+"""Sum of squares that a motion over rows leaves, over that left by a motion over columns (the control): both explain
+about half of any error of the lens or board model, also in captures without motion."""
 MIN_SHARE_TRIED = 0.2
-"""Where a lens that changes explains this much at first order, it is solved for in every image."""
+"""A change of the lens that explains this much at first order is solved for in every image."""
 LENS_ROUNDS, LENS_TOLERANCE = 2, 1e-6
-"""A focal length that is off by a hundredth moves poses by more than first order: the second round ends it."""
+"""The effect of a focal length that differs by a hundredth is not linear: two rounds are needed."""
 
 
 CHANGES = {
@@ -71,17 +71,18 @@ CHANGES = {
     ),
     "bend": Finding.look("the board is bent otherwise in every image", "glue it to something stiff, and retake all"),
 }
-"""What may change from image to image, by kinds of `ViewEvidence.changes` ("lens" is focus and shift)."""
+"""Finding for each kind of change of `ViewEvidence.changes` ("lens" is focus and shift)."""
 
 OF_LENS = ("focus", "shift", "lens")
-"""The last is both of the others, for a zoom whose centre is not the lens's."""
+"""The last is both of the others, for a zoom about another centre than that of the lens."""
 MOTION = ("rows", NO_CHANGE)
 MOVED = replace(CHANGES["rows"], message="boards or the camera moved while the image was read (rolling shutter)")
-"""A pose that follows a sheared board leaves nearly the same of a motion over rows as of one over columns. Where rows
-are best, and both explain nearly all, far better than all else, it was a motion, unless a bend of each board is the
-main part, too: a lens or board unlike its model shows as that."""
+"""After the pose, motions over rows and over columns are hard to distinguish. Where rows are best, and both explain
+nearly everything, far better than all else, it is a motion, unless a bend of each board explains most of it, too: that
+is an error of the lens or board model."""
 MIN_SHARE_MOVED = 0.9
-"""What a motion explains then: 0.97 and more where simulated boards in hand move by pixels."""
+"""Part of the squares that a motion explains in that case: 0.97 and more where SIMULATED boards in hand move by
+pixels."""
 
 
 def changing(
@@ -91,14 +92,14 @@ def changing(
     but: Collection[str] = (),
     clusters: IntArray | None = None,
 ) -> list[Finding]:
-    """Return a finding where one thing differs from image to image that the calibration takes for constant.
+    """Return a finding where something changes between images that the calibration assumes constant.
 
     Parameters
     ----------
-    correlation : that of the residuals of neighbouring corners.
-    solved : what was calibrated, where it is known: a lens that changes is then solved for, not only looked for at
-        first order.
-    but : kinds of change that are not to be told.
+    correlation : `neighbour_correlation` of the residuals.
+    solved : observations and fit of the calibration, if known: a change of the lens is then solved for, not only tested
+        at first order.
+    but : kinds of change that are not reported.
     clusters : as for `view_evidence`.
     """
     evidence = view_evidence(calibration, clusters) if correlation > MIN_NEIGHBOUR_CORRELATION else None
@@ -118,7 +119,7 @@ def changing(
         }
     best = min(changes, key=lambda kind: changes[kind].criterion)
     if best in OF_LENS and _leads(changes, best, but=OF_LENS):
-        # A zoom about another centre is both; what is nearly as good with one of them is that one.
+        # A zoom about another centre is both; if one of them explains nearly as much, it is that one.
         alone = [kind for kind in OF_LENS[:2] if _leads(changes, kind, but=("lens",))]
         found = CHANGES[alone[0] if alone else best]
     elif best == "rows" and changes["rows"].left <= MAX_LEFT_OF_CONTROL * changes[NO_CHANGE].left:
@@ -142,7 +143,7 @@ def changing(
 
 
 def _leads(changes: Mapping[str, ViewChange], kind: str, but: Collection[str] = ()) -> bool:
-    """Say whether a kind of change is the main part of the residuals, far above all others but those of `but`."""
+    """Return whether a kind of change explains most of the residuals, far better than all others except `but`."""
     found = changes[kind]
     others = [0.0, *(change.criterion for name, change in changes.items() if name != kind and name not in but)]
     lead = max(MIN_LEAD_OF_CRITERION, -MIN_LEAD_OF_GAIN * found.criterion)
@@ -162,7 +163,7 @@ def _solved_for(
     at_first: ViewChange,
     clusters: IntArray | None,
 ) -> ViewChange:
-    """Return what a lens that changes so explains when all is solved with it; `at_first` order where that is
+    """Return what a change of the lens explains when everything is solved with it, or `at_first` (order) if that is
     more."""
     weight, start, residuals, left = fit.weight(observations), fit.state, fit.residuals, at_first.left
     before = ((fit.residuals.px**2).sum(axis=-1) * weight**2).sum(axis=1)

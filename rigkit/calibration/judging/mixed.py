@@ -1,8 +1,8 @@
-"""Two cameras whose images were mixed: the board before the one, then before the other.
+"""Images of two cameras mixed up as those of one.
 
-Cameras that stand beside each other see every board from two places, and always the same motion lies between them. Of
-one camera before which a board is held here and there, no motion comes twice. A board that is moved by equal steps
-comes from each place on to the next one: the same image is the end of one step and the start of another.
+Two cameras on one mount see each board in two poses with always the same motion in between. In images of one camera no
+motion between poses occurs twice, unless the board was moved by equal steps: then an image is the end of one step and
+the start of the next.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from rigkit.core.arrays import FloatArray, IntArray
 from rigkit.core.findings import Finding
 
 SAME_MOTION = 0.005
-"""Boards that land within this part of their distance were moved alike."""
+"""Two motions are equal where they move the board to the same place within this part of its distance."""
 MIN_MOTION = 2.0
-"""A motion of less than so many times that is none."""
+"""A smaller multiple of that is no motion."""
 MIN_PARTNERS = 4
-"""So many images with a partner at the same motion are no chance: a motion has six numbers."""
+"""Number of pairs of images with the same motion that is not chance: a motion has six parameters."""
 MIN_SHARE_PAIRED = 0.5
-"""Of all images, with their partners, at least this part must hang together so."""
+"""Part of all images that must be in such pairs."""
 MAX_SHARE_CHAINED = 0.2
-"""More images than this part that are both start and end: a board moved by equal steps."""
+"""Part of these images that may be both start and end; more is a board moved by equal steps."""
 MAX_STARTS = 24
-"""So many views from which motions are tried, spread over the places of the boards, in whatever order they come."""
+"""Number of views from which motions are tried, spread over the places of the boards, whatever their order."""
 
 
 def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
-    """Return a finding if the images are of two cameras that see the board at once; `number` (V,) is that of each
-    view's image, as `cluster_numbers` has it."""
+    """Return a finding if the images are of two synchronous cameras; `number` (V,) are the `cluster_numbers` of the
+    views' images."""
     views = calibration.views
     images = [view.image for view in views]
     _, first = np.unique(number, return_index=True)
@@ -59,16 +59,16 @@ def two_cameras(calibration: Calibration, number: IntArray) -> list[Finding]:
 def _partners(
     rotation: FloatArray, centre: FloatArray, boards: IntArray, number: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Return start and end of the views (V,) between which the boards have moved in the one way that is the most
-    common, from poses (V, 3, 3) and (V, 3) mm."""
+    """Return start and end of the pairs of views with the most common motion of the board, from poses (V, 3, 3) and
+    (V, 3) mm."""
     distance = float(np.linalg.norm(centre, axis=1).mean())
-    # A pose as four points: the board's origin, and the ends of axes half as long as it is far away.
+    # A pose as four points: the board's origin, and the ends of axes of half the distance.
     frame = 0.5 * distance * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     reach = SAME_MOTION * distance * 2.0
     along = np.lexsort(centre.T)
     starts = along[np.unique(np.linspace(0, len(centre) - 1, min(MAX_STARTS, len(centre))).astype(np.int64))]
-    # By how much each motion moves a frame that stands where boards usually were, as products of all ends and starts:
-    # coordinates first, then start, end and point.
+    # Displacement of a frame at the boards' mean place by each motion, as products of all ends and starts: coordinates
+    # first, then start, end and point.
     typical = frame + centre.mean(axis=0)
     seen_from = (typical - centre[starts, None]) @ rotation[starts]
     moved = np.swapaxes(rotation, 0, 1).reshape(-1, 3) @ seen_from.reshape(-1, 3).T
@@ -80,12 +80,12 @@ def _partners(
     moved = np.moveaxis(moved[:, j, i], 0, 1).reshape(-1, 12)
     alike = _neighbours(moved, reach) if len(moved) else np.zeros(0, np.int64)
     if alike.max(initial=0) < 2:
-        # No motion comes twice.
+        # No motion occurs twice.
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     near = np.linalg.norm(moved - moved[int(np.argmax(alike))], axis=1) <= reach
     best = np.flatnonzero(near)
     points = frame @ np.swapaxes(rotation, -1, -2) + centre[:, None]
-    # The motion of the one that lies in the middle of those.
+    # The motion closest to the median of those.
     middle = best[int(np.argmin(np.linalg.norm(moved[best] - np.median(moved[best], axis=0), axis=1)))]
     start, end = starts[i[middle]], j[middle]
     landed = (points - centre[start]) @ (rotation[end] @ rotation[start].T).T + centre[end]
@@ -98,7 +98,7 @@ def _partners(
 
 
 def _neighbours(points: FloatArray, reach: float) -> IntArray:
-    """Return how many of the points (N, 12) lie within `reach` of each (N,), itself too."""
+    """Return for each of the points (N, 12) the number within `reach` of it, (N,), itself included."""
     i, j = close_pairs(points, reach)
     near = np.linalg.norm(points[i] - points[j], axis=1) <= reach
     return np.asarray(1 + np.bincount(np.concatenate([i[near], j[near]]), minlength=len(points)))

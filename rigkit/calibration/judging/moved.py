@@ -1,13 +1,13 @@
-"""Whether the lens stayed as it was while the images were taken: those before each image against those from it on.
+"""Test whether the lens changed while the images were taken: a change point between earlier and later images.
 
-The moment is searched for at first order: what each image pulls the lens by, after its pose, is summed up in the order
-of the images, and where the sums before and after contradict each other most is where it may have changed. The best of
-many splits is good by chance, too. So the same search is done in random orders of the images, whatever makes these
-differ: only where time does better than nearly all of those did it change then.
+The change point is searched at first order: the scores of the images, with poses eliminated, are summed in the order of
+the images, and the split is where lenses of the two parts differ most. As the best of many splits is good by chance,
+too, the search is repeated in random orders of the images (permutation test).
 
-A board that is not what the model says sets images apart too, wherever they show it in different ways. So splits in
-time are compared with splits by place: boards left and right, near and far, tilted this way and that. Only what time
-tells apart more clearly than any of those is a lens that moved. The same holds for images whose names are of two kinds.
+An error of the board model makes images differ, too, where they show the board in different ways. So splits in time are
+compared with splits by place: boards left and right, near and far, tilted in different directions. Only a split in time
+that separates more clearly than all of those is a lens that moved. The same test is done for images with two kinds of
+names.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ from rigkit.core.findings import Finding
 
 MIN_IMAGES_FOR_HALVES = 10
 MIN_HALF_SIGMAS = 3.0
-"""Parts this far apart (root of the mean squared distance of the parameters, in standard deviations) may be two
-lenses. Halves of one and the same are 1 apart, at most 2."""
+"""Root mean squared difference of the parameters, in standard deviations, from which two parts may be of two lenses.
+That of two halves of one lens is 1, at most 2."""
 AGAINST_PLACE = 1.4
-"""They are, if what they say beside any other way to part the images (root of what the cost falls) is so many times
-what that says beside them. Measured, the least of all ways: 0.3 to 1.1 in 12 REAL and rendered sessions of one lens;
-there in random orders that chance parts as clearly, 0.9 to 1.6 (once 1.7 in 720); in nine of ten 1.3 and more, usually
-2.7, where eight of them are parted at a zoom of 3 or 15 %."""
+"""Root of the cost decrease of the split given any split by place, over that of the split by place given this one,
+from which it is a change of the lens. Measured, the smallest over all splits by place: 0.3 to 1.1 in 12 REAL and
+RENDERED sessions of one lens; 0.9 to 1.6 (once 1.7 in 720) in their random orders that separate as clearly by chance;
+1.3 and more in nine of ten, typically 2.7, where eight of the sessions have a zoom of 3 or 15 % between two parts."""
 ORDERS, CHANCE = 199, 0.02
-"""Random orders of the images, and how many of them may part these as well as time does."""
+"""Number of random orders, and the largest part of them that may separate the images as well as time does."""
 DIGITS = re.compile(r"\d+")
 
 
 def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
-    """Return a verdict if the images before one of them and those from it on, in the order given, have different
-    intrinsics, or those whose names are alike and the others."""
+    """Return a finding if the images before and from one image on, in the order given, have different intrinsics, or
+    if images with two kinds of names do."""
     images = list(dict.fromkeys(observations.images))
     if len(images) < MIN_IMAGES_FOR_HALVES:
         return ()
     place = {name: i for i, name in enumerate(images)}
     number = np.array([place[name] for name in observations.images])
-    # The shape of the boards stays as it was found: two shapes are not two lenses.
+    # Board shapes are held: two shapes are not two lenses.
     state = fit.state.with_boards_held()
     scores, order = _ImageScores.of(fit, number), np.arange(len(images))
     first = scores.split_at(order)
@@ -76,7 +76,7 @@ def moved_lens(observations: Observations, fit: Fit) -> tuple[Finding, ...]:
 
 
 def moment(order: Sequence[str], some: Collection[str]) -> str:
-    """Return in words when `some` of the images in `order` were taken, if before or after all others; else ""."""
+    """Return in words that `some` of the images in `order` are the first or the last ones; "" if they are neither."""
     for at, words in ((len(some), "before '{}'"), (len(order) - len(some), "from '{}' on")):
         if 0 < at < len(order) and set(order[:at] if words.startswith("before") else order[at:]) == set(some):
             return words.format(order[at])
@@ -85,8 +85,8 @@ def moment(order: Sequence[str], some: Collection[str]) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _ImageScores:
-    """What each of N images says of the lens after its pose: information (N, P, P) and score (N, P), in units in which
-    all together and the prior (P, P) have a unit diagonal; a part has `min_images` images at least."""
+    """Information (N, P, P) and score (N, P) of N images on the lens, poses eliminated, scaled so that their sum with
+    the prior (P, P) has a unit diagonal; each part of a split has at least `min_images` images."""
 
     information: FloatArray
     score: FloatArray
@@ -95,7 +95,7 @@ class _ImageScores:
 
     @classmethod
     def of(cls, fit: Fit, number: IntArray) -> _ImageScores:
-        """Return those of the images that the views (V,) are of, all else that is solved for held."""
+        """Return those of the images `number` (V,) of the views, with all other unknowns held."""
         p = fit.state.camera.parameters.size
         rows = np.r_[:p, -7:0] % fit.data.products[0].shape[-1]
         information, score = reduced_by_cluster(fit.data.products[0][:, rows[:, None], rows], p, number)
@@ -106,21 +106,21 @@ class _ImageScores:
         return cls(information * across, score * scale, prior * across + RIDGE_OF_STEP * np.eye(p), min_images)
 
     def gains(self, order: IntArray) -> FloatArray:
-        """Return by how much the cost falls when the first k of the images in this order (N,) and the others have
-        lenses of their own: for each k that leaves both enough, at first order, but for what one lens gains."""
+        """Return the first-order decrease of the cost when the first k images in this order (N,) and the others have
+        separate lenses, against one common lens, for each k that leaves both parts enough images."""
         at = slice(self.min_images - 1, len(order) - self.min_images)
         return self._gain(self.information[order].cumsum(axis=0)[at], self.score[order].cumsum(axis=0)[at])
 
     def split_at(self, order: IntArray) -> int:
-        """Return how many of the images in this order (N,) come before the place where lenses differ most."""
+        """Return the number of images in this order (N,) before the split with the largest decrease."""
         return self.min_images + int(np.argmax(self.gains(order)))
 
     def gain_of(self, second: BoolArray) -> float:
-        """Return the same when the images that are `second` (N,) and the others have."""
+        """Return the decrease for separate lenses of the images `second` (N,) and the others."""
         return float(self._gain(self.information[second].sum(axis=0)[None], self.score[second].sum(axis=0)[None])[0])
 
     def _gain(self, information: FloatArray, score: FloatArray) -> FloatArray:
-        """Return the same for parts that sum up to these (K, P, P) and (K, P)."""
+        """Return the decrease for K first parts with these sums (K, P, P) and (K, P)."""
         every, pull = self.information.sum(axis=0), self.score.sum(axis=0)
         gain = -pull @ np.linalg.solve(every + self.prior, pull)
         for own, part in ((information, score), (every - information, pull - score)):
@@ -128,21 +128,20 @@ class _ImageScores:
         return np.asarray(gain)
 
     def gain_of_both(self, one: BoolArray, other: BoolArray) -> float:
-        """Return the same when lenses differ between images that are `one` (N,) and not, and that are `other` and
-        not."""
+        """Return the decrease when lenses differ by two additive effects, of the splits `one` (N,) and `other`."""
         sides = np.stack([np.ones(len(one)), one, other])
         p = self.prior.shape[0]
         every = np.einsum("av,bv,vij->aibj", sides, sides, self.information)
-        # What one lens is held by holds each step between two as well.
+        # The prior of the lens applies to each effect, too.
         every += np.einsum("ab,ij->aibj", np.eye(3), self.prior)
         pull = sides @ self.score
         whole = pull.ravel() @ np.linalg.solve(every.reshape(3 * p, 3 * p), pull.ravel())
         return float(whole - pull[0] @ np.linalg.solve(every[0, :, 0], pull[0]))
 
     def chance(self, clusters: IntArray, number: IntArray) -> float:
-        """Return the chance that images in a random order are parted as much as these are in theirs; 1 as soon as it
-        is above `CHANCE`. Views (V,) of one cluster, copies of each other, stay together; `number` (V,) is that of
-        the image of each."""
+        """Return the p-value of the permutation test: the part of random orders with a split at least as good as in the
+        true order; 1 as soon as it exceeds `CHANCE`. Near-duplicates, views (V,) of one cluster, stay together;
+        `number` (V,) is the index of each view's image."""
         of_image = np.zeros(len(self.score), np.int64)
         of_image[number] = clusters
         found = self.gains(np.arange(len(of_image))).max()
@@ -155,8 +154,8 @@ class _ImageScores:
 
 
 def _named_alike(images: Sequence[str]) -> BoolArray | None:
-    """Return which images (N,) have names other than the first one's but for their digits, of two kinds of names with
-    a fair number each; None where there are no two such kinds."""
+    """Return which images (N,) have another kind of name (without digits) than the first; None unless there are exactly
+    two kinds with enough images each."""
     kinds = [DIGITS.sub("", name) for name in images]
     if len(set(kinds)) != 2:
         return None
@@ -167,8 +166,9 @@ def _named_alike(images: Sequence[str]) -> BoolArray | None:
 def _lens_difference_sigmas(
     observations: Observations, fit: Fit, state: State, number: IntArray, second: BoolArray, scores: _ImageScores
 ) -> float | None:
-    """Return by how many standard deviations the lenses of the images (N,) that are `second` and of the others differ,
-    if that says far more than how images parted by place do; `number` is that of the image of each view (V,)."""
+    """Return the difference, in standard deviations, between the lenses of the images `second` (N,) and of the others,
+    None unless it is significant and larger than for splits by place; `number` (V,) is the index of each view's
+    image."""
     distance = _cost_difference(observations, fit, state, second[number])
     if not distance > MIN_HALF_SIGMAS:
         return None
@@ -186,8 +186,7 @@ def _lens_difference_sigmas(
 
 
 def _places(observations: Observations, state: State) -> FloatArray:
-    """Return in what ways views differ but in time, (K, V): where in the image, how far from its middle, how far away,
-    how tilted."""
+    """Return the places of the views, (K, V): position in the image, distance from its mean, distance, tilts."""
     present = observations.present[..., None]
     count = np.maximum(present.sum(axis=1), 1)
     pixels = (observations.pixels * present).sum(axis=1) / count
@@ -197,8 +196,8 @@ def _places(observations: Observations, state: State) -> FloatArray:
 
 
 def _cost_difference(observations: Observations, fit: Fit, state: State, second: BoolArray) -> float:
-    """Return how far apart the intrinsics of the two sets of views are: by how much the cost falls when each has its
-    own, which for one and the same lens is sigma^2 a parameter."""
+    """Return the difference of the intrinsics of two sets of views in standard deviations, from the decrease of the
+    cost with separate intrinsics: for one lens that is sigma^2 for each parameter."""
     whole, split, count = 0.0, 0.0, 0
     for chosen in (np.flatnonzero(~second), np.flatnonzero(second)):
         part, start = observations.subset(chosen), state.subset(chosen)

@@ -1,4 +1,4 @@
-"""How far the residuals of neighbouring corners agree: noise does not, a lens or a board unlike its model does."""
+"""Correlation of the residuals of neighbouring corners: zero for noise, positive for errors of lens or board model."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rigkit.calibration.result import Calibration
 
 
 def neighbour_correlation(c: Calibration) -> float:
-    """Return the correlation of the residuals of corners next to each other on their board, kept ones; 0 if none is."""
+    """Return the correlation of the residuals of inliers that are neighbours on their board; 0 if there are none."""
     corners = c.corners
     kept, grid = corners.kept, corners.grid
     columns, rows = (grid.max(axis=0) + 1).tolist()

@@ -1,16 +1,15 @@
-"""A lens that does not look from one point: its entrance pupil moves along the axis with the angle.
+"""Test for a lens that is not central: its entrance pupil moves along the axis with the angle.
 
-All camera models here are central: a pixel has a ray, and all rays meet. Of wide lenses that is true of what is far
-away. The pupil of a real fisheye moves forward by millimetres towards the rim, so that a point at the angle t and the
-distance R appears turned by about s(t) sin(t) / R, with s(t) = e t^2 to first order. Boards that fill the image of such
-a lens are as near as the board is large, where that is pixels. A central model follows it for one distance; what it
-cannot follow shows in the residuals, and what it did follow is wrong at all other distances, far away most of all.
+All camera models here are central: the rays of all pixels meet in one point. For wide lenses that holds only for far
+points. The pupil of a real fisheye moves forward by millimetres towards the rim, so that a point at the angle t and
+the distance R appears rotated by about s(t) sin(t) / R, with s(t) = e t^2 to first order. A board that fills the image
+of such a lens is so near that this is pixels. A central model absorbs it for one distance. The rest is in the
+residuals, and the absorbed part is an error at all other distances, largest for far points.
 
-The residuals tell e, with the boards' poses and a bow of the boards free to follow, and the lens, as far as any central
-one can: a displacement of its image that no model has is not taken for a pupil. How sure e is, the scatter from image
-to image tells; how far what is far away has moved, by how much the parameters have followed. Corners that fit least
-were left out, and boards of free shape follow, too: of what is there this finds about a half to three quarters, and
-says "at least".
+The residuals give e by regression, with the boards' poses and bows and any displacement of a central lens free, so
+that errors of the lens model do not count as a pupil. The scatter between images gives the standard deviation of e. The
+change of the fitted parameters gives the displacement of far points. As outliers are left out and released board shapes
+absorb a part as well, a half to three quarters of the movement are found, and the finding says "at least".
 
 Reference: D. B. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68 (2006), section 2, on the
 moving entrance pupil (the E terms of CAHVORE).
@@ -45,32 +44,33 @@ from rigkit.kernels.departures import displacements
 
 BOWS = CHANGE_COLUMNS["bend"]
 BY_CHANCE = 1e-3
-"""Of images of a lens that looks from one point so few show a pupil that moves."""
+"""Significance level of the finding."""
 ASKED_AT = 0.05
-"""Of such images so few have it solved for. A pupil spoils the lens it is told by, and the scatter between images, most
-where images are few: of SIMULATED sessions with 3 mm rad^-2 one of ten had a chance of one to three in a thousand."""
+"""Significance level at which a pupil is solved for. It is higher, as a moving pupil increases the scatter between
+images, most with few images: one of ten SIMULATED sessions with 3 mm rad^-2 had a p-value of 0.001 to 0.003."""
 MIN_FOUND = 0.5
-"""Mostly a half of a pupil or more is found where lens and boards follow it: what may matter in full is asked for."""
+"""Smallest part of a pupil's movement that is found here; so a pupil is solved for from half of the size that
+matters."""
 MIN_PUPIL_PART = 1e-4
-"""Of the square of what a pupil does to the corners, poses, boards and a central lens that follow it leave at least
-this. Captures that tell have a hundredth to a third, boards of one distance and narrow lenses next to nothing."""
+"""Smallest part of a pupil's effect on the corners (sum of squares) that poses, boards and a central lens must not
+absorb. Captures that determine it have 0.01 to 0.3; boards at one distance and narrow lenses have almost none."""
 NOT_FOLLOWED = 1e-10
-"""Of what is common to all images, a direction with less than this part of the largest square is not followed."""
+"""Relative singular value up to which a direction common to all images is undetermined."""
 DISTANCES = (0.05, 0.95)
-"""Quantiles of the corners' distances that are told."""
+"""Quantiles of the corners' distances that are reported."""
 NOT_ONE_POINT = "the lens does not look from one point"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MovingPupil:
-    """How an entrance pupil moves.
+    """First-order estimate of the movement of an entrance pupil.
 
     Attributes
     ----------
-    mm_per_rad2, sigma_mm_per_rad2 : by how much it moves forward with the square of the angle, and the standard
-        deviation of that, from the scatter between images.
+    mm_per_rad2, sigma_mm_per_rad2 : forward movement per squared angle, and its standard deviation from the scatter
+        between images.
     freedom : degrees of freedom of the latter.
-    followed : (P,) by how much the camera's parameters would change if it were known.
+    followed : (P,) change of the camera's parameters if the movement were modelled.
     """
 
     mm_per_rad2: float
@@ -80,11 +80,11 @@ class MovingPupil:
 
     @classmethod
     def of(cls, calibration: Calibration) -> MovingPupil | None:
-        """Return that of a calibrated lens; None where its images leave it open."""
+        """Return that of a calibrated lens; None where its images do not determine it."""
         found = _products(calibration)
         if found is None:
             return None
-        # All that is common to the images, then the pupil and the residual.
+        # Rows common to all images, then the pupil and the residual.
         products, image, p = found
         whole = products.sum(axis=0)
         scale = np.sqrt(np.maximum(np.diag(whole), np.finfo(float).tiny))
@@ -95,7 +95,7 @@ class MovingPupil:
         left = float(gram[pupil, pupil] - follow @ gram[common, pupil])
         if not left > MIN_PUPIL_PART:
             return None
-        # How all of it moves with 1 mm rad^-2 of the pupil, and what is then left in each image.
+        # Change of all rows with 1 mm rad^-2 of the pupil, and the residual of each image after the fit.
         direction = np.append(-follow * scale[pupil] / scale[common], 1.0)
         information = left * scale[pupil] ** 2
         own, pull = products[:, :-1, :-1], products[:, :-1, -1]
@@ -104,23 +104,23 @@ class MovingPupil:
         after = np.bincount(image, (pull - own @ step) @ direction)
         share = np.bincount(image, own @ direction @ direction) / information
         variance = float((after**2 / np.maximum(1.0 - share, MIN_LEFT)).sum()) / information**2
-        # Images of much leverage count for several.
+        # Images of high leverage count for several.
         freedom = max(1.0 / float((share**2).sum()) - 1.0, 1.0)
-        # The lens as it is had its parameters and the boards' shapes to follow with, and no displacement.
+        # The calibration itself could adapt its parameters and board shapes, but no displacements.
         alone = _following(gram, np.append(common[:p], common[-BOWS:]), pupil)[:p] * scale[pupil] / scale[:p]
         return cls(amount, float(np.sqrt(variance)), freedom, -amount * alone)
 
     @property
     def chance(self) -> float:
-        """Probability of a movement as large from images of a lens that looks from one point."""
+        """Probability of a movement this large for a central lens."""
         # Imported here: scipy is slow to import, and most calibrations never ask.
         from scipy.special import stdtr
 
         return float(2.0 * stdtr(self.freedom, -abs(self.mm_per_rad2) / max(self.sigma_mm_per_rad2, 1e-12)))
 
     def far_px(self, far: FarProjection) -> float:
-        """Return by how much (rms at the boards' corners) it moves what is far away, after the rotation that hides it
-        best."""
+        """Return the displacement of far points by it (rms at the boards' corners), after the rotation that compensates
+        it best."""
         safe = np.where(far.sigmas > 0.0, far.sigmas, 1.0)
         moved = np.einsum(
             "ipm,p->im", far.corners.design, np.append(self.followed, -far.hides @ (self.followed / safe))
@@ -129,9 +129,9 @@ class MovingPupil:
 
 
 def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | None:
-    """Return products (V, K, K) of how the corners of V views move, their poses eliminated; which image (V,) each is
-    of, and P. They move with what is common to all images (the camera's P parameters, displacements of the image and
-    bows of the boards), with the pupil and with the residual. None where that is nothing."""
+    """Return J^T J (V, K, K) of V views with poses eliminated, the image (V,) of each, and P; None with too few views.
+    The columns of J are derivatives by what is common to all images (the camera's P parameters, displacements of the
+    image and bows of the boards) and by the pupil, and the residual."""
     views = [view for view in calibration.views if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS]
     if len(views) < MIN_INFORMATIVE_VIEWS:
         return None
@@ -144,7 +144,7 @@ def _products(calibration: Calibration) -> tuple[FloatArray, IntArray, int] | No
 
 
 def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
-    """Return the rows (2, K, N) of `_products`, those of the pose first, and how many corners each view has."""
+    """Return the rows (2, K, N) for `_products`, those of the pose first, and the number of corners of each view."""
     rows, count = rows_of(calibration, views)
     p, bows = calibration.camera.parameters.size, columns_of(rows.shape[1])["bend"]
     poses = [view.cam_from_board for view in views]
@@ -152,7 +152,7 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
     x, y, z = np.concatenate(
         [at @ pose.rotation.T + pose.translation_mm for at, pose in zip(points, poses, strict=True)]
     ).T
-    # Boards that come nearer by as much as the pupil moves forward: the third of the rows of a pose's shift.
+    # A pupil that moves forward is equivalent to a board that comes nearer: the third row of the translation.
     pupil = -(np.arctan2(np.hypot(x, y), z) ** 2) * rows[:, 5]
     moved = displacements(np.concatenate([view.pixels[view.kept] for view in views]), calibration.camera.size_px)
     parts = [rows[:, : 6 + p], moved, rows[:, bows], pupil[:, None], rows[:, -1:]]
@@ -160,13 +160,13 @@ def _rows(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatA
 
 
 def _following(gram: FloatArray, rows: IntArray, what: int) -> FloatArray:
-    """Return the amounts of these `rows` with which they follow the row `what` best."""
+    """Return the coefficients of the regression of the row `what` on `rows`, from their products `gram`."""
     return np.asarray(np.linalg.lstsq(gram[np.ix_(rows, rows)], gram[rows, what], rcond=NOT_FOLLOWED)[0])
 
 
 def moving_pupil(calibration: Calibration, correlation: float, far: FarProjection) -> list[Finding]:
-    """Return a finding where the lens does not look from one point, and that matters; `correlation`: that of the
-    residuals of neighbouring corners."""
+    """Return a finding where the pupil moves significantly and by a relevant amount; `correlation` is the
+    `neighbour_correlation` of the residuals."""
     asked = calibration.pupil is None and correlation > MIN_NEIGHBOUR_CORRELATION
     pupil = MovingPupil.of(calibration) if asked else None
     if pupil is None or pupil.chance > BY_CHANCE:
@@ -187,7 +187,7 @@ def moving_pupil(calibration: Calibration, correlation: float, far: FarProjectio
 
 
 def modelled_pupil(calibration: Calibration) -> list[Finding]:
-    """Say of a lens whose pupil is part of its calibration by how much that moves."""
+    """Return a finding with the movement of a pupil that is part of the calibration."""
     if calibration.pupil is None:
         return []
     near, away, rim = _shown(calibration)
@@ -203,8 +203,8 @@ def modelled_pupil(calibration: Calibration) -> list[Finding]:
 
 
 def may_move(calibration: Calibration) -> bool:
-    """Say whether a pupil that moves is worth to be solved for: residuals of a central lens would not often be so by
-    chance, and what is far away would move by something of importance. What the fit then says decides."""
+    """Return whether a moving pupil should be solved for: its first-order estimate is significant at ASKED_AT, and far
+    points would be displaced by a relevant amount. The fit decides then."""
     if neighbour_correlation(calibration) <= MIN_NEIGHBOUR_CORRELATION:
         return False
     pupil = MovingPupil.of(calibration)
@@ -214,7 +214,7 @@ def may_move(calibration: Calibration) -> bool:
 
 
 def _shown(calibration: Calibration) -> tuple[float, float, float]:
-    """Return from where to where boards were, mm, and the largest angle of a corner from the axis, rad."""
+    """Return the DISTANCES of the corners, mm, and their largest angle from the axis, rad."""
     points = calibration.corners.in_cam(np.flatnonzero(calibration.corners.kept))
     distance = np.linalg.norm(points, axis=1)
     near, away = np.quantile(distance, DISTANCES).tolist()

@@ -1,10 +1,10 @@
-"""Images of one camera of which a program turned some by half a turn, or mirrored some.
+"""Images of one camera of which some were rotated by 180 degrees, or mirrored, by a program.
 
-Viewers turn pictures that follow a tag of their file; conferencing programs mirror them. Such a picture is one of the
-same lens whose principal point lies on the other side of its middle, and a mirrored one shows a mirrored board. No
-number is free but which ones were flipped: so nobody need see two clusters of principal points, which few images, or
-boards that are tilted the other way once they are turned, do not show surely. Each image is asked: with lens and board
-as they are, is it shown better as it is, or put back? Then lens and board are solved for again.
+Image viewers apply the EXIF orientation; conferencing programs mirror. Such an image is of the same lens with the
+principal point reflected at the image centre, and a mirrored image shows a mirrored board. The only unknown is which
+images were flipped. Each image is tested: with lens and board shape held, does it fit better as it is, or flipped back?
+Then lens and board shape are solved for again. This needs no two clusters of principal points, which few images, or
+boards that compensate by their tilt, do not show clearly.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from rigkit.core.arrays import BoolArray, IntArray
 from rigkit.core.findings import Finding
 
 TOLERANCE = 1e-4
-"""Relative to the cost: put back, the squares of the residuals fall by a factor, if that was the cause."""
+"""Relative cost at which the solver stops: if flipping is the cause, the cost falls by a factor."""
 MAX_STILL_SHIFTED = 0.2
-"""What a shifted picture explains once pictures are put back is less than this part of what putting them back explains.
-Shifts anywhere between two ends, cut in two, leave a third, normal ones more than half; REAL sessions of which half
-was turned leave 0.003 to 0.1."""
+"""Part of the squares that a shift between images explains after flipping back, over that explained by flipping back.
+Uniformly distributed shifts split into two groups leave a third, normally distributed ones more than half; REAL
+sessions of which half was turned leave 0.003 to 0.1."""
 ROUNDS = 4
-"""Images change sides in so many rounds at most."""
+"""Maximal number of rounds in which images change sides."""
 MIN_FIRST_GAIN = 0.1
-"""Views put back, lens and boards held, take so much off the squares, or they are not worth solving for. Of REAL and
-SIMULATED sessions of which every fourth picture was mirrored 0.4 to 0.6, of the same as they are 0 to 0.01."""
+"""Part of the squares that flipping views back must explain, with lens and boards held, before it is solved for: 0.4 to
+0.6 for REAL and SIMULATED sessions with every fourth image mirrored, 0 to 0.01 for the unchanged sessions."""
 WAYS = {
     "turned by half a turn": np.array([-1.0, -1.0]),
     "mirrored left to right": np.array([-1.0, 1.0]),
     "mirrored top to bottom": np.array([1.0, -1.0]),
 }
-"""What is done to a picture, as signs of how far a pixel lies from its middle, (right, down)."""
+"""Kinds of flips, as signs of the pixel coordinates (u, v) relative to the image centre."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Back:
-    """Observations whose pictures of the views `at` (V,) are put back in one of the `WAYS`, what they are solved to,
-    and the sum of the squared residuals."""
+    """Observations with the images of the views `at` (V,) flipped back in one of the `WAYS`, their solution, and its
+    sum of squares."""
 
     way: str
     at: BoolArray
@@ -67,10 +67,10 @@ def flipped_pictures(
     *,
     shifted: bool = True,
 ) -> Finding | None:
-    """Return a finding where some of the pictures were turned by half a turn or mirrored; None where that is no cause.
+    """Return a finding where some of the images were rotated by 180 degrees or mirrored, else None.
 
-    `clusters` are as for `view_evidence`, whose `evidence` is of the calibration as it is; `shifted` says whether it
-    is worth while to look for two principal points.
+    `evidence` is the `view_evidence` of the calibration with these `clusters`; `shifted` says whether two clusters of
+    principal points are possible.
     """
     before = float(weighted_squares(fit.state, observations, fit.weight(observations)).sum())
     tried = [
@@ -93,9 +93,9 @@ def flipped_pictures(
 def _first_guesses(
     way: str, evidence: ViewEvidence | None, observations: Observations, fit: Fit
 ) -> Iterator[tuple[BoolArray, IntArray]]:
-    """Yield which views (V,) may be flipped, and from which end their boards are numbered then: those that lens and
-    boards as they are show better put back (lens and boards are those of the many, where these are), and those of one
-    of two principal points."""
+    """Yield which views (V,) may be flipped, and the quarter turns by which their boards are then numbered differently:
+    the views that fit better flipped with lens and boards held, and those of one of two clusters of principal points.
+    """
     better, gain, turns = _better_put_back(way, observations, fit.state, fit)
     if gain > MIN_FIRST_GAIN and not better.all():
         yield better, turns
@@ -109,7 +109,7 @@ def _first_guesses(
 
 
 def _put_back_in_turn(way: str, at: BoolArray, turns: IntArray, observations: Observations, fit: Fit) -> _Back:
-    """Return what is found from a first guess of which views are flipped: solved for, and asked again."""
+    """Return the solution from a first guess of which views are flipped, by alternating solution and test."""
     begun, state = _put_back(way, at, turns, observations, fit.state)
     state, _ = refine_poses(begun, state, fit.weight(observations), tolerance=START_TOLERANCE)
     for _ in range(ROUNDS):
@@ -129,16 +129,16 @@ def _solved(way: str, at: BoolArray, observations: Observations, state: State, f
 
 
 def _better_put_back(way: str, observations: Observations, state: State, fit: Fit) -> tuple[BoolArray, float, IntArray]:
-    """Return which views (V,) lens and boards as they are show better put back, the part of all squares that this takes
-    away, and by how many quarter turns (V,) the boards are numbered otherwise then: a mirrored one is numbered from
-    either end; one that looks the same turned may be."""
+    """Return which views (V,) fit better flipped, with lens and boards held, the relative decrease of the sum of
+    squares, and the quarter turns (V,) by which their boards are then numbered differently: a mirrored board is
+    numbered from either end, as is one with rotational symmetry."""
     every, weight = np.ones(len(observations.views), dtype=bool), fit.weight(observations)
     now, costs = weighted_squares(state, observations, weight), []
     for turns in (0, 2):
         flipped, start = _put_back(way, every, np.full(len(every), turns), observations, state)
         cost = refine_poses(flipped, start, weight, tolerance=START_TOLERANCE)[1]
-        told = turns == 2 and WAYS[way].prod() > 0.0
-        costs.append(np.where([told and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
+        numbered = turns == 2 and WAYS[way].prod() > 0.0
+        costs.append(np.where([numbered and not view.board.looks_same_turned for view in flipped.views], np.inf, cost))
     best = np.min(costs, axis=0)
     better = best < now
     gain = float((now - best)[better].sum() / max(float(now.sum()), np.finfo(float).tiny))
@@ -148,8 +148,8 @@ def _better_put_back(way: str, observations: Observations, state: State, fit: Fi
 def _put_back(
     way: str, at: BoolArray, turns: IntArray, observations: Observations, state: State
 ) -> tuple[Observations, State]:
-    """Return observations and poses with the pictures of the views `at` (V,) flipped in one of the `WAYS`, their boards
-    numbered from an end that lies so many quarter `turns` (V,) further."""
+    """Return observations and poses with the images of the views `at` (V,) flipped in one of the `WAYS`, and their
+    boards renumbered by so many quarter `turns` (V,)."""
     signs, middle = WAYS[way], 0.5 * (np.array(state.camera.size_px) - 1.0)
     pixels, corner, views = observations.pixels.copy(), observations.corner.copy(), list(observations.views)
     pixels[at] = middle + signs * (pixels[at] - middle)
@@ -158,7 +158,7 @@ def _put_back(
         view, picture = views[k], np.append(signs, 1.0)
         grid, board = view.grid, np.ones(3)
         if signs.prod() < 0.0:
-            # To stay right-handed, a board in a mirror is counted backwards along its columns.
+            # To stay right-handed, a mirrored board is numbered backwards along its columns.
             grid, board = np.stack([view.board.columns - 1 - grid[:, 0], grid[:, 1]], axis=-1), np.array([-1.0, 1, 1])
             across = (view.board.columns - 1) * view.board.square_x_mm
             translation[k] += rotation[k] @ np.array([across, 0.0, 0.0])
@@ -171,17 +171,17 @@ def _put_back(
 
 
 def _finding_of(back: _Back, before: float, evidence: ViewEvidence) -> Finding | None:
-    """Return the finding, where putting pictures back explains the residuals, and nothing like it is left in them."""
+    """Return the finding, if flipping images back explains the residuals and no shift between images is left."""
     at, changes = back.at, evidence.changes()
     left, part = max(back.squares / before, np.finfo(float).eps), float(at.mean())
     if not 0.0 < part < 1.0 or not changes:
         return None
-    # Which pictures were flipped is known from the residuals alone, and costs its entropy.
+    # Which images were flipped is estimated from the same residuals: twice its entropy is added to the criterion.
     entropy = -2.0 * len(at) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
-    # Corners of an image err together; each image says two numbers of where its principal point lies.
+    # Errors within an image are correlated: each counts as two measurements, of its principal point.
     if 2.0 * len(at) * np.log(left) + entropy > -MIN_LEAD:
         return None
-    # A picture that moves on the sensor by any way moves on, whatever was flipped.
+    # Images that shift on the sensor for another reason still do after flipping.
     if left * max(changes[way].share for way in ("shift", "lens")) > MAX_STILL_SHIFTED * (1.0 - left):
         return None
     names = [view.image for view in back.observations.views]

@@ -1,11 +1,10 @@
-"""Images of two kinds, through two lenses or at two settings of one: turned, cropped, undistorted, of another camera.
+"""Images of two kinds, from two lenses or two settings of one: turned, cropped, undistorted, of another camera.
 
-Nothing says which image is of which kind; the residuals do. Each image has an amount by which its lens lies on the way
-from the one kind to the other, and where there are two kinds those amounts lie at two places, far apart against their
-scatter. What else is not as the model says, a lens, a board, a motion, scatters them without a gap. So the unit that
-counts is the image, not the corner. Two places are held against one by the scatter of the amounts, and against what
-else tells the images apart: a lens unlike its model differs between boards here and there, near and far, tilted this
-way and that, too.
+Which image is of which kind is estimated from the residuals. Each image gives an amount along the difference between
+the two lenses. If there are two kinds, the amounts form two clusters that are far apart compared with their scatter;
+other errors of the model (lens, board, motion) scatter them without a gap. So images are the units, not corners. Two
+clusters are compared with one by the scatter of the amounts, and with other causes of differences between images: an
+error of the lens model, too, differs with the boards' position, distance and tilt.
 """
 
 from __future__ import annotations
@@ -20,25 +19,25 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.core.findings import Finding
 
 MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND = 3, 0.1
-"""Fewer images that are unlike the others are named one by one."""
+"""Smallest number, and part, of images of a kind; fewer are reported one by one."""
 OF_UNIFORM = 1.0 + np.log(2.0 * np.pi) - np.log(12.0)
-"""By so much for each image amounts that lie anywhere between two ends are likelier evenly spread than normal (twice
-the logarithm): a lens that changes little by little is not of two kinds."""
+"""Twice the log likelihood ratio, for each image, of a uniform against a normal distribution for uniformly distributed
+amounts: a lens that changes gradually is not of two kinds."""
 MIN_LEAD = 6.0
-"""By so much the Bayesian information criterion of two kinds is below that of one, and of each other cause: strong
-evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995). Of amounts drawn normal, evenly or with
-Student's tails, one kind has shown -8 at 8 images and -9 at 20 in 400 draws each, in a hundredth of them 0 to -4."""
+"""Difference of the Bayesian information criterion of two kinds to that of one, and of each other cause: strong
+evidence (Kass and Raftery, "Bayes factors", J. Am. Stat. Assoc. 90, 1995). For SIMULATED amounts of one kind (normal,
+uniform, or Student's) it was -8 with 8 images and -9 with 20 at the least in 400 draws each, 0 to -4 in a hundredth."""
 KINDS_REMEDY = (
     "look for another camera, another zoom or focus, or images that a program has turned, mirrored, cropped, resized "
     "or undistorted, and calibrate each kind from its own images"
 )
-"""What to do about images of two kinds."""
+"""Remedy for images of two kinds."""
 SIGMAS_DO_NOT_HOLD = "the uncertainties that are stated do not hold"
-"""What follows for everything that was calculated."""
+"""Consequence for the result, in messages."""
 SIDES_ROUNDS = 8
-"""Images change sides in so many rounds at most."""
+"""Maximal number of rounds in which images change sides."""
 RIDGE_OF_STEP = 1e-9
-"""Part of its own (or all) information that keeps what the images leave open at rest."""
+"""Ridge, as a part of the information, that keeps undetermined directions at zero."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,9 +46,10 @@ class Kinds:
 
     Attributes
     ----------
-    second : which views (V,) are of the second kind.
-    amounts, weight : (V,) how far each lies on the way to it, 0 and 1 on average, and what it counts.
-    step : by how much the second kind's lens differs, in the units of the rows it was looked for among.
+    second : (V,) which views are of the second kind.
+    amounts, weight : (V,) amount of each view along the difference, 0 for the first kind and 1 for the second on
+        average, and its weight.
+    step : difference of the second kind's lens, in the units of the rows tested.
     cost : Bayesian information criterion less that of one kind.
     """
 
@@ -61,13 +61,12 @@ class Kinds:
 
 
 def min_of_a_kind(images: int) -> float:
-    """Return how many of the images a kind has at least."""
+    """Return the smallest number of images of a kind, for so many `images`."""
     return max(MIN_OF_A_KIND, MIN_SHARE_OF_A_KIND * images)
 
 
 def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | None:
-    """Return a finding where the images are of two kinds; None where they are not, or where it may be something else
-    by which they differ."""
+    """Return a finding where the images are of two kinds; None where they are not, or another cause explains it."""
     if len(evidence.views) < 2 * MIN_OF_A_KIND:
         return None
     columns = columns_of(evidence.own.shape[1])
@@ -96,11 +95,11 @@ def two_kinds(calibration: Calibration, evidence: ViewEvidence) -> Finding | Non
 
 
 def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kinds | None:
-    """Return the two kinds of images whose lenses differ in these rows; None where there are no two. `known` (C, C) is
-    how well what is common to all images is known.
+    """Return the best split of the images into two kinds whose lenses differ in these rows; None if one has too few.
+    `known` (C, C) is the `common_covariance` of the evidence.
 
-    In turn, from each of several first guesses: the difference that explains most, and each image to the side that
-    explains more of it.
+    From each of several first guesses it alternates (like k-means) between the difference that explains most, and the
+    assignment of each image to the kind that explains more.
     """
     own, across, along = evidence.own[:, rows, rows], evidence.own[:, rows, COMMON], evidence.along[:, rows]
     follow = across @ known
@@ -120,11 +119,11 @@ def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kind
     gain = np.einsum("sk,sk->s", step, second.astype(np.float64) @ along)
     best = int(np.argmax(np.where(enough, gain, -np.inf)))
     information = np.maximum(np.einsum("k,vkl,l->v", step[best], own, step[best]), np.finfo(float).tiny)
-    # What an image does not know it does not say; those that know much scatter by the misfit of the model all the same.
+    # Weights saturate: the amounts of images with much information scatter by errors of the model.
     weight = information / (information + np.median(information))
     amount, chosen = pull[best] / information, second[best]
     part = float(chosen.mean())
-    # Whichever kind each image is of is known from the residuals alone, and costs its entropy.
+    # The kind of each image is estimated from the same residuals: twice its entropy is added to the criterion.
     entropy = -2.0 * len(chosen) * (part * np.log(part) + (1.0 - part) * np.log1p(-part))
     cost = entropy + len(step[best]) * np.log(len(chosen)) + OF_UNIFORM * len(chosen)
     cost += _explained(amount, weight, chosen[None].astype(float))[0]
@@ -134,8 +133,8 @@ def split_in_two(evidence: ViewEvidence, rows: slice, known: FloatArray) -> Kind
 def _best_steps(
     own: FloatArray, across: FloatArray, follow: FloatArray, along: FloatArray, second: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return for each guess (S, V) of which images are of the second kind the difference (S, K) of its lens that
-    explains most, and how much each image's residuals lie along it (S, V), all that is common following."""
+    """Return for each guess (S, V) of the images of the second kind the difference (S, K) of its lens that explains
+    most, and the score of each image along it (S, V), with everything common to all images eliminated."""
     sides = second.astype(np.float64)
     shared, followed = np.tensordot(sides, across, axes=1), np.tensordot(sides, follow, axes=1)
     information = np.tensordot(sides, own, axes=1) - shared @ np.swapaxes(followed, 1, 2)
@@ -148,8 +147,8 @@ def _best_steps(
 
 
 def _explained(amount: FloatArray, weight: FloatArray, causes: FloatArray) -> FloatArray:
-    """Return what each of the causes (C, V) takes off the deviance of the amounts (V,), as a line of its own: the
-    degrees of freedom left times the logarithm of what it leaves of their squares."""
+    """Return the change of the deviance of the amounts (V,) by a linear regression on each of the causes (C, V): the
+    degrees of freedom times the logarithm of the part of the squares that it leaves."""
     mean = amount - np.average(amount, weights=weight)
     centred = causes - (causes @ weight / weight.sum())[:, None]
     along = (centred * weight) @ mean
@@ -159,8 +158,8 @@ def _explained(amount: FloatArray, weight: FloatArray, causes: FloatArray) -> Fl
 
 
 def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -> float:
-    """Return the criterion of the best other cause of the amounts: where the boards were, how far away, how tilted,
-    which board it was; a line along it, or a step between two sides of it."""
+    """Return the information criterion of the best other cause of the amounts: position, distance and tilt of the
+    boards, and which board it was; each as a linear function or as a step."""
     at = np.array(evidence.views)
     corners = calibration.corners
     middle = np.array([calibration.views[k].pixels.mean(axis=0) for k in at])
@@ -170,7 +169,7 @@ def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -
     places = np.stack(
         [*off.T, np.hypot(*off.T), np.linalg.norm(shift, axis=1), *corners.rotation[at, :2, 2].T, boards.astype(float)]
     )
-    # Between values that differ: where all images show one board, no step is the order of the images.
+    # Steps only between different values: with one board they would follow the order of the images.
     steps = places[:, None] >= np.sort(places, axis=1)[:, 1:, None]
     line = _explained(kinds.amounts, kinds.weight, places).min() + np.log(len(at))
     step = _explained(kinds.amounts, kinds.weight, steps.reshape(-1, len(at)).astype(float)).min()
@@ -178,5 +177,5 @@ def _otherwise(calibration: Calibration, evidence: ViewEvidence, kinds: Kinds) -
 
 
 def _camera_rows(evidence: ViewEvidence) -> slice:
-    """Return where the camera's parameters are among the rows of the evidence."""
+    """Return the camera's parameters among the rows of the evidence."""
     return slice(COMMON.start, COMMON.start + len(evidence.scale) - CHANGE_COLUMNS["bend"])

@@ -1,6 +1,6 @@
-"""What a person should know about a calibration, in sentences: what is wrong, how one can tell, what to do.
+"""Findings about a calibration, in sentences: what is wrong, how it was found, what to do.
 
-The limits are constants here; none depends on the result that it judges.
+All limits are constants; none depends on the result that is judged.
 """
 
 from __future__ import annotations
@@ -41,37 +41,37 @@ from rigkit.core.arrays import BoolArray, FloatArray, IntArray
 from rigkit.core.findings import Finding, Severity, worst
 
 CELLS = (4, 3)
-"""The image in columns x rows of cells, for coverage."""
+"""Columns and rows of cells of the image, for coverage."""
 CELL_CORNERS = 5
-"""A cell with fewer corners than this is empty."""
+"""A cell with fewer corners is empty."""
 MAX_RATIO_OF_MEDIANS = 2.5
-"""A view whose median residual is this many times the usual one, there in the image."""
+"""Median residual of a view over that of all views in the same part of the image, from which it is reported."""
 ODD_IMAGE_RATIO = 3.5
-"""One with more is so unlike the others that nobody knows how good these are. Whose image that is it does not tell: in
-15 real captures images of the camera itself have up to 3.9 (bouguet's left08), one of another camera put among those
+"""The same from which the calibration is not called good. It does not tell whether the image is of another camera: in
+15 REAL captures images of the camera itself have up to 3.9 (bouguet's left08); an image of another camera among those
 of bouguet and bumblebee2 has 1.1 to 4.9 in 49 of 50 cases."""
 ODD_IMAGE_REMEDY = (
     "look whether the board or the camera moved, another camera took it or a program mirrored it, and retake it"
 )
 RINGS = 4
-"""What is usual is asked of so many rings around the middle of the image: towards the rim all corners scatter more."""
+"""Number of rings about the image centre in which residuals are compared: all corners scatter more towards the rim."""
 MAX_OUTLIER_SHARE = 0.2
-"""A view with this part of its corners outliers."""
+"""Part of a view's corners that may be outliers."""
 NAMED = 3
-"""So many images are named one by one."""
+"""Maximal number of images that are listed one by one."""
 PATTERN = 0.35
-"""Correlation of residuals of neighbouring corners: noise has 0 (a fitted pose makes it slightly negative)."""
+"""Correlation of residuals of neighbouring corners: that of noise is 0 (slightly negative after fitting a pose)."""
 OVERFIT = 1.25
 """Held-out over training RMS."""
 UNCERTAIN_PX = 1.0
-"""Worst-direction standard deviation of a projection, in the covered part of the image."""
+"""Standard deviation of the projection in the worst direction, in the covered part of the image."""
 OUTLIER_SHARE = 0.03
 NAMES_U = ("left", "centre left", "centre right", "right")
 NAMES_V = ("top", "middle", "bottom")
 
 
 class Judged(Protocol):
-    """What has a training error and, perhaps, one on images that took no part."""
+    """A result with a training error and, if there were enough images, a held-out error."""
 
     @property
     def rms_px(self) -> float: ...
@@ -94,25 +94,26 @@ def judge(
 
     Parameters
     ----------
-    also : verdicts found elsewhere.
-    far, clusters : what `FarProjection.of` and `cluster_numbers` (V,) return, where they are known already.
-    in_force : of "model" and "board_shape" those that are "auto" already: no remedy to offer.
-    solved, order : what was calibrated, and the names of all images in the order given, those left out too.
+    also : findings from elsewhere.
+    far, clusters : results of `FarProjection.of` and `cluster_numbers` (V,), if known.
+    in_force : those of "model" and "board_shape" that were "auto", so that this is no remedy.
+    solved : observations and fit of the calibration, if known.
+    order : names of all images in the order given, also of those left out.
     """
     far = FarProjection.of(calibration) if far is None else far
     clusters = _clusters(calibration.views) if clusters is None else clusters
     upright = boards_never_rotated(calibration)
     extent, correlation = Extent.of(calibration), neighbour_correlation(calibration)
     mixed, change = _residuals(calibration, correlation, far, also, clusters, solved)
-    # One lens for two cameras: residuals are of no view, board or model, and say nothing else.
+    # With the images of two cameras mixed, residuals are not informative about views, boards and model.
     unlike, unclear = ([], []) if mixed else _views(calibration)
     pattern = [] if mixed else _pattern(calibration, correlation, in_force, bool(change))
     effects = _uncertain(calibration, far)
-    # Images that contradict each other make a lens unsure, however many there are.
+    # Images that contradict each other make the lens uncertain, however many there are.
     contradicting = worst(effects) is Severity.BAD
-    # Pictures of two kinds are why later ones are of another lens than the first.
+    # A cause found already explains why later images are of another lens than the first.
     named = bool(mixed) or worst(change) is Severity.BAD
-    # What says that nobody knows how good the rest is: then it is not good.
+    # Findings that make the quality of the calibration unknown: it is not called good.
     causes = [
         *_not_converged(calibration, in_force),
         *mixed,
@@ -154,23 +155,23 @@ def _residuals(
     clusters: IntArray,
     solved: tuple[Observations, Fit] | None,
 ) -> tuple[list[Finding], list[Finding]]:
-    """Return findings on two cameras that are mixed, and on what else residuals tell of images and lens."""
+    """Return findings on two cameras mixed, and on other causes of the residuals."""
     if mixed := two_cameras(c, clusters):
         return mixed, []
-    # Where it was another lens later on, residuals of one for both are of no motion, of no board, and no second cause.
+    # If the lens changed at some image, the residuals of a common lens are no evidence for another change.
     but = CHANGES if worst(also) is Severity.BAD else ()
     change = changing(c, correlation, solved, but, clusters)
     if hardly_tilted(c):
-        # A lens that such boards leave open gives their images shears and zooms of their own: nobody can tell.
+        # Such boards do not determine the lens, and its errors look like shears and zooms that differ between images.
         change = [finding for finding in change if finding.severity is Severity.BAD]
-    # A pupil that moves looks a little like a zoom in every image, and what changes never like a pupil.
+    # A moving pupil looks a little like a zoom in every image, but no change between images looks like a pupil.
     return [], change if worst(change) is Severity.BAD else moving_pupil(c, correlation, far) or change
 
 
 def diagnose_session(
     calibration: Calibration, dropped: Sequence[tuple[str, str]], also: Sequence[Finding] = ()
 ) -> tuple[Finding, ...]:
-    """Return the verdicts of the calibration together with those on images that gave no view at all, and others."""
+    """Return the verdicts of the calibration, with findings on images without a view and those of `also` added."""
     found = _left_out(dropped, calibration.views)
     return (*calibration.verdicts[:1], *found, *calibration.verdicts[1:], *also)
 
@@ -178,10 +179,10 @@ def diagnose_session(
 def with_headline(
     result: Judged, causes: Sequence[Finding], effects: Sequence[Finding], where: str = ""
 ) -> list[Finding]:
-    """Return the first verdict, and those of `causes` and `effects` that it does not say itself.
+    """Return the headline, and the `causes` and `effects` that it does not contain.
 
-    It is as grave as the gravest of them and names the first bad cause, or else the first: what is wrong with the
-    images, before what comes of it. `where` says of which part of the image the error is.
+    The headline has the severity of the worst of them and contains the first bad cause, or else the first finding, so
+    that causes come before effects. `where` are words for the part of the image that the error holds for.
     """
     held = result.heldout_rms_px
     error = f"training RMS {result.rms_px:.3f} px" if held is None else f"held-out RMS {held:.3f} px"
@@ -206,15 +207,15 @@ def _not_converged(c: Calibration, in_force: Collection[str]) -> list[Finding]:
 
 
 def _contradicting(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[str]:
-    """Return the images that hardly agree with the others in any corner, where these are too many for mishaps."""
+    """Return the images dropped for lack of inliers, if there are too many to be accidents."""
     used = {view.image for view in views}
     out = list(dict.fromkeys(i for i, reason in dropped if reason.endswith(DISAGREES_WITH_VIEWS) and i not in used))
     return out if len(out) >= min_of_a_kind(len(used) + len(out)) else []
 
 
 def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
-    """Whatever the error of the rest: so many images are of another lens, setting or board, or the rest is. `order` is
-    that of all images."""
+    """Return a finding if many images contradict the others: one of the groups is of another lens, setting or board.
+    `order` are the names of all images."""
     images = _contradicting(c.dropped, c.views)
     if not images:
         return []
@@ -225,8 +226,8 @@ def _of_another_kind(c: Calibration, order: Sequence[str]) -> list[Finding]:
 
 
 def _left_out(dropped: Sequence[tuple[str, str]], views: Sequence[ViewResult]) -> list[Finding]:
-    """Name the images left out, or how many for each reason. What lies beside a board in an image that is used is no
-    cause to look."""
+    """Return findings on the images left out, or their number for each reason. Grids beside a board in a used image are
+    not reported."""
     contradicted = set(_contradicting(dropped, views))
     dropped = [(image, reason) for image, reason in dropped if image not in contradicted]
     used = {view.image for view in views}
@@ -251,7 +252,7 @@ def _images_left_out(dropped: Sequence[tuple[str, str]]) -> list[Finding]:
 
 
 def _coverage(c: Calibration) -> list[Finding]:
-    """Name the cells of the image that no board reached, where the lens has an image at all."""
+    """Return a finding with the cells of the image without corners, where the lens has an image."""
     width, height = c.camera.size_px
     pixels = c.corners.pixels[c.corners.kept]
     size = np.array([width / CELLS[0], height / CELLS[1]])
@@ -284,22 +285,22 @@ def _cell(c: Calibration, pixel: FloatArray) -> str:
 
 
 def _views(c: Calibration) -> tuple[list[Finding], list[Finding]]:
-    """Name the views that are unlike the others: those that may be of another camera, and the rest."""
+    """Return findings on views with large residuals: those that may be of another camera, and the others."""
     if len(c.views) < 3:
         return [], []
     lengths = c.corners.count
     out = np.bincount(c.corners.view[~c.corners.kept], minlength=len(lengths))
-    # Of all corners: a view that is bad throughout has its worst corners among the outliers.
+    # With outliers: a view that is bad throughout has its worst corners among them.
     residual = np.hypot(*np.nan_to_num(c.corners.residuals_px).T)
     middle = _medians(residual, lengths)
     typical = max(float(np.median(middle)), np.finfo(float).tiny)
     times = middle / typical
     if times.max() > MAX_RATIO_OF_MEDIANS:
-        away = c.corners.pixels - image_center(c.camera.size_px)
-        there = np.full(len(away), typical)
-        for ring in np.array_split(np.argsort((away**2).sum(axis=1)), RINGS):
-            there[ring] = max(float(np.median(residual[ring])), typical)
-        times = _medians(residual / there, lengths)
+        offset = c.corners.pixels - image_center(c.camera.size_px)
+        expected = np.full(len(offset), typical)
+        for ring in np.array_split(np.argsort((offset**2).sum(axis=1)), RINGS):
+            expected[ring] = max(float(np.median(residual[ring])), typical)
+        times = _medians(residual / expected, lengths)
     unlike, found = list[Finding](), list[Finding]()
     for i in np.flatnonzero((times > MAX_RATIO_OF_MEDIANS) | (out > MAX_OUTLIER_SHARE * lengths)).tolist():
         view = c.views[i]
@@ -326,7 +327,8 @@ def _medians(values: FloatArray, count: IntArray) -> FloatArray:
 
 
 def _pattern(c: Calibration, correlation: float, in_force: Collection[str], named: bool) -> list[Finding]:
-    """Residuals of neighbours agree where lens or board are not what the model says, or for a cause `named` already."""
+    """Return a finding where residuals of neighbours are correlated: an error of the lens or board model, unless a
+    cause is `named` already."""
     if correlation < PATTERN:
         return []
     what = f"residuals of neighbouring corners agree (correlation {correlation:.2f}): "
@@ -373,7 +375,7 @@ def _uncertain(c: Calibration, far: FarProjection) -> list[Finding]:
 
 
 def _outliers(c: Calibration, named: Collection[str | None]) -> list[Finding]:
-    """Those of images that are `named` have no cause but theirs."""
+    """Return a finding about many outliers, not counting those of images that are `named` already."""
     far = [outlier for outlier in c.outliers if not (outlier.residual_px <= SMALL_PX or outlier.image in named)]
     share = len(far) / max(len(c.outliers) + c.corner_count, 1)
     if share <= OUTLIER_SHARE:

@@ -1,6 +1,6 @@
-"""What residuals say of each image: how much of them is a longer focal length, a shifted picture, a bent board ...
+"""Regression of each image's residuals on possible changes between images: focal length, shift, bend of the board ...
 
-At first order, after each image's own pose, and with all that the images have in common free to follow.
+At first order, with each image's pose and everything common to all images eliminated.
 """
 
 from __future__ import annotations
@@ -14,36 +14,35 @@ from rigkit.calibration.result import Calibration, ViewResult
 from rigkit.core.arrays import FloatArray, IntArray, Points
 
 MIN_INFORMATIVE_CORNERS = 20
-"""A view with fewer corners says too little of its own after its pose."""
+"""A view with fewer corners has too few degrees of freedom after its pose."""
 MIN_INFORMATIVE_VIEWS = 6
 CORNERS_AT_ONCE = 20_000
-"""Of which rows are held: 1.6 kB each, in `judging.pupil` as many again."""
+"""Corners whose rows are in memory at a time: 1.6 kB each, in `judging.pupil` twice as much."""
 MIN_OWN_PART = 1e-6
-"""A kind of change that the pose, or the kinds before, follow but for this part of it is none of its own."""
+"""Part of a kind of change (its length) that pose and earlier kinds must not absorb."""
 MIN_COMMON_PART = 1e-6
-"""Of what is common to all images, a direction that a kind of change follows but for this part of its square is
-open."""
+"""Relative eigenvalue up to which a direction common to all images is undetermined given a kind of change."""
 MIN_SHARE_LEFT = 0.5
-"""A bow that all images share takes no more than the rest of the squares."""
+"""Part of the squares that must remain after fitting a bow common to all images."""
 NO_CHANGE = "columns"
-"""No camera reads its image column by column: what fits that as well as rows may be a lens or board unlike its
-model."""
+"""The control: no camera reads its image column by column, so what columns explain as well as rows may be an error of
+the lens or board model."""
 CHANGE_COLUMNS = {"bend": 3, "focus": 1, "shift": 2, "rows": 6, NO_CHANGE: 6}
-"""How many rows of `rows_of` each kind of change has, in their order before the residual; bends are common, too."""
+"""Number of rows of each kind of change in `rows_of`, in their order before the residual; bends are common, too."""
 COMMON = slice(6, -(sum(CHANGE_COLUMNS.values()) - CHANGE_COLUMNS["bend"] + 1))
-"""Rows of `rows_of` that are common to all images: not of the pose, nor of one image's own."""
+"""Rows of `rows_of` that are common to all images: parameters and bends."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewChange:
-    """How much of the residuals a kind of change from image to image explains.
+    """How much of the residuals a kind of change between images explains.
 
     Attributes
     ----------
-    ratio : variance along it over that of the rest; 1 by chance.
-    share : of all squares, beyond chance.
-    left : part of all squares that it leaves.
-    criterion : its Bayesian information criterion less that of no change.
+    ratio : F ratio, the variance explained for each degree of freedom over that of the rest; 1 by chance.
+    share : part of the sum of squares explained beyond chance.
+    left : part of the sum of squares left.
+    criterion : Bayesian information criterion less that of no change.
     """
 
     ratio: float
@@ -53,7 +52,7 @@ class ViewChange:
 
     @classmethod
     def of(cls, left: float, freedom: int, directions: int) -> ViewChange:
-        """Return that of a kind with so many directions, of residuals with so many degrees of freedom."""
+        """Return that of a kind with so many degrees of freedom `directions`, of residuals with `freedom`."""
         rest = left / (freedom - directions)
         squares = 1.0 - left
         criterion = freedom * np.log(left) + directions * np.log(freedom)
@@ -62,14 +61,14 @@ class ViewChange:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class ViewEvidence:
-    """What the residuals of V views say, as products of rows of `rows_of` without the pose.
+    """Products of the rows of `rows_of` for V views, with poses eliminated.
 
     Attributes
     ----------
-    views : which of the calibration's.
-    own, length : products (V, K, K), and the lengths (V, K) of the rows with it.
-    along : (V, K) products with the residuals, what is common to all images followed.
-    gram, scale : products (C, C) of what is common, to a unit diagonal by the scales (C,).
+    views : indices of the views in the calibration.
+    own, length : (V, K, K) products of the rows, and (V, K) lengths of the rows before eliminating poses.
+    along : (V, K) products of the rows with the residuals, after fitting the common rows.
+    gram, scale : (C, C) products of the common rows, scaled to a unit diagonal, and (C,) their scales.
     total, freedom : sum of squares of the residuals, and its degrees of freedom.
     """
 
@@ -83,16 +82,15 @@ class ViewEvidence:
     freedom: int
 
     def common_covariance(self) -> FloatArray:
-        """Return the inverse (C, C) of the products of what is common, as far as the images tell it."""
+        """Return the pseudo-inverse (C, C) of the products of the common rows."""
         values, vectors = np.linalg.eigh(self.gram)
         root = vectors * np.where(values > MIN_COMMON_PART, values, np.inf) ** -0.5 / self.scale[:, None]
         return np.asarray(root @ root.T)
 
     def explained(self, rows: slice) -> tuple[float, int, FloatArray]:
-        """Return the squares that a kind of change explains when all that is common to the images follows, how many
-        directions it has, and its amounts (V, n)."""
-        # Directions of the unit vectors' own part, and how much of the residual, and of what is common, lies along
-        # each.
+        """Return the sum of squares that a kind of change explains jointly with the common rows, its degrees of
+        freedom, and its amounts (V, n)."""
+        # Orthonormal directions of the scaled rows, and the components of residual and common rows along each.
         size, common = self.length[:, rows], COMMON
         sizes, axes = np.linalg.eigh(self.own[:, rows, rows] / (size[:, :, None] * size[:, None]))
         known = sizes > MIN_OWN_PART**2
@@ -110,7 +108,7 @@ class ViewEvidence:
         return squares, int(known.sum()), (np.swapaxes(back, -1, -2) @ (amount - shared @ step)[..., None])[..., 0]
 
     def changes(self) -> dict[str, ViewChange]:
-        """Return what each kind of change explains; nothing where the residuals leave too little freedom."""
+        """Return what each kind of change explains; empty with too few degrees of freedom."""
         out = {}
         for kind, rows in columns_of(self.own.shape[1]).items():
             squares, directions, _ = self.explained(rows)
@@ -121,10 +119,9 @@ class ViewEvidence:
 
 
 def view_evidence(calibration: Calibration, clusters: IntArray | None = None) -> ViewEvidence | None:
-    """Return what the residuals say; None where that is nothing.
+    """Return the evidence of the residuals; None with too few views.
 
-    `clusters` (V,) number the views' images, as `cluster_numbers` has it: those that repeat another one say nothing
-    that it does not say, and are not asked.
+    `clusters` (V,) are the `cluster_numbers` of the views; of near-duplicate images only the first is used.
     """
     informative = [
         k for k, view in enumerate(calibration.views) if np.count_nonzero(view.kept) >= MIN_INFORMATIVE_CORNERS
@@ -136,7 +133,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
     if len(informative) < MIN_INFORMATIVE_VIEWS:
         return None
     products = products_of([calibration.views[k] for k in informative], lambda views: rows_of(calibration, views))
-    # A lens so far off has no pixels, or no slopes, for some views: they tell nothing.
+    # A very wrong lens may not project, or have no derivatives for, some views: they are left out.
     finite = np.asarray(np.isfinite(products).all(axis=(1, 2)))
     if np.count_nonzero(finite) < MIN_INFORMATIVE_VIEWS:
         return None
@@ -152,7 +149,7 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
     before = float(own[:, residual, residual].sum())
     total = before - float(step @ (2.0 * score - gram @ step))
     if total < (1.0 - MIN_SHARE_LEFT) * before:
-        # A bow that all images share was left out of the model: what is left after it is of no fit, and says nothing.
+        # The model lacks a bow common to all images: the residuals are not those of a minimum.
         return None
     return ViewEvidence(
         views=[k for k, tells in zip(informative, finite, strict=True) if tells],
@@ -169,8 +166,8 @@ def view_evidence(calibration: Calibration, clusters: IntArray | None = None) ->
 def products_of(
     views: Sequence[ViewResult], rows_of_some: Callable[[Sequence[ViewResult]], tuple[FloatArray, IntArray]]
 ) -> FloatArray:
-    """Return of every view the products (V, K, K) of its rows, those of u and of v summed; `rows_of_some` returns the
-    rows (2, K, N) of some of the views and how many corners each has. Rows of all views at once are never held."""
+    """Return for every view the products (V, K, K) of its rows, summed over u and v. `rows_of_some` returns the rows
+    (2, K, N) of some of the views and the number of corners of each; it is called with a few views at a time."""
     corners = np.cumsum([np.count_nonzero(view.kept) for view in views])
     batch = (corners - 1) // CORNERS_AT_ONCE
     out = []
@@ -182,7 +179,7 @@ def products_of(
 
 
 def columns_of(count: int) -> dict[str, slice]:
-    """Return where the kinds of change are among `count` rows of `rows_of`."""
+    """Return the slices of the kinds of change among `count` rows of `rows_of`."""
     stops = count - 1 - sum(CHANGE_COLUMNS.values()) + np.cumsum(list(CHANGE_COLUMNS.values()))
     out = {
         name: slice(stop - size, stop)
@@ -192,10 +189,10 @@ def columns_of(count: int) -> dict[str, slice]:
 
 
 def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[FloatArray, IntArray]:
-    """Return how the kept corners of the views move, (2, K, N) px, and how many there are of each view (V,).
+    """Return derivatives of the pixels of the views' inliers, (2, K, N), and the number of inliers of each view (V,).
 
-    With what is, in this order: the pose (6), what all images share (the parameters of camera and pupil and the 3 bows
-    of the boards), the other kinds of change, and the residual last.
+    Rows are, in this order, the derivatives by the pose (6), by what is common to all images (parameters of camera and
+    pupil, 3 bows of the boards) and by the other kinds of change, and last the residuals.
     """
     count = np.array([np.count_nonzero(view.kept) for view in views])
     start, view = np.cumsum(count) - count, np.repeat(np.arange(len(views)), count)
@@ -233,14 +230,14 @@ def rows_of(calibration: Calibration, views: Sequence[ViewResult]) -> tuple[Floa
 
 
 def points_of(calibration: Calibration, views: Sequence[ViewResult]) -> Points:
-    """Return the points (N, 3) of the boards that the kept corners of the views are."""
+    """Return the points (N, 3) mm of the views' inliers in their boards' frames."""
     shapes = {board.board_id: board for board in calibration.boards}
     return np.concatenate([shapes[view.board_id].at(view.grid[view.kept]) for view in views])
 
 
 def without_pose(products: FloatArray, length: FloatArray) -> FloatArray:
-    """Return the products (V, K, K) of rows with the part taken out that the first six follow, the pose; `length`
-    (V, K) is that of the rows. Directions that the corners leave open are none of the pose."""
+    """Return the products (V, K, K) of rows with the first six, the pose, eliminated; `length` (V, K) are the rows'
+    lengths. Undetermined directions of the pose are left out."""
     pose = length[:, :6]
     sizes, axes = np.linalg.eigh(products[:, :6, :6] / (pose[:, :, None] * pose[:, None]))
     whitened = np.where(sizes > MIN_OWN_PART**2, sizes, np.inf) ** -0.5
