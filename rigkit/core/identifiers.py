@@ -18,7 +18,7 @@ def last_number(name: str) -> str:
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
-    """Return by what names sort as a person counts.
+    """Return the key of natural sorting, in which numbers sort by value.
 
     >>> sorted(["b10", "b9", "a"], key=natural_key)
     ['a', 'b9', 'b10']
@@ -26,12 +26,15 @@ def natural_key(name: str) -> list[tuple[int, str]]:
     return [(int(part) if part.isdecimal() else -1, part) for part in re.split(r"(\d+)", name.lower())]
 
 
-def check_identifier(name: str, what: str) -> str:
-    """Return `name`; raises InputError, which calls it `what`, where it is not one.
+def is_identifier(name: str) -> bool:
+    """Return whether `name` is a valid identifier: letters and digits of any script, '_', '-', '.', '+', parentheses
+    and blanks inside; a letter, digit or '_' first."""
+    return len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) is not None and ".." not in name
 
-    Letters and digits of any script, '_', '-', '.', '+', parentheses and blanks inside; a letter, digit or '_' first.
-    """
-    if len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) and ".." not in name:
+
+def check_identifier(name: str, what: str) -> str:
+    """Return `name` if `is_identifier`; else raises InputError, which calls it `what`."""
+    if is_identifier(name):
         return name
     shown = ascii(name if len(name) <= MAX_IDENTIFIER else name[:MAX_IDENTIFIER] + "...")
     raise InputError(

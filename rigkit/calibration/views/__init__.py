@@ -1,1 +1,1 @@
-"""Views of boards as the calibration takes them: what can be used, as arrays, and what must be left out together."""
+"""Views of boards: the usable ones, as arrays, and the folds of the cross-validation."""

@@ -1,13 +1,12 @@
-"""Which images are left out together in cross-validation: by what they show, in whatever order they come.
+"""Folds of the cross-validation over images, from the boards' places, independent of the order of the images.
 
-A choice of model that changed when files were given other names would be no choice. Folds are dealt so that each has
-boards as all have them: where they are in the image, how large and how slanted. What is left out then takes from none
-of the others what only it could tell. Images that nearly repeat each other, as those of a film do, go together: left
-out one by one they would be known from those that stay.
+So renaming files does not change the model selection. Folds are stratified: each has the same distribution of position,
+size and slant of the boards, so that no fold contains the only images of their kind. Images that are nearly equal, as
+in a video, are in one fold: else a held-out image would be known from its neighbours.
 
-Measured on fifteen REAL captures: ten random ways to deal choose two or three models or shapes in ten of them, and
-spread the held-out error by 1 to 15 %. In fourteen these folds choose what leaving out one image at a time chooses, or
-what no fewer of the random ways do than anything else.
+Measured on fifteen REAL captures: ten random assignments choose two or three models or shapes in ten of them, and vary
+the held-out error by 1 to 15 %. In fourteen of the captures these folds choose what leave-one-out chooses, or what the
+largest number of the random assignments chooses.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from rigkit.calibration.views.repeats import close_pairs, joined, places_of
 from rigkit.core.arrays import FloatArray, IntArray, Pixels
 
 NEARLY_ALIKE = 0.02
-"""Boards whose centres and extents are alike within this part of the mean extent stand nearly where they stood: lens
-and board err alike there. So does a board in a film from one frame to the next, hardly ever one moved by hand."""
+"""Boards whose centres and extents agree within this part of the mean extent are nearly at the same place, with the
+same model errors: a board in a video from one frame to the next, hardly ever one moved by hand."""
 ROUNDING = 1e-9
-"""Places (px, and logarithms of extents) that differ by less are one."""
+"""Smallest standard deviation of places (px, and logarithms of extents)."""
 
 
 def folds_of(pixels: Sequence[Pixels], clusters: IntArray, folds: int) -> IntArray:
@@ -32,8 +31,8 @@ def folds_of(pixels: Sequence[Pixels], clusters: IntArray, folds: int) -> IntArr
     Parameters
     ----------
     pixels : (C, 2) of each view's corners.
-    clusters : (V,) number of the cluster of each view, as `cluster_numbers` has them.
-    folds : how many; of fewer clusters each is one.
+    clusters : (V,) `cluster_numbers` of the views.
+    folds : number of folds; with fewer clusters each is a fold.
     """
     places = _means(places_of(pixels)[:, 1:], clusters)
     folds = min(folds, len(places))
@@ -48,8 +47,8 @@ def _means(values: FloatArray, group: IntArray) -> FloatArray:
 
 
 def _nearly_alike(places: FloatArray, folds: int) -> IntArray:
-    """Return the group (N,) of each of N places (centre and extents), of those that are nearly alike; within a narrower
-    limit where a group would be larger than a fold: boards that move without a stop are one long chain."""
+    """Return the group (N,) of nearly equal places (N, 6), centre and extents. The limit is lowered where a group would
+    be larger than a fold: boards that move continuously form one long chain."""
     reach, most = NEARLY_ALIKE * float(places[:, 2:].mean()), -(-len(places) // folds)
     while True:
         one, other = close_pairs(places, reach)
@@ -60,8 +59,8 @@ def _nearly_alike(places: FloatArray, folds: int) -> IntArray:
 
 
 def _dealt(places: FloatArray, size: IntArray, folds: int) -> IntArray:
-    """Return the fold (G,) of groups of so many images each: the most unlike the mean come first, each to the fold that
-    has, of those with the fewest images so far, the most of the opposite."""
+    """Return the fold (G,) of groups of so many images each. Groups are assigned in the order of their distance from
+    the mean, each to the fold, of those with the fewest images so far, whose sum is most opposite to it."""
     centre, extents = places[:, :2], np.maximum(places[:, 2:], np.finfo(float).tiny)
     along = np.log(extents)
     unlike = np.column_stack([centre, along.mean(axis=1), along[:, 0] - along[:, 1], along[:, 2] - along[:, 3]])

@@ -1,4 +1,4 @@
-"""Views as padded arrays: (views, corners), so that every step of the calibration is one array operation."""
+"""Views as padded arrays (views, corners), so that every step of the calibration is one array operation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from rigkit.core.detections import BoardView
 from rigkit.core.errors import InputError
 
 SIGMA_RANGE = 8.0
-"""Corner sigmas are believed within this factor of their median: a predicted 0.001 px must not rule the solution."""
+"""Corner sigmas are limited to this factor from their median: a predicted 0.001 px must not dominate the solution."""
 
 
 class Workspace:
-    """Memory for the derivatives of a block of views, kept from one linearisation to the next: pages fresh from the
-    system would cost more than the arithmetic."""
+    """Memory for the derivatives of a block of views, reused by all linearisations: allocating it would take longer
+    than the arithmetic."""
 
     def __init__(self) -> None:
         self._memory: FloatArray = np.empty(0)
@@ -52,8 +52,7 @@ class Observations:
     first_row : (len(boards) + 1,) first row of each board in the table.
     board : (V,) int, board of each view.
     workspace : of the solver; subsets share it.
-    known_clusters, known_folds : what `clusters` and `folds` have found, once they were asked; observations of the same
-        views share it.
+    known_clusters, known_folds : caches of `clusters` and `folds`, shared by observations of the same views.
     """
 
     views: tuple[BoardView, ...]
@@ -71,8 +70,8 @@ class Observations:
 
     @classmethod
     def from_views(cls, views: Sequence[BoardView]) -> Observations:
-        """Pad the views. Raises InputError where a corner lies outside its board, comes twice, or one name means
-        boards of two sizes."""
+        """Return the padded views. Raises InputError where a corner lies outside its board or occurs twice, or boards
+        of two sizes have the same name."""
         boards: dict[str, Board] = {}
         for view in views:
             known = boards.setdefault(view.board.board_id, view.board)
@@ -118,17 +117,17 @@ class Observations:
         return np.concatenate([board.points() for board in self.boards])
 
     def with_common_error(self, squared_px: FloatArray, kept: BoolArray) -> Observations:
-        """Return the observations with sigmas that explain the residuals: what the corners' own sigmas do not (a lens
-        or a board that the model does not follow) is an error common to all corners, so sigma^2 + s^2.
+        """Return the observations with weights for sigma^2 + s^2, where s is an error common to all corners (of the
+        lens or board model) that explains the residuals.
 
-        `squared_px` (V, C) are squared 2-D residuals, `kept` (V, C) the corners to judge by.
+        `squared_px` (V, C) are squared 2-D residuals, `kept` (V, C) the corners to estimate s from.
         """
         excess = float((0.5 * squared_px - self.sigma_px**2)[kept].mean()) if kept.any() else 0.0
         sigma = np.sqrt(self.sigma_px**2 + max(excess, 0.0))
         return replace(self, weight=_weights(sigma, self.present))
 
     def subset(self, chosen: IntArray) -> Observations:
-        """Return the views `chosen`; the board table stays as it is."""
+        """Return the views with the indices `chosen`, with the same table of boards."""
         return replace(
             self,
             views=tuple(self.views[i] for i in chosen),
@@ -148,14 +147,14 @@ class Observations:
         return [view.image for view in self.views]
 
     def clusters(self) -> IntArray:
-        """Return the number of the image of each view (V,), images that repeat others taken as one."""
+        """Return the cluster of each view (V,): its image, with near-duplicate images in one cluster."""
         if not self.known_clusters:
             boards, pixels = [view.board.board_id for view in self.views], [view.pixels for view in self.views]
             self.known_clusters.append(cluster_numbers(self.images, boards, pixels))
         return self.known_clusters[0]
 
     def folds(self, count: int) -> IntArray:
-        """Return the fold of each view (V,), of `count` of them or, of fewer images, each its own."""
+        """Return the fold of each view (V,), of `count` folds; with fewer images each is a fold."""
         if count not in self.known_folds:
             clusters = self.clusters()
             self.known_folds[count] = folds_of([view.pixels for view in self.views], clusters, count)[clusters]
@@ -179,7 +178,8 @@ def _measures(board: Board) -> tuple[int, int, float, float]:
 
 
 def _check_once(views: Sequence[BoardView], view_of: IntArray, place: IntArray, largest: int) -> None:
-    """`place` (N,) is the number of each corner on its board, of `largest` corners at most."""
+    """Raise InputError where a view has a corner twice; `place` (N,) is the index of each corner on its board, of at
+    most `largest` corners."""
     count = np.bincount(view_of * largest + place)
     if count.max(initial=0) > 1:
         view = views[int(count.argmax()) // largest]

@@ -1,4 +1,4 @@
-"""Images that repeat each other: the same boards at the same places are one measurement, not two."""
+"""Near-duplicate images: the same boards at the same places are one measurement, not two."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from rigkit.core.arrays import FloatArray, IntArray, Pixels
 from rigkit.kernels.coverage import pairs_within
 
 REPEATED_PX = 0.5
-"""Boards whose corners have, in two images, the same centre and the same extents within this were not moved between."""
+"""A board was not moved between two images if the centre and the extents of its corners are equal within this."""
 MAX_ALONG_ONE_AXIS = 1024
-"""So many points at most are sorted along one axis; more of them along two."""
+"""Up to so many points are sorted along one axis; more of them along two."""
 MIN_STRIP = 1e-6
-"""No strip is narrower than this part of the whole: places along strips are then exact to 1e-10 of it."""
+"""Smallest width of a strip, as a part of the extent: positions along strips are then exact to 1e-10 of it."""
 SEARCH_FACTOR = 1.001
-"""Pairs are sought this far, for rounding, and kept by their own distances."""
+"""Margin of the search for pairs, for rounding; their own distances decide."""
 
 
 def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequence[Pixels]) -> IntArray:
-    """Return for each view (V,) the number of the image that it is of; images that repeat each other have one number,
-    and so have those that hang together by others that they repeat.
+    """Return for each view (V,) the cluster number of its image; near-duplicates, also by a chain of others, have the
+    same number.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
     places, shown = places_of(pixels), dict[str, list[int]]()
     for view, image in enumerate(images):
         shown.setdefault(image, []).append(view)
-    # Only images of the same boards can repeat each other.
+    # Only images of the same boards can be duplicates.
     alike: dict[tuple[str, ...], list[list[int]]] = {}
     for own in shown.values():
         if len(own) > 1:
@@ -47,15 +47,16 @@ def cluster_numbers(images: Sequence[str], boards: Sequence[str], pixels: Sequen
 
 
 def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
-    """Return which of the points (N, D), D > 1, are within `reach` of each other along every axis: i < j, (P,) each."""
+    """Return the pairs i < j, (P,) each, of points (N, D), D > 1, that are within `reach` of each other along every
+    axis."""
     extent = np.ptp(points, axis=0)
     axes = np.argsort(extent, kind="stable")
     many = len(points) > MAX_ALONG_ONE_AXIS
     side = max(reach, MIN_STRIP * float(extent.max()), np.finfo(float).tiny)
     place, length = points[:, axes[-1]], 0.0
     if many:
-        # In strips across the axis in which they are the furthest apart, one after the other along the next one: close
-        # ones are in the same strip or in the next.
+        # Strips across the axis of the largest extent, sorted along the axis of the second largest: close points are in
+        # the same strip or in the next.
         strip, along = (place - place.min()) // side, points[:, axes[-2]]
         length = float(extent[axes[-2]]) + 4.0 * side
         place = along - along.min() + strip * length
@@ -67,14 +68,14 @@ def close_pairs(points: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
     if many:
         ends[:, 2] = np.searchsorted(place, place + length - SEARCH_FACTOR * side)
         ends[:, 3] = np.searchsorted(place, place + length + SEARCH_FACTOR * side)
-    # The widest axis but the one that they are sorted along tells the most of them apart.
+    # Axes in the order of their extents, the sorted one last: the first comparisons then reject most pairs.
     pairs = order[pairs_within(points[order][:, np.roll(axes[::-1], -1)], reach, ends)]
     pairs.sort(axis=1)
     return pairs[:, 0], pairs[:, 1]
 
 
 def joined(one: IntArray, other: IntArray, count: int) -> IntArray:
-    """Return for each of `count` things the first one of those that it hangs together with, by pairs (P,) each."""
+    """Return for each of `count` things the first one of its connected component, for edges (P,) each."""
     first = np.arange(count)
     while True:
         before = first.copy()
@@ -86,8 +87,8 @@ def joined(one: IntArray, other: IntArray, count: int) -> IntArray:
 
 
 def places_of(pixels: Sequence[Pixels]) -> FloatArray:
-    """Return for each view how many corners there are, their centre, and their extents along the image's axes and
-    diagonals, px: (V, 7)."""
+    """Return for each view (V, 7): the number of corners, their centre, and their extents along the image's axes and
+    diagonals, px."""
     count = np.array([len(corners) for corners in pixels])
     start, corners = np.cumsum(count) - count, np.concatenate([np.asarray(one) for one in pixels])
     along = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [1.0, -1.0]]) @ corners.T

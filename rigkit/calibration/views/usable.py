@@ -1,4 +1,4 @@
-"""Which views a calibration can use at all, and why not the others."""
+"""The views that a calibration can use, and the reasons for the others."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from rigkit.core.arrays import FloatArray, IntArray, Pixels
 from rigkit.core.boards import Board
 from rigkit.core.detections import BoardDetection, BoardView
 from rigkit.core.errors import InputError
-from rigkit.core.identifiers import IDENTIFIER, MAX_IDENTIFIER
+from rigkit.core.identifiers import MAX_IDENTIFIER, is_identifier
 from rigkit.core.patterns.chessboard import Chessboard
 from rigkit.core.patterns.circles import Circles
 
 MIN_CORNERS_OF_VIEW = 6
-"""A pose has six numbers: fewer than six corners leave hardly anything to check it by."""
+"""A pose has six parameters: fewer corners give no check of it."""
 OFTEN = 3
-"""Whole grids of one size: parts of a larger board, as the frame cuts them, come in many sizes."""
+"""Number of whole grids of one size that make a board: parts of a larger board, cut by the frame, have many sizes."""
 MIN_SHARE_LARGER = 0.25
-"""Images that show a whole larger grid instead of a listed board, as a part of all: fewer may be something else."""
+"""Part of all images with a whole larger grid instead of a declared board, from which that is the board."""
 TOUCHING = 1.7
-"""Corners of one lattice lie this many times as far apart as the nearest two do there, or nearer: slanted squares."""
+"""Largest distance of neighbours on one lattice over the smallest one there: slanted squares."""
 MAX_SHARE_REACHING = 0.1
-"""Images in which a stray corner beside a smaller board makes it reach as far as a listed one, as a part of all."""
+"""Part of all images in which a false corner beside a smaller board may extend it to the size of a declared one."""
 MAX_SHARE_COPIES = 0.25
-"""Images that show more whole boards than are listed, as a part of those with any: from here on there are copies."""
+"""Part of the images with whole boards in which there are more than declared, from which there are copies of them."""
 MIN_TIMES_LARGER = 2.0
-"""The board is seen so many times as long as a picture of one in the background, or they may be two boards alike."""
+"""Length of the board in the image over that of a picture of one in the background; below it both may be boards."""
 OTHER_GRIDS = "grids beside the whole board, which may be parts of another or something else"
-"""Why a grid in an image that is used gives no view."""
+"""Reason why a grid in a used image gives no view."""
 MIN_SPREAD = 1e-6
-"""Corners on a line: the determinant of their scatter, as a part of its squared trace, is rounding (of a row of the
-board), or noise (of a board seen edge-on: it is then a thousandth as high as it is wide)."""
+"""Determinant of the corners' scatter over its squared trace from which they are not collinear: less is rounding (of a
+row of the board) or noise (of a board seen edge-on, a thousandth as high as wide)."""
 
 
 PART = re.compile(r" part (of .+|[0-9a-f]{8})$")
-"""How the name of a part of a board ends: see `views_of_image`."""
+"""End of the name of a part of a board: see `views_of_image`."""
 
 
 def usable_views(
@@ -83,7 +83,7 @@ def _inside(pixels: Pixels, size_px: tuple[int, int]) -> bool:
 
 
 def _on_a_line(points: FloatArray, count: IntArray) -> list[bool]:
-    """Say for each view, of `count` (V,) of the points (N, 2), whether they lie on one line or spot."""
+    """Return for each view whether its points, `count` (V,) of the points (N, 2), are collinear or coincide."""
     owner = np.repeat(np.arange(len(count)), count)
     mean = [np.bincount(owner, axis, len(count)) / np.maximum(count, 1) for axis in points.T]
     x, y = points[:, 0] - mean[0][owner], points[:, 1] - mean[1][owner]
@@ -103,17 +103,16 @@ def _reason(view: BoardView, line_of: str | None) -> str | None:
 def other_size(
     detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board], about: Sequence[Board] = ()
 ) -> str | None:
-    """Return in words which size the boards of a session's images (name -> detections) have, where it is clearly none
-    of those listed. A board that is known to be `about`, as that of the calibration, need be seen only once.
+    """Return words for the size of the boards in a session's images (name -> detections), if it is clearly not a
+    declared one, else None. One detection is enough for the size of a board in `about`, which is known to be there.
 
-    Where most images show a whole grid of one size that is not listed, and hardly any grid reaches from end to end of a
-    listed board, the boards are of that size: a smaller board passes for part of a listed one. And where images show
-    whole grids that are larger than a listed board, and that board nowhere, part of a larger board was taken for it in
-    the others.
+    The size is another one if most images have a whole grid of it and hardly any grid is as large as a declared board
+    (a smaller board passes for part of a declared one). It is another one, too, if images have whole grids larger than
+    a declared board and never that board: in the other images it was part of a larger board.
     """
     listed = {frozenset(board.size) for board in boards}
     found = [_put_together(own) for own in detections.values() if own]
-    # Of other patterns than chessboards as people count them: tags, not the corners of tags.
+    # Sizes in the units of each pattern: tags, not the corners of tags.
     declared = sorted(boards, key=lambda board: board.size)
     sizes = ", ".join(dict.fromkeys(b.describe().split(", ")[0].removesuffix(" inner corners") for b in declared))
     without = [own for own in found if not any(frozenset(seen.size) in listed for seen in own)]
@@ -132,12 +131,11 @@ def other_size(
 def without_lookalikes(
     detections: Mapping[str, Sequence[BoardDetection]], boards: Sequence[Board]
 ) -> dict[str, tuple[BoardDetection, ...]]:
-    """Return the detections of a session's images (name -> detections) without what only may be part of a board where
-    every board of the session stands whole beside it.
+    """Return the detections of a session's images (name -> detections) without possible parts of boards in images where
+    all boards of the session are detected whole: they may be a tiled floor or a patterned box.
 
-    A tiled floor or a patterned box lies in any room, and its squares need not be square. Where images often show more
-    whole boards than are listed, there are copies of them, and their parts are welcome. Where they do so once or twice,
-    a much smaller one is a picture of a board on the wall, or a toy: it is left out, and the large one is the board.
+    If many images have more whole boards than declared, there are copies of them, and parts are kept. If only a few
+    have, a much smaller board is taken for a picture of one: it is left out, and the large one is named as the board.
     """
     listed = {frozenset(board.size) for board in boards}
     whole = {
@@ -160,8 +158,8 @@ def without_lookalikes(
 
 
 def _without_small_copies(found: Sequence[BoardDetection], board: Board) -> list[BoardDetection]:
-    """Return the detections of an image without whole grids of the board's size that are seen much smaller than the
-    largest, which is named then."""
+    """Return the detections of an image without whole grids of the board's size that are much smaller in the image than
+    the largest; if only that is left it gets the board's name."""
     alike = [d for d in found if d.board_id is None and d.complete and (d.columns, d.rows) == board.size]
     if len(alike) < 2:
         return list(found)
@@ -176,7 +174,7 @@ def _without_small_copies(found: Sequence[BoardDetection], board: Board) -> list
 
 @dataclass(frozen=True, slots=True)
 class _Extent:
-    """A grid in an image: its size, how far its corners reach, whether it is whole."""
+    """A grid in an image: its size, the columns and rows from its first corner to its last, whether it is complete."""
 
     size: tuple[int, int]
     reach: tuple[int, int]
@@ -184,7 +182,7 @@ class _Extent:
 
 
 def _put_together(own: Sequence[BoardDetection]) -> list[_Extent]:
-    """Return the grids of an image; two that touch along a whole side are one, out of which a size was cut."""
+    """Return the grids of an image; two that touch along a whole side are merged."""
     seen = [_Extent((one.columns, one.rows), _reach(one), one.complete) for one in own]
     for i, j in combinations(range(len(own)), 2):
         sides = set(seen[i].size) & set(seen[j].size)
@@ -198,11 +196,11 @@ def _put_together(own: Sequence[BoardDetection]) -> list[_Extent]:
 
 
 def _touching(one: BoardDetection, other: BoardDetection) -> int:
-    """Return how many corners of `one` have a corner of `other` as near as their own neighbours."""
+    """Return how many corners of `one` have a corner of `other` at the distance of their own neighbours."""
     own = np.linalg.norm(one.pixels[:, None] - one.pixels, axis=-1)
     np.fill_diagonal(own, np.inf)
-    away = np.linalg.norm(one.pixels[:, None] - other.pixels, axis=-1).min(axis=1)
-    return int(((away > 0.5 * own.min(axis=1)) & (away < TOUCHING * own.min(axis=1))).sum())
+    distance = np.linalg.norm(one.pixels[:, None] - other.pixels, axis=-1).min(axis=1)
+    return int(((distance > 0.5 * own.min(axis=1)) & (distance < TOUCHING * own.min(axis=1))).sum())
 
 
 def _reach(found: BoardDetection) -> tuple[int, int]:
@@ -214,11 +212,11 @@ def _reach(found: BoardDetection) -> tuple[int, int]:
 def views_of_image(
     image: str, detections: Sequence[BoardDetection], boards: Sequence[Board], camera: str | None = None
 ) -> tuple[list[BoardView], str | None]:
-    """Return the views that an image gives, or why it gives none; `camera` is whose image it is, of several.
+    """Return the views of an image, or the reason why it has none; `camera` is the image's camera, of several.
 
-    A detection that could be several boards, or part of one, still is a flat grid of known points: it becomes a view of
-    a board of its own, called "<board> part of <image>", and after its camera: images of one name, of two cameras, show
-    different parts.
+    A detection that could be one of several boards, or part of one, is still a flat grid of known points. It becomes a
+    view of a separate board named "<board> part of <image>", with the camera's name, as images of two cameras may have
+    the same name.
     """
     views: list[BoardView] = []
     other: list[str] = []
@@ -233,7 +231,7 @@ def views_of_image(
         of = image if camera is None else f"{image} of {camera}"
         name = _part_name(parent.board_id, of, k + 1 if len(detections) > 1 else None)
         sides = parent.square_x_mm, parent.square_y_mm
-        # Rows of circles keep their stagger, which a part is numbered by; all else needs a place on the board.
+        # A part of a staggered circle grid keeps its pattern, as its numbering depends on it.
         pattern = parent.pattern if isinstance(parent.pattern, Circles) else Chessboard()
         sigma_mm = parent.square_sigma_mm
         part = Board(name, turned.columns, turned.rows, *sides, square_sigma_mm=sigma_mm, pattern=pattern)
@@ -245,20 +243,18 @@ def views_of_image(
 
 
 def _part_name(board_id: str, image: str, number: int | None) -> str:
-    """Return a name for a part of a board, its own for every image, whatever the image is called."""
+    """Return a valid name for a part of a board, a different one for every image."""
     name = f"{board_id} part of {image}" + (f" ({number})" if number else "")
-    if len(name) <= MAX_IDENTIFIER and IDENTIFIER.fullmatch(name) and ".." not in name:
-        return name
-    return f"{board_id[: MAX_IDENTIFIER - 20]} part {zlib.crc32(name.encode()):08x}"
+    return name if is_identifier(name) else f"{board_id[: MAX_IDENTIFIER - 20]} part {zlib.crc32(name.encode()):08x}"
 
 
 def without_parts(boards: Iterable[Board]) -> tuple[Board, ...]:
-    """Return the boards without those that are called parts: nobody has them to hold, and they are not to look for."""
+    """Return the boards without those that are parts of others by their name: they do not exist by themselves."""
     return tuple(board for board in boards if PART.search(board.board_id) is None)
 
 
 def _parent(found: BoardDetection, boards: Sequence[Board]) -> tuple[Board | None, BoardDetection]:
-    """Return the smallest board that the detection can be part of, and the detection turned to it."""
+    """Return the smallest board that the detection can be part of, and the detection turned to its axes."""
     for board in sorted(boards, key=lambda b: b.corner_count):
         square = board.square_x_mm == board.square_y_mm
         staggered = isinstance(board.pattern, Circles) and board.pattern.staggered
