@@ -1,13 +1,13 @@
-"""Several cameras, or boards, on one mount: calibrated together. `calibrate.py` runs it all, in this order.
+"""Joint calibration of several cameras, or boards, on one mount. `calibrate.py` runs these steps in order:
 
 - each camera alone: `rigkit.calibration`
-- views in: `observations`; boards on one mount: `board_places`, `board_ties`, `board_sizes`
-- a start: `frames`
-- one least squares: `layout`, `state`, `pose_jacobians` (how views follow from the rig), `shape`, `known`,
-  `solver`; what does not fit in it left out: `disagree`, `joint`
-- how sure that is: `heldout`, `flatness`, `lags`, `between_models`, `displaced`, `uncertainty`
-- what to think of it: `verdicts`
-- what comes out: `assemble`, `result`, `board_rig`
+- the views: `observations`; rigidly mounted boards: `board_places`, `board_ties`, `board_sizes`
+- initial mounts and frames: `frames`
+- the joint least squares: `layout`, `state`, `pose_jacobians`, `shape`, `known`, `solver`; outlier frames: `disagree`,
+  `joint`
+- uncertainty: `heldout`, `flatness`, `lags`, `between_models`, `displaced`, `uncertainty`
+- diagnosis: `verdicts`
+- the result: `assemble`, `result`, `board_rig`
 
-`compare` tells two rigs apart.
+`compare` compares two rigs.
 """

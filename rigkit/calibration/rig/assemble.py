@@ -1,4 +1,4 @@
-"""Putting a solved rig together as a result: covariances, each camera as the rig has it, the boards' places."""
+"""The result of a solved rig: covariances, each camera's calibration in the rig, the places of mounted boards."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from rigkit.geometry.rigid3 import Rigid3
 def assemble_rig(
     joint: JointRig, heldout: tuple[float | None, tuple[float | None, ...]]
 ) -> tuple[RigCalibration, list[FarProjection]]:
-    """Return the rig, and how sure the projection of each of its cameras is; `heldout` is the error of frames that took
-    no part, over all cameras and of each.
+    """Return the rig, and the uncertainty of the projection of each camera; `heldout` is the held-out error, over all
+    cameras and of each.
 
     Raises DegenerateError where there are fewer corners than unknowns.
     """
@@ -54,7 +54,7 @@ def assemble_rig(
     cameras, squared = _cameras(joint, heldout[1], known, beside)
     everything = np.concatenate(squared)
     reported = _lenses_and_mounts(layout, state)
-    # One ruler has measured all boards: its error does not average out.
+    # All boards were measured with one ruler: its error does not average out.
     scale = max((b.square_sigma_mm or 0.0) / min(b.square_x_mm, b.square_y_mm) for b in boards)
     far = [FarProjection.of(camera.calibration) for camera in cameras]
     rig = RigCalibration(
@@ -79,8 +79,8 @@ def assemble_rig(
 
 
 def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
-    """Return where the parameters of central lenses and the mounts stand among the globals: what a rig's covariance is
-    of. Pupils that move have been solved for together with them."""
+    """Return the indices, among the globals, of the parameters of the central lenses and of the mounts: the rows of a
+    rig's covariance."""
     lenses = [
         np.arange(run.start, run.start + far_camera(camera).parameters.size)
         for run, camera in zip(layout.cameras, state.cameras, strict=True)
@@ -89,7 +89,7 @@ def _lenses_and_mounts(layout: Layout, state: RigState) -> IntArray:
 
 
 def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, reported: IntArray) -> dict[str, SolvedPupil]:
-    """Return the pupils that move, by name, with their covariance with the globals `reported`."""
+    """Return the moving pupils by camera name, with their cross-covariance with the globals `reported`."""
     out = {}
     for name, run, camera in zip(joint.views.names, layout.cameras, joint.solution.state.cameras, strict=True):
         if isinstance(camera, NearCamera):
@@ -101,8 +101,8 @@ def _pupils(joint: JointRig, layout: Layout, covariance: FloatArray, reported: I
 def _cameras(
     joint: JointRig, heldout: Sequence[float | None], known: GlobalCovariance, beside: FloatArray
 ) -> tuple[list[RigCamera], list[FloatArray]]:
-    """Return the cameras as the rig has them, and the squared residuals of the corners of each, px^2; `beside` (G, G)
-    is what is not sure of the globals beside what frames show."""
+    """Return the cameras in the rig's solution, and the squared residuals of the corners of each, px^2; `beside` (G, G)
+    is the covariance of the globals beside that from the scatter between frames."""
     observations, state = joint.observations, joint.solution.state
     layout = state.layout(observations)
     cameras, squared = [], []
@@ -133,8 +133,8 @@ def _cameras(
 
 
 def _error_of_held(joint: JointRig, layout: Layout, unit: FloatArray) -> FloatArray:
-    """Return what the errors of the values near which lenses and mounts are held add to the covariance (G, G) of all
-    globals: K W C W K, with the information W by which they are held and the covariance C of those values."""
+    """Return the contribution of the prior means of held lenses and mounts to the covariance (G, G) of all globals:
+    K W C W K, with the information W of these priors and the covariance C of their means."""
     out = np.zeros_like(unit)
     known, names = joint.known, joint.views.names
     held = zip(names, layout.cameras, joint.views.single, joint.observations.held, strict=False)

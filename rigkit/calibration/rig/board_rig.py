@@ -1,4 +1,4 @@
-"""Boards mounted to each other, as solved: where each sits, how sure that is, their angles and distances."""
+"""The solved poses of boards mounted to each other, with covariance, and their angles and distances."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rigkit.geometry.rotation import angle_between, skew
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MountedBoard:
-    """A board, its solved corners (columns * rows, 3) mm in its own frame, and its place on the target."""
+    """A board, its solved corners (columns * rows, 3) mm in its own frame, and its pose on the target."""
 
     board: Board
     points_mm: Points
@@ -30,7 +30,7 @@ class MountedBoard:
         return f"MountedBoard({self.board!r}, {len(self.points_mm)} solved corners, {self.target_from_board!r})"
 
     def point(self, feature: Feature) -> FloatArray:
-        """Return where a corner or the centre is in the board's frame, (3,) mm."""
+        """Return the position of a corner or the centre in the board's frame, (3,) mm."""
         if feature.grid is None:
             return np.asarray(self.points_mm.mean(axis=0))
         column, row = feature.grid
@@ -42,7 +42,7 @@ class MountedBoard:
 
     @property
     def face(self) -> FloatArray:
-        """Normal of the face in the target's frame, towards whoever looks at it."""
+        """Normal of the face in the target's frame, towards the viewer."""
         return -self.target_from_board.rotation[:, 2]
 
 
@@ -52,11 +52,12 @@ class BoardRig:
 
     Attributes
     ----------
-    boards : with their places; the first one's is the identity.
-    covariance : (6 (n - 1), 6 (n - 1)) of the places of all boards but the first: left perturbation (rad), mm.
-        Student's, with `freedom` degrees of freedom; deviations that are quoted count them in (`widening`).
+    boards : the boards with their poses; that of the first is the identity.
+    covariance : (6 (n - 1), 6 (n - 1)) of the poses of all boards but the first: left perturbation (rad), mm. Of a
+        Student's t distribution with `freedom` degrees of freedom, which quoted standard deviations account for
+        (`widening`).
     image_count : images that show at least two of them.
-    scale_sigma : relative standard deviation of all lengths, from how well the squares were measured.
+    scale_sigma : relative standard deviation of all lengths, from the measurement of the squares.
     """
 
     boards: tuple[MountedBoard, ...]
@@ -77,13 +78,13 @@ class BoardRig:
         return tuple(b.board.board_id for b in self.boards)
 
     def index(self, name: str) -> int:
-        """Return the position of the board `name`; raises InputError that lists the names."""
+        """Return the index of the board `name`; raises InputError that lists the names."""
         if name not in self.names:
             raise InputError(f"no board of this rig is called '{name}'; there are {', '.join(self.names)}")
         return self.names.index(name)
 
     def angle_deg(self, a: str, b: str) -> tuple[float, float]:
-        """Return the angle between two boards as a protractor laid across their faces shows it, and its sigma, deg."""
+        """Return the angle between the faces of two boards, as a protractor measures it, and its sigma, deg."""
         i, j = self.index(a), self.index(b)
         first, second = self.boards[i].face, self.boards[j].face
         between = float(angle_between(first, second))
@@ -102,23 +103,23 @@ class BoardRig:
         i, j = self.index(a.board_id), self.index(b.board_id)
         end, by_end = self._point(i, a)
         other, by_other = self._point(j, Feature(b.board_id, centre=True) if b.is_plane else b)
-        separation = end - other
+        between = end - other
         if b.is_plane:
             normal = self.boards[j].face
-            signed = float(normal @ separation)
+            signed = float(normal @ between)
             sign = float(np.sign(signed)) or 1.0
             # d (n . (p - q)) = n . (dp - dq) + (w x n) . (p - q)
-            turn = np.concatenate([np.cross(normal, separation), np.zeros(3)])
+            turn = np.concatenate([np.cross(normal, between), np.zeros(3)])
             row = self._row({i: sign * (normal @ by_end)}) + self._row({j: sign * (turn - normal @ by_other)})
             length = abs(signed)
         else:
-            length = float(np.linalg.norm(separation))
-            along = separation / max(length, np.finfo(float).tiny)
+            length = float(np.linalg.norm(between))
+            along = between / max(length, np.finfo(float).tiny)
             row = self._row({i: along @ by_end}) - self._row({j: along @ by_other})
         return length, float(np.hypot(self._sigma(row), length * self.scale_sigma))
 
     def _point(self, k: int, feature: Feature) -> tuple[FloatArray, FloatArray]:
-        """Return a point of board `k` in the target's frame and its derivative by the board's place, (3, 6)."""
+        """Return a point of board `k` in the target's frame and its derivative by the board's pose, (3, 6)."""
         lever = self.boards[k].target_from_board.rotation @ self.boards[k].point(feature)
         return lever + self.boards[k].target_from_board.translation_mm, np.concatenate(
             [-skew(lever), np.eye(3)], axis=1

@@ -1,4 +1,4 @@
-"""Whether boards that were taken for free are mounted to each other: then a calibration gains from saying so."""
+"""Test whether boards that were declared independent are mounted to each other: declaring it improves a calibration."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from rigkit.core.findings import Finding
 from rigkit.core.progress import silent
 
 MIN_IMAGES_OF_TIE = 3
-"""Two images can agree by chance; boards that keep their places in three are mounted."""
+"""Two images can agree by chance; boards with the same relative pose in three are mounted."""
 TIED_SIGMAS = 10.0
-"""Sharing one pose costs boards on one mount a few sigmas (paper that is not flat: up to 3.5), and boards that moved by
-a millimetre against each other some tens."""
+"""Cost of sharing one pose, in standard deviations of a corner: a few for boards on one mount (up to 3.5 for paper that
+is not flat), some tens for boards that moved by a millimetre against each other."""
 LIKE_BOARDS = "{0} boards of {1}x{2} corners"
 
 
 def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[Finding, ...]:
-    """Return a verdict if boards kept their places to each other in all images that show several, else nothing.
+    """Return a finding if boards kept their relative poses in all images that show several of them.
 
     `views` are those of the calibration, with their boards.
     """
@@ -37,7 +37,7 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
     group = [name for name, count in often.items() if count >= MIN_IMAGES_OF_TIE]
     if len(group) < 2:
         return ()
-    # Sharing a shape is for the solution itself to find: here flat boards will do.
+    # Flat boards are enough for this test.
     flat = replace(calibration, boards=tuple(replace(b, kind="flat") for b in calibration.boards))
     try:
         named, notes = board_places([group], RigViews(["camera"], [seen], (flat,), {}), boards)
@@ -61,7 +61,8 @@ def suggest_ties(views: Sequence[BoardView], calibration: Calibration) -> tuple[
 
 
 def _by_size(views: Sequence[tuple[str, BoardView]], calibration: Calibration) -> FrameObservations:
-    """Return what the camera saw, boards without a name of their own called by their size and number in the image."""
+    """Return the camera's observations, with boards that occur only once named by their size and number in the
+    image."""
     out: FrameObservations = {}
     count: Counter[tuple[str, str]] = Counter()
     often = Counter(view.board.board_id for _, view in views)

@@ -1,9 +1,9 @@
-"""Several cameras on one mount, from synchronous views of boards: all intrinsics and all mounts solved together.
+"""Calibration of a rig: all intrinsics and mounts are solved together, from synchronous views of boards.
 
-The rig's frame is that of its first camera. Not every camera need see every board in every frame: it is enough that the
-cameras hang together through targets that two of them see at once. Boards may move between frames, each on its own, or
-together where they are mounted to each other (`rigid_boards`): then where they sit on their target is solved for as
-well. One camera before such a target is a rig too.
+The rig's frame is that of its first camera. Not every camera must see every board in every frame: it is enough that the
+cameras are connected by targets that two of them see at once. Boards may move between frames, each on its own, or
+together if they are mounted to each other (`rigid_boards`): then their poses on the target are solved for as well. One
+camera with such a target is a rig, too.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ def calibrate_rig(
 
     Parameters
     ----------
-    views : camera name -> (frame, view) pairs; what was taken at the same moment has the same frame.
+    views : camera name -> (frame, view) pairs; images taken at the same moment have the same frame.
     sizes_px : camera name -> (width, height).
     model, degree : as for `calibrate`, one for all cameras or one for each.
     board : as for `calibrate`; where a camera alone finds boards warped or released, their shape is solved for jointly.
-    rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may be
-        identified and oriented in any way; their arrangement sorts that out.
-    known : lenses, or lenses and mounts, that stay as they are; what is not sure of them is in all covariances.
-    folds : of the cross-validations, of each camera alone and of the rig; 0 for none.
-    pupil : whether entrance pupils may move, as for `calibrate`: each camera alone decides, all are solved together.
-    begun : cameras alone, as far as they are found already: what is known of the same views is not done again.
+    rigid_boards : groups of ids of boards that are mounted to each other. Boards of a group that look alike may have
+        any ids and orientations in the views; both are found from their arrangement.
+    known : lenses, or lenses and mounts, that are held; their covariance is part of all covariances.
+    folds : number of folds of the cross-validations, of each camera alone and of the rig; 0 for none.
+    pupil : whether entrance pupils may move, as for `calibrate`: decided for each camera alone, solved jointly.
+    begun : earlier calibrations of single cameras, whose results are reused for the same views.
 
     Raises
     ------
@@ -100,11 +100,11 @@ def calibrate_rig(
 def _on_rigid_boards(
     alone: RigViews, views: Views, groups: Sequence[Sequence[str]], options: _Options, progress: Progress
 ) -> tuple[RigViews, tuple[Finding, ...]]:
-    """Return the views with boards identified and oriented by how they are mounted to each other, and what to say."""
+    """Return the views with boards identified and oriented by their arrangement, and findings."""
     boards = _boards(views, groups)
     every, notes = board_places(groups, alone, boards)
     if options.board != "flat" and _renamed(alone.seen, every.seen):
-        # The boards' shapes were those of mixtures.
+        # The boards' shapes were found from mixed-up boards.
         views = {n: [(e.frame, e.view) for e in own.values()] for n, own in zip(views, every.seen, strict=True)}
         every, notes = board_places(groups, options.each_alone(views, progress), boards)
     return every, notes
@@ -112,7 +112,7 @@ def _on_rigid_boards(
 
 @contextmanager
 def _mistakes_named(views: RigViews) -> Iterator[None]:
-    """Say in errors which mistake with files made the cameras disagree."""
+    """Add to errors the file mix-up that makes the cameras disagree, if one is found."""
     try:
         yield
     except DegenerateError as error:
@@ -121,8 +121,7 @@ def _mistakes_named(views: RigViews) -> Iterator[None]:
 
 
 def _mispaired(rig: RigCalibration, views: RigViews, cost_sigmas: float) -> list[Finding]:
-    """Return which mistake with files made frames disagree, of those left out or, where sharing poses usually costs
-    more than a good rig, of all."""
+    """Return findings on file mix-ups that explain the frames left out, or all frames if most of them disagree."""
     if cost_sigmas > BAD and (cause := why_nothing_agrees(views)):
         return [cause]
     mounts, left_out = [camera.cam_from_rig for camera in rig.cameras], [key[:2] for key in rig.left_out]
@@ -137,7 +136,7 @@ def _require_sound(views: Views, options: _Options) -> None:
 
 
 def _require_entries(views: Views, **given: object) -> None:
-    """Raise InputError where something is given by camera, and one has none."""
+    """Raise InputError where an option given by camera has no entry for one of them."""
     for what, entries in given.items():
         missing = [name for name in views if isinstance(entries, Mapping) and name not in entries]
         if missing:
@@ -165,7 +164,8 @@ def _require_one_image(views: Views) -> None:
 
 
 def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known: KnownCameras | None) -> None:
-    """Raise InputError where a known camera has no views or another size, or does not come first with its mount."""
+    """Raise InputError where a known camera has no views or another size, or the one that defines the frame is not the
+    first."""
     if known is None:
         return
     for name, (camera, _) in known.cameras.items():
@@ -182,7 +182,7 @@ def _require_known(views: Views, sizes_px: Mapping[str, tuple[int, int]], known:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Options:
-    """How every camera is calibrated alone."""
+    """The options of `calibrate_rig` for each camera alone."""
 
     sizes_px: Mapping[str, tuple[int, int]]
     model: str | Mapping[str, str]
@@ -195,12 +195,12 @@ class _Options:
 
     @property
     def in_force(self) -> list[str]:
-        """Which of model and shape of the boards are chosen already: no remedies."""
+        """Those of "model" and "board_shape" that are "auto", so that this is no remedy."""
         models = {self.model} if isinstance(self.model, str) else set(self.model.values())
         return [name for name, values in (("model", models), ("board_shape", {self.board})) if values == {"auto"}]
 
     def each_alone(self, views: Views, progress: Progress) -> RigViews:
-        """Return the views as each camera alone is calibrated with them; errors name the camera."""
+        """Return the views with the calibration of each camera alone; errors contain the camera's name."""
         found: dict[str, Calibration] = {}
         asked: list[tuple[str, Sequence[BoardView], Request]] = []
         for name, own in views.items():
@@ -240,8 +240,8 @@ class _Options:
 
 
 def _with_pupils_too(cameras: Sequence[tuple[str, Sequence[BoardView], Request]]) -> dict[str, Calibration]:
-    """Return those of the cameras, beside others of the rig whose pupil moves, whose images agree that theirs does too:
-    they need not show it so well as where nothing else speaks for it."""
+    """Return the calibrations with a moving pupil of those cameras for which it is significant. If other cameras of the
+    rig have a moving pupil, no improvement of the held-out error is required."""
     out = {}
     for name, views, request in cameras:
         try:
@@ -266,7 +266,7 @@ def _boards(views: Views, groups: Sequence[Sequence[str]]) -> dict[str, Board]:
 
 
 def _renamed(before: Sequence[FrameObservations], after: Sequence[FrameObservations]) -> bool:
-    """Say whether any board was given another name or first corner."""
+    """Return whether any board has another name or first corner than before."""
     return any(
         old.keys() != new.keys() or any(old[key].view is not new[key].view for key in old)
         for old, new in zip(before, after, strict=True)

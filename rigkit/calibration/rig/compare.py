@@ -1,9 +1,8 @@
-"""Two calibrations of a rig, or of boards on one mount: have its cameras, or they, moved against each other?
+"""Test whether the cameras of a rig, or boards on one mount, moved against each other between two calibrations.
 
-Boards alone leave open how a lens is turned in its camera: a moved principal point and a turned camera are the same
-image, and the mount takes the turn up. So mounts are compared as the lenses of the first rig have their axes. With W_k
-the rotation that hides a change dk_k of the lens k best (first order: W_k = G_k dk_k), the mount's perturbation
-(w, dt) at (R, t) becomes
+A shift of the principal point is equivalent to a rotation of the camera, which the mount absorbs. So mounts are
+compared with respect to the axes of the first rig's lenses. With W_k the rotation that compensates a change dk_k of the
+lens k best (first order: W_k = G_k dk_k), the mount's perturbation (w, dt) at (R, t) becomes
 
     w' = w - W_k + R W_0,      dt' = dt - W_k x t,
 
@@ -32,19 +31,24 @@ from rigkit.geometry.rotation import skew
 LENS_GRID = (24, 18)
 """Pixels (columns, rows) at which the lenses are compared."""
 SCALE_ROUNDS, SCALE_STEP = 8, 1e-4
-"""Newton's steps to the scale between two rigs, and the relative step of its derivative."""
+"""Newton steps for the scale between two rigs, and the relative step of its derivative."""
 MAX_SCALE = 100.0
-"""Lengths of one rig in another's: metres for centimetres at most."""
+"""Largest ratio of the lengths of two rigs: metres for centimetres."""
 WEIGHT_FLOOR_PX = 1e-6
-"""No projection is surer than this: weights stay finite without noise."""
+"""Smallest standard deviation of a projection: weights stay finite without noise."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Mounted:
-    """The cameras of a rig by name, each with its cam_from_rig, the first the identity; the covariance of all
-    intrinsics and then of the mounts of all but the first (left perturbations, rad and mm), None where that is not
-    known, and its degrees of freedom. An error of the squares' size is the same in two rigs where the boards are: it is
-    not in the covariance."""
+    """A rig to be compared.
+
+    Attributes
+    ----------
+    cameras : by name, camera and cam_from_rig; that of the first is the identity.
+    covariance : of all intrinsics, then of the mounts of all but the first (left perturbations, rad and mm); None if
+        unknown. The error of the squares' size is not included: two rigs with the same boards have it in common.
+    freedom : its degrees of freedom.
+    """
 
     cameras: dict[str, tuple[Camera, Rigid3]]
     covariance: FloatArray | None
@@ -52,14 +56,14 @@ class Mounted:
 
     @property
     def layout(self) -> Layout:
-        """Where lenses and mounts stand in the covariance."""
+        """Slices of lenses and mounts in the covariance."""
         return Layout.of_cameras(camera for camera, _ in self.cameras.values())
 
 
 @dataclass(frozen=True, slots=True)
 class MountDifference:
-    """How far one camera, or board, sits from where the other calibration has it: degrees, mm, and the chance of as
-    much if it did not move; None where a rig does not say how sure it is."""
+    """Difference of one camera's, or board's, pose between two calibrations: degrees, mm, and the probability of a
+    difference this large without a movement; None where a rig has no covariance."""
 
     name: str
     rotation_deg: float
@@ -69,8 +73,8 @@ class MountDifference:
 
 @dataclass(frozen=True, slots=True)
 class RigDifference:
-    """Of every camera (or board) but the first, and the chance of as much in all of them if nothing moved; `scale` are
-    lengths of the second rig over those of the first, where they differ and nothing else does."""
+    """Differences of every camera (or board) but the first, and the probability of all of them together without a
+    movement; `scale` is the ratio of lengths, second rig over first, if that alone explains the difference."""
 
     mounts: tuple[MountDifference, ...]
     chance: float | None
@@ -82,10 +86,10 @@ class RigDifference:
 
 
 def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
-    """Compare the mounts of two rigs after the rotations of their lenses; of one camera alone nothing can differ.
+    """Compare the mounts of two rigs after the rotations between their lenses; a single camera has no mount.
 
-    Raises InputError where the rigs have other cameras, or cameras of other image sizes; DegenerateError where two
-    cameras look elsewhere.
+    Raises InputError where the rigs have different cameras or image sizes; DegenerateError where the fields of view of
+    two cameras do not overlap.
     """
     if list(a.cameras) != list(b.cameras):
         raise InputError(
@@ -96,12 +100,12 @@ def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
     weights = [_weights(a, k) * _weights(b, k) for k in range(len(a.cameras))]
     for (first, _), (second, _), weight in zip(a.cameras.values(), b.cameras.values(), weights, strict=True):
         turns.append(compare_cameras(first, second, grid=LENS_GRID, weights=weight).b_from_a)
-    sits, sat = ([mount for _, mount in rig.cameras.values()] for rig in (a, b))
+    mounts, others = ([mount for _, mount in rig.cameras.values()] for rig in (a, b))
 
     def off(scale: float) -> FloatArray:
         out = [np.zeros(0)]
-        for turn, here, there in list(zip(turns, sits, sat, strict=True))[1:]:
-            # As the axes of the first rig's lenses have it.
+        for turn, here, there in list(zip(turns, mounts, others, strict=True))[1:]:
+            # With respect to the axes of the first rig's lenses.
             moved = Rigid3(turn.T @ there.rotation @ turns[0], turn.T @ there.translation_mm / scale)
             out.append(here.step_from(moved))
         return np.concatenate(out)
@@ -115,7 +119,7 @@ def compare_mounts(a: Mounted, b: Mounted) -> RigDifference:
 
 
 def _scale(off: Callable[[float], FloatArray], known: Known) -> float | None:
-    """Return by what factor lengths differ, where nothing else does; None where something does."""
+    """Return the ratio of lengths that explains the difference; None if none does."""
     scale, weight = 1.0, scaled_pinv(known[0])
     for _ in range(SCALE_ROUNDS):
         here = off(scale)
@@ -127,10 +131,10 @@ def _scale(off: Callable[[float], FloatArray], known: Known) -> float | None:
 
 
 def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDifference:
-    """Compare the places of boards on one mount, in the frame of the first of them; an error of the squares' size is
-    the same in both.
+    """Compare the poses of boards on one mount, in the frame of the first of them; the error of the squares' size is
+    common to both.
 
-    Raises InputError where the boards are others.
+    Raises InputError where the boards are different ones.
     """
     if a.names != b.names:
         raise InputError(
@@ -142,7 +146,7 @@ def compare_board_rigs(a: BoardRig, b: BoardRig, *, seed: int = 0) -> RigDiffere
 
 
 Known = tuple[FloatArray, FloatArray]
-"""Covariance (n, n) of what may differ, and errors (n, N) drawn from what both parts of it say."""
+"""Covariance (n, n) of a difference, and differences (n, N) drawn from the distributions of both parts."""
 
 
 def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int = 0) -> Known:
@@ -151,19 +155,19 @@ def _known(parts: Sequence[FloatArray], freedom: Sequence[float], seed: int = 0)
     return parts[0] + parts[1], first - second
 
 
-def _difference(names: Sequence[str], separation: FloatArray, known: Known | None) -> RigDifference:
-    """Return the difference from the perturbations `separation` (6 n,) of what has the names."""
+def _difference(names: Sequence[str], steps: FloatArray, known: Known | None) -> RigDifference:
+    """Return the difference from the perturbations `steps` (6 n,) of the poses with these names."""
     mounts = []
     for k, name in enumerate(names):
         own = slice(6 * k, 6 * k + 6)
-        angle, shift = np.degrees(np.linalg.norm(separation[own][:3])), np.linalg.norm(separation[own][3:])
-        chance = None if known is None else _chance(separation[own], known[0][own, own], known[1][own])
+        angle, shift = np.degrees(np.linalg.norm(steps[own][:3])), np.linalg.norm(steps[own][3:])
+        chance = None if known is None else _chance(steps[own], known[0][own, own], known[1][own])
         mounts.append(MountDifference(name, float(angle), float(shift), chance))
-    return RigDifference(tuple(mounts), None if known is None else _chance(separation, *known))
+    return RigDifference(tuple(mounts), None if known is None else _chance(steps, *known))
 
 
 def _weights(rig: Mounted, k: int) -> FloatArray:
-    """Return the weights (rows, columns) of the pixels of camera `k`: what the lens knows there, by its variance."""
+    """Return weights (rows, columns) of pixels of camera `k`, inverse to the projection's standard deviation there."""
     camera = list(rig.cameras.values())[k][0]
     pixels = grid_pixels(camera.size_px, LENS_GRID)
     if rig.covariance is None:
@@ -179,7 +183,7 @@ def _weights(rig: Mounted, k: int) -> FloatArray:
 
 
 def _moved(rig: Mounted, covariance: FloatArray, weights: Sequence[FloatArray]) -> FloatArray:
-    """Return the covariance (6 (n - 1), 6 (n - 1)) of the mounts as the lenses have their axes."""
+    """Return the covariance (6 (n - 1), 6 (n - 1)) of the mounts with respect to the axes of the lenses."""
     design = _design(rig, weights)
     return design @ covariance @ design.T
 
@@ -206,7 +210,8 @@ def _design(rig: Mounted, weights: Sequence[FloatArray]) -> FloatArray:
 
 
 def _chance(off: FloatArray, covariance: FloatArray, errors: FloatArray) -> float:
-    """Return the probability that errors like those drawn, (n, N), are as large as `off` (n,), by the covariance."""
+    """Return the p-value of a difference `off` (n,): the part of the drawn `errors` (n, N) with at least its
+    Mahalanobis distance."""
     if not len(off):
         return 1.0
     inverse = scaled_pinv(covariance)

@@ -1,4 +1,4 @@
-"""The error of a rig on frames that took no part in it: its headline."""
+"""Cross-validation of a rig over frames."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rigkit.calibration.solving.state import weighted_squares
 
 
 def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float | None, ...]]:
-    """Return the 2-D RMS over frames that took no part, of all cameras together and of each: cameras, mounts, places
-    and shapes of boards from the other frames, only one pose a target refitted, by all cameras at once. Of fewer frames
-    than folds each is one. None with less than MIN_IMAGES_OF_FIT, or where those of one fold alone tell where a camera
-    sits.
+    """Return the 2-D RMS over held-out frames, of all cameras together and of each: cameras, mounts, places and shapes
+    of boards are from the other folds, only one pose for each target is fitted, jointly to all cameras. With fewer
+    frames than folds each is a fold. None with less than MIN_IMAGES_OF_FIT frames, or where a camera's mount is
+    determined by the frames of one fold alone.
 
-    It counts what a held-out error of single cameras cannot see: cameras that disagree. Residuals are weighted
-    as in the solution.
+    Unlike the held-out errors of single cameras it includes disagreement between cameras. Residuals are weighted as in
+    the solution.
     """
     observations, state = joint.observations, joint.solution.state
     nothing = None, (None,) * len(observations.cameras)
@@ -43,7 +43,7 @@ def heldout_rms(joint: JointRig, folds: int) -> tuple[float | None, tuple[float 
 
 
 def _is_connected(observations: RigObservations) -> bool:
-    """Say whether every camera shares a pose with the first, or with those that hang together with it."""
+    """Return whether all cameras are connected by shared poses."""
     poses = [set(own.tolist()) for own in observations.frame]
     linked, rest = poses[0], poses[1:]
     while rest:

@@ -1,4 +1,4 @@
-"""The joint solve of a rig with whatever does not fit left out, frame by frame."""
+"""The joint solution of a rig, with outlier frames left out."""
 
 from __future__ import annotations
 
@@ -42,21 +42,21 @@ from rigkit.core.progress import Progress
 from rigkit.geometry.rigid3 import Rigid3
 
 NOTHING_IN_COMMON = 0.1
-"""Where corners that views share are usually so far apart, as a part of the boards' size in the images, the cameras do
-not see the same. A board that moves while cameras without a common trigger look at it is a pixel or two apart, 1 or 2 %
-of its size, and each frame of such a rig is still a measurement, whose error the frames' scatter tells; other boards,
-or frames that do not belong together, are as far apart as they are large."""
+"""Typical distance between views that share a pose, as a part of the boards' size in the images, from which the cameras
+do not see the same. A board that moves in front of cameras without a common trigger gives a pixel or two, 1 or 2 % of
+its size; such frames are still measurements, whose error is in the scatter between frames. Different boards, or frames
+that do not belong together, are as far apart as they are large."""
 BAD = 10.0
-"""Where sharing poses usually costs so many times the corners' noise, a rig measures that much worse than its cameras
-could: it is not good."""
+"""Typical cost of sharing a pose, as a multiple of the corners' noise, from which a rig is not good: it is so much
+worse than its cameras."""
 MIN_SHARE = 0.5
-"""More of the shared targets must agree than disagree."""
+"""Largest part of the shared targets that may be left out."""
 MAX_ROUNDS = 8
-"""The rig is solved so many times at most, each time without the frames that disagreed."""
+"""Maximal number of solutions, each without the frames that disagreed in the one before."""
 NAMED = 3
-"""So many of the frames that disagree are named."""
+"""Number of disagreeing frames that a message lists."""
 TRIED = 6
-"""Of few targets that all look bad, the worst ones are left out for trial, one by one."""
+"""Number of the worst targets, of few that all look bad, that are left out by way of trial, one at a time."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,13 +65,13 @@ class JointRig:
 
     Attributes
     ----------
-    views : what every camera saw, with the keys by which poses are shared.
-    observations, solution : what was used of it and what came out.
+    views : all views, with the keys by which they share poses.
+    observations, solution : the observations used, and the solution.
     sigma_px : prior standard deviation of a corner of median quality, from the cameras alone.
-    cost_sigmas : how many sigmas sharing a pose usually costs; about 1 where the models hold.
+    cost_sigmas : typical cost of sharing a pose, in standard deviations; about 1 if the models are right.
     left_out : (frame, target, reason).
-    notes : what is not sure.
-    known : what was held where it was known.
+    notes : findings about ambiguities.
+    known : cameras held at known values.
     """
 
     views: RigViews
@@ -85,24 +85,24 @@ class JointRig:
 
     @cached_property
     def frames(self) -> IntArray:
-        """Number of the frame of every pose, (F,): `frame_numbers`."""
+        """Index of the frame of every pose, (F,): `frame_numbers`."""
         return frame_numbers(self.views, self.observations)
 
     def folds(self, count: int) -> IntArray:
-        """Return the fold of every pose (F,), of `count` of them or, of fewer frames, each its own."""
+        """Return the fold of every pose (F,), of `count` folds; with fewer frames each is a fold."""
         pixels = [view.pixels for own in self.observations.cameras for view in own.views]
         frame = self.frames[np.concatenate(self.observations.frame)]
         return folds_of(pixels, frame, count)[self.frames]
 
     @property
     def shared_count(self) -> int:
-        """Targets, counted in every frame, of which several views are tied."""
+        """Number of targets, counted in every frame, that several views share."""
         return len(shared_keys(self.views.seen))
 
 
 def frame_numbers(views: RigViews, observations: RigObservations) -> IntArray:
-    """Return the number of the frame of every pose, (F,), in the natural order of their names; frames in which all
-    cameras see what they saw in an earlier one have its number."""
+    """Return the index of the frame of every pose, (F,), in the natural order of the names; near-duplicate frames have
+    the index of the first one."""
     frame = {entry.key: entry.frame for own in views.seen for entry in own.values()}
     names = [frame[key] for key in observations.keys]
     shown = [
@@ -116,9 +116,9 @@ def frame_numbers(views: RigViews, observations: RigObservations) -> IntArray:
 
 
 def solve_jointly(views: RigViews, progress: Progress, known: KnownCameras | None = None) -> JointRig:
-    """Solve for everything together, leaving out targets on which the cameras (or the target's boards) disagree.
+    """Return the joint solution, without targets on which the cameras (or the target's boards) disagree.
 
-    Raises InputError where a camera shares nothing with the others, DegenerateError where too little is left.
+    Raises InputError where a camera shares no target with the others, DegenerateError where too few are left.
     """
     mounts, notes = mounts_of(views)
     mounts = list(mounts) if known is None else known.mounts(views.names, mounts)
@@ -197,14 +197,14 @@ def _solved(
 def _with_lags(
     views: RigViews, observations: RigObservations, solution: Solution[RigState], sigma: float
 ) -> Solution[RigState]:
-    """Return the solution with the lags of cameras where frames surely tell of them."""
+    """Return the solution with the lags of cameras if they are significant."""
     times = times_of(observations.keys, {entry.key: entry.frame for own in views.seen for entry in own.values()})
     return with_lags(observations, solution, sigma, times, frame_numbers(views, observations))
 
 
 def _boards_px(seen: Sequence[FrameObservations]) -> float:
-    """Return how large boards are in the images, px: the median over views of twice the corners' rms distance from
-    their middle."""
+    """Return the size of boards in the images, px: the median over views of twice the corners' rms distance from their
+    centre."""
     entries = [entry for own in seen for entry in own.values()]
     shown = [entry.view.pixels[entry.kept] if entry.kept.any() else entry.view.pixels for entry in entries]
     count = np.array([len(corners) for corners in shown])
@@ -214,7 +214,7 @@ def _boards_px(seen: Sequence[FrameObservations]) -> float:
 
 
 def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float, float], *, several: bool) -> Finding:
-    """Return what to say where sharing poses usually costs more than chance: `typical` px a corner, and sigmas."""
+    """Return the finding where the typical cost of sharing poses, `typical` px a corner and sigmas, is not chance."""
     usual_px, typical_sigmas = typical
     worst = sorted(cost, key=lambda key: -cost[key])[:NAMED]
     times = {frame: np.sqrt(cost[frame, target]) / max(sigma, MIN_PX) for frame, target in worst}
@@ -232,10 +232,10 @@ def _disagreement(cost: Mapping[Key, float], sigma: float, typical: tuple[float,
 
 
 def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Return near which parameters each lens is held, and by which information: so many times that of its own corners.
+    """Return the prior mean and information of each lens: that of its own calibration, times `weight`.
 
-    Where sharing poses usually costs s times what chance allows, what cameras say of each other through shared poses
-    is wrong by s times what they are believed, and would bend the lenses: a camera's own corners count s^2 times.
+    If sharing poses typically costs s times as much as by chance, the constraints from shared poses have s times the
+    assumed error, and would bias the lenses. So a camera's own corners get s^2 times the weight.
     """
     out = []
     for alone in single:
@@ -248,8 +248,8 @@ def _held(single: Sequence[Calibration], sigma: float, weight: float) -> tuple[t
 def _one_bad(
     views: RigViews, mounts: Sequence[Rigid3], sigma: float, cost: Mapping[Key, float], known: KnownCameras | None
 ) -> list[Key]:
-    """Return the one target, if any, without which the others agree: among few, a bad one pulls the mounts so far that
-    all of them look bad."""
+    """Return the one target, if any, without which the others agree: with few targets an outlier shifts the mounts so
+    far that all of them look bad."""
     found: list[tuple[float, float, Key]] = []
     for key in sorted(cost, key=lambda k: -cost[k])[:TRIED]:
         trial = views.with_seen([dict(own) for own in views.seen])
@@ -272,8 +272,8 @@ def _sigma(single: Sequence[Calibration]) -> float:
 
 
 def _observations(views: RigViews, sigma: float) -> tuple[RigObservations, FloatArray]:
-    """Pad the views of all cameras to one table of boards, weighted by how well each camera alone saw its corners, and
-    return the first unknowns of the boards' shape."""
+    """Return the padded views of all cameras with one table of boards, weighted by the residuals of each camera alone,
+    and the initial unknowns of the boards' shape."""
     entries, places = [list(own.values()) for own in views.seen], views.places
     keys = {key: i for i, key in enumerate(dict.fromkeys(e.key for own in entries for e in own))}
     everything = Observations.from_views([e.view for own in entries for e in own])
@@ -286,7 +286,7 @@ def _observations(views: RigViews, sigma: float) -> tuple[RigObservations, Float
         kept[observations.present] = np.concatenate([e.kept for e in own])
         squared[observations.present] = np.concatenate([e.squared_px for e in own])
         observations = observations.with_common_error(squared, kept)
-        # Cameras differ in how sharp they are: a residual counts in its own camera's standard deviations.
+        # Cameras differ in sharpness: a residual counts in its own camera's standard deviations.
         better = sigma / max(alone.sigma_px, MIN_PX) if sigma > MIN_PX else 1.0
         cameras.append(observations)
         weights.append(np.where(kept, better * observations.weight, 0.0))
@@ -306,7 +306,7 @@ def _observations(views: RigViews, sigma: float) -> tuple[RigObservations, Float
 
 
 def _require_agreement(views: RigViews, left: int, shared: int) -> None:
-    """Raise DegenerateError where so much was left out that the rest means nothing."""
+    """Raise DegenerateError where too many shared targets were left out."""
     if not left:
         return
     advice = _advice(views.seen)

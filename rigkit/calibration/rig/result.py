@@ -1,4 +1,4 @@
-"""What a calibrated rig is: cameras, where they sit, how sure that is, and boards that were mounted to each other."""
+"""The result of a rig calibration: cameras with their mounts, uncertainty, and boards mounted to each other."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rigkit.geometry.rotation import skew
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigCamera:
-    """A camera of a rig: what it is called, where it sits, and its calibration as the rig's solution has it."""
+    """A camera of a rig: its name, its mount, and its calibration in the rig's solution."""
 
     name: str
     cam_from_rig: Rigid3
@@ -49,31 +49,31 @@ class RigCalibration:
 
     Attributes
     ----------
-    cameras : in the order given; the first is the rig's frame.
+    cameras : in the order given; the first defines the rig's frame.
     rms_px : 2-D RMS per corner over all cameras, sqrt(mean |residual|^2).
-    heldout_rms_px : the headline. The same over frames that took no part: k-fold over frames, all intrinsics, mounts
-        and places of boards frozen, only one pose a target refitted, by all cameras at once. None with too few frames.
+    heldout_rms_px : cross-validated error: the same over held-out frames, by k-fold cross-validation over frames. All
+        intrinsics, mounts and places of boards are then fixed, only one pose for each target is fitted, jointly to all
+        cameras. None with too few frames.
     covariance : of all intrinsics, camera by camera, then of the mounts of all cameras but the first: left perturbation
-        (rad) and translation (mm), six each. Student's, with `freedom` degrees of freedom.
+        (rad) and translation (mm), six each. Of a Student's t distribution with `freedom` degrees of freedom.
     sigma_px : standard deviation of a corner per coordinate, of median quality.
-    overdispersion : by how much more the frames disagree than the corners' scatter alone explains, as a ratio of
-        standard deviations: 1 where the errors of a frame's corners are independent. All covariances rest on the
-        frames, and count in by how much cameras and mounts would move if the boards' corners were free.
-    freedom : degrees of freedom of the covariances; infinite where there are too few frames to know. Standard
-        deviations that are quoted count them in (`widening`).
+    overdispersion : ratio of the scatter between frames to that expected from independent corners, as a ratio of
+        standard deviations, at least 1. All covariances include it, and the change of cameras and mounts if the boards'
+        corners were released.
+    freedom : degrees of freedom of the covariances; infinite with too few frames to estimate them. Quoted standard
+        deviations account for them (`widening`).
     single : each camera calibrated alone, with its own verdicts.
     convergence : of the joint solve.
     corner_count : corners used.
     shared_count : targets, counted in every frame, that several views share.
     left_out : (frame, target, reason) of targets on which the views disagree: each camera's own calibration uses them,
         the mounts do not.
-    scale_sigma : relative standard deviation of all lengths, from how well the boards' squares were measured.
+    scale_sigma : relative standard deviation of all lengths, from the measurement of the boards' squares.
     board_rigs : boards that are mounted to each other.
-    verdicts : what is good and what is not, the headline first.
-    departures : of each camera what its lens may do beyond its model, and how the rest of the rig is off with it; empty
-        where that is not known.
-    pupils : by name those that move, solved for with all else; their `with_frame` is with what `covariance` is of.
-    lags : by name of all cameras but the first, where they have no common trigger and boards moved; else empty.
+    verdicts : findings about the rig, the headline first.
+    departures : model inadequacy of each camera's lens, with the error of the rest of the rig; empty if unknown.
+    pupils : moving pupils by camera name; their `with_frame` has the rows of `covariance`.
+    lags : by name, of all cameras but the first; empty if they have a common trigger or the boards did not move.
     """
 
     cameras: tuple[RigCamera, ...]
@@ -113,21 +113,21 @@ class RigCalibration:
         return "\n".join(lines)
 
     def index(self, name: str) -> int:
-        """Return the position of the camera `name`; raises InputError that lists the names."""
+        """Return the index of the camera `name`; raises InputError that lists the names."""
         names = [c.name for c in self.cameras]
         if name not in names:
             raise InputError(f"rig: no camera is called '{name}'; there are {', '.join(names)}")
         return names.index(name)
 
     def cam2_from_cam1(self, name1: str, name2: str) -> Rigid3:
-        """Return the motion from one camera to another."""
+        """Return the relative pose cam2_from_cam1 of two cameras."""
         first, second = self.cameras[self.index(name1)], self.cameras[self.index(name2)]
         return second.cam_from_rig @ first.cam_from_rig.inverse()
 
     def baseline_mm(self, name1: str, name2: str) -> tuple[float, float]:
         """Return the distance between the centres of two cameras and its standard deviation, mm.
 
-        The deviation is that of the corners' noise and of how well the boards' squares were measured.
+        The standard deviation includes the covariance, model inadequacy and the measurement of the boards' squares.
         """
         first, second = self.index(name1), self.index(name2)
         difference = self._centre(second) - self._centre(first)
@@ -146,13 +146,13 @@ class RigCalibration:
 
     @cached_property
     def widening(self) -> float:
-        """By how much standard deviations are widened when they are quoted, so that two hold 95 % of errors."""
+        """Factor on quoted standard deviations, so that two of them contain 95 % of the errors."""
         return widening(effective_freedom(self.freedom, self.overdispersion, len(self.covariance)))
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations of what `covariance` is of, with what the lenses may do beyond their models: two hold
-        95 % of errors, however few frames there are."""
+        """Standard deviations of the rows of `covariance`, model inadequacy included, widened so that two of them
+        contain 95 % of the errors."""
         variance = self.widening**2 * np.diag(self.covariance)
         for own in self.departures:
             variance += (own.moves**2).sum(axis=1)
@@ -160,20 +160,20 @@ class RigCalibration:
 
     @cached_property
     def quoted(self) -> tuple[tuple[Camera, ...], FloatArray]:
-        """The same as `with_departures`, with the covariance widened as it is quoted."""
+        """As `with_departures`, with the covariance widened."""
         return self._with_departures(self.widening**2 * self.covariance)
 
     @cached_property
     def with_departures(self) -> tuple[tuple[Camera, ...], FloatArray]:
-        """The cameras, with what their lenses may do beyond their models as further parameters, and the covariance of
-        these, camera by camera, and of the mounts: Student's."""
+        """The cameras with their model inadequacy as further parameters, and the covariance of all parameters, camera
+        by camera, and of the mounts, not widened."""
         return self._with_departures(self.covariance)
 
     def _with_departures(self, covariance: FloatArray) -> tuple[tuple[Camera, ...], FloatArray]:
         return with_modes([c.camera for c in self.cameras], covariance, self.departures)
 
     def mount(self, k: int) -> slice:
-        """Return where the mount of camera `k` > 0 stands in the covariance."""
+        """Return the slice of the mount of camera `k` > 0 in the covariance."""
         return Layout.of_cameras(c.camera for c in self.cameras).mount(k)
 
     def _centre(self, k: int) -> FloatArray:

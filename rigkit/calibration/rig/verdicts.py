@@ -1,4 +1,4 @@
-"""What a person should know about a rig, in sentences, as `rigkit.calibration.judging.verdicts` has it for a camera."""
+"""Findings about a rig, in sentences: `rigkit.calibration.judging.verdicts` for several cameras."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rigkit.calibration.rig.result import RigCalibration
 from rigkit.core.findings import Finding
 
 FEW_SHARED = 5
-"""A mount has six numbers: fewer shared boards leave hardly anything to check it by."""
+"""A mount has six parameters: fewer shared boards give hardly any check of it."""
 OVERDISPERSED = 2.0
-"""Frames that disagree by this many times what the corners' scatter explains have an error in common."""
+"""Overdispersion from which it is reported."""
 WORSE = 1.5
-"""Held-out error in the rig over that of the cameras alone."""
+"""Held-out error in the rig over that of the cameras alone, from which it is reported."""
 MANY_LEFT_OUT = 0.2
 
 
 def diagnose_rig(
-    rig: RigCalibration, far: Sequence[FarProjection], notes: Sequence[Finding] = (), *, in_force: Collection[str] = ()
+    rig: RigCalibration, far: Sequence[FarProjection], notes: Sequence[Finding], *, in_force: Collection[str]
 ) -> tuple[Finding, ...]:
-    """Return the verdicts, the headline first; `far` are the cameras' projections, `notes` verdicts found elsewhere,
-    `in_force` as for `judge`."""
+    """Return the verdicts, the headline first; `far` are the uncertainties of the cameras' projections, `notes`
+    findings from elsewhere, `in_force` as for `judge`."""
     causes = [
         *notes,
         *_not_converged(rig),
@@ -51,7 +51,7 @@ def _lags(rig: RigCalibration) -> list[Finding]:
 
 
 def lag_words(rig: RigCalibration) -> list[str]:
-    """Return in words when each camera took its pictures, where they have no common trigger."""
+    """Return words for the lag of each camera."""
     first, out = rig.cameras[0].name, []
     for name, lag in rig.lags.items():
         when = "after" if lag.frames >= 0.0 else "before"
