@@ -1,1 +1,1 @@
-"""How sure a rig is, and what its cameras' models, triggers and lenses leave open."""
+"""The uncertainty of a rig: covariance, model selection, model inadequacy, transfer between cameras."""

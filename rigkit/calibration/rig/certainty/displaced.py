@@ -1,7 +1,7 @@
-"""What the lenses of a rig may do beyond their models, and how all that was solved for moves with it.
+"""Model inadequacy of the lenses of a rig, and the error of all unknowns with it.
 
-As a camera alone (`certainty.displaced`); in a rig the poses of the boards are those of all cameras, so that
-mounts move along with a lens's displacements: globals follow by the rig's normal equations, the boards' shape held.
+As for a single camera (`certainty.displaced`), but all cameras share the boards' poses, so that mounts change with the
+displacements of a lens: by the rig's normal equations, with the boards' shape held.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from rigkit.kernels.departures import displacements
 def lens_modes(
     observations: RigObservations, solution: Solution[RigState], far: Sequence[FarProjection], reported: IntArray
 ) -> tuple[LensModes, ...]:
-    """Return what each lens may do beyond its model, and how the globals `reported` (G,), intrinsics and mounts, are
-    off; `far` are the cameras' projections as the rig has them."""
+    """Return the model inadequacy of each lens, with the error of the globals `reported` (G,), intrinsics and mounts;
+    `far` are the uncertainties of the cameras' projections in the rig."""
     n, normal = solution.state.layout(observations).shape.start, solution.normal
     if n < len(normal.g):
         normal = replace(normal, gg=normal.gg[:n, :n], gp=normal.gp[:, :n], points_from=None)
@@ -44,8 +44,8 @@ def _of_camera(
     modes: FloatArray,
     reported: IntArray,
 ) -> LensModes:
-    """Return how the globals `reported` are off with the modes (J, M) of the lens of camera `c`; `normal` are the
-    rig's equations without the boards' shape."""
+    """Return the modes (J, M) of the lens of camera `c` with the error of the globals `reported`; `normal` are the
+    rig's normal equations without the boards' shape."""
     if not modes.size:
         return LensModes(modes, np.zeros((len(reported), 0)))
     layout = state.layout(observations)
@@ -74,9 +74,8 @@ def _products(
     modes: FloatArray,
     late: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weighted products of the modes with the derivatives by the parameters (P, M), and with those by the
-    pose of each view (V, 6, M); `late` is by how much each goes on in time (V, 6), and the information on its own
-    time."""
+    """Return the weighted products of the modes with the derivatives by the parameters (P, M) and by the pose of each
+    view (V, 6, M); `late` are the velocity of each view's pose (V, 6) and the information on its own time."""
     points, lever = alone.points_in_cam(own)
     pixels, valid, d_pixels_d_point, d_pixels_d_parameters = alone.camera.project_with_jacobians(points)
     used = valid & (weight > 0.0)
@@ -90,7 +89,7 @@ def _products(
     by_view = np.concatenate([-d_pixels_d_point @ skew(lever), d_pixels_d_point], axis=-1)
     views, count = len(weight), modes.shape[1]
     if late is not None:
-        # What the pictures' own times take up.
+        # The images' own times absorb a part.
         by_time = np.einsum("vcxi,vi->vcx", by_view, late[0])
         weighted = by_time * np.where(used, weight, 0.0)[..., None] ** 2
         known = np.einsum("vcx,vcx->v", weighted, by_time) + late[1]

@@ -1,4 +1,4 @@
-"""How sure all that a rig is solved for is, with the frames as what repeats."""
+"""Cluster-robust covariance of all unknowns of a rig, with frames as the independent units."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from rigkit.core.errors import DegenerateError
 def frame_covariance(
     observations: RigObservations, solution: Solution[RigState], sigma_px: float, frames: IntArray
 ) -> tuple[GlobalCovariance, float]:
-    """Return how sure the solution is, and the standard deviation of a corner by all residuals; `frames` (F,) numbers
-    the frames of the poses in their order in time, `sigma_px` is what the solution took for that of a corner.
+    """Return the covariance of the solution, and the standard deviation of a corner from all residuals; `frames` (F,)
+    are the indices of the poses' frames in order of time, `sigma_px` is the prior standard deviation of a corner.
 
     Raises DegenerateError where there are fewer corners than unknowns.
     """
@@ -33,14 +33,14 @@ def frame_covariance(
 
 
 def residual_sigma(observations: RigObservations, solution: Solution[RigState], sigma_px: float) -> float:
-    """Return the standard deviation of a corner of median quality, degrees of freedom counted.
+    """Return the standard deviation of a corner of median quality, from the residuals and their degrees of freedom.
 
     Raises DegenerateError where there are none.
     """
     state, normal = solution.state, solution.normal
     layout = state.layout(observations)
     poses = int((np.einsum("fii->f", normal.pp) > 0.0).sum())
-    # Every unknown of the shape has a prior, which pays for it.
+    # The prior of an unknown of the shape counts as a measurement, so that both cancel.
     unknowns = layout.shape.start + 6 * poses
     freedom = 2 * observations.corner_count - unknowns
     if freedom <= 0:

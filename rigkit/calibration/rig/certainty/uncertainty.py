@@ -1,12 +1,12 @@
-"""How far a rig may be off in pixels: where a point that one camera sees must appear in another.
+"""Uncertainty of a rig in pixels: of the projection into one camera of a point that another one sees.
 
-A point x at a known distance on the ray of a pixel of camera 1 moves with the intrinsics k1, as the pixel stays, and
-with the mounts; in camera 2
+A point x at a known distance on the ray of a pixel of camera 1 changes with the intrinsics k1, as the pixel is fixed,
+and with the mounts; in camera 2
 
     dq2 = dq2/dk2 dk2 + dq2/dx2 (dM2 + R21 (dx1 - dM1)),      dx1 = -(dq1/dx1)+ dq1/dk1 dk1,
 
-where dM = w x (x - t) + dt is how a mount's perturbation moves a point of its camera, seen from the rig, and + inverts
-across the ray only.
+where dM = w x (x - t) + dt is the motion of a point in the camera by a perturbation of its mount, and + is the inverse
+perpendicular to the ray.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from rigkit.core.arrays import BoolArray, FloatArray, Points
 from rigkit.geometry.rotation import skew
 
 TRANSFER_POINTS = 40
-"""So many corners, spread over all views, are enough to see how sure the transfer is where the boards were."""
+"""Number of corners, spread over all views, at which the transfer is evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """From camera `a` to camera `b`: standard deviation in the worst direction, px, at the middle one and at the worst
-    of the corners that `a` saw and `b` has in its image."""
+    """Uncertainty of the transfer from camera `a` to camera `b`: standard deviation in the worst direction, px, median
+    and maximum over corners that `a` saw and that are in the image of `b`."""
 
     a: str
     b: str
@@ -37,8 +37,8 @@ class Transfer:
 
 
 def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None:
-    """Return how sure it is where the boards' corners in camera `a` must appear in camera `b`; None where `b` has none
-    of their places in its image."""
+    """Return the uncertainty of the transfer of the boards' corners from camera `a` to camera `b`; None where none of
+    them is in the image of `b`."""
     calibration = rig.cameras[rig.index(a)].calibration
     shown = {shape.board_id: shape.points_mm[:: max(1, len(shape.points_mm) // 8)] for shape in calibration.boards}
     boards = [shown[view.board_id] for view in calibration.views]
@@ -56,8 +56,8 @@ def transfer_uncertainty(rig: RigCalibration, a: str, b: str) -> Transfer | None
 
 
 def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> tuple[FloatArray, BoolArray]:
-    """Return the covariance (N, 2, 2), px^2, of where `points` (N, 3) mm in camera `a` appear in camera `b`, their
-    pixels in `a` and their distances given, and whether they do (N,)."""
+    """Return the covariance (N, 2, 2), px^2, of the pixels in camera `b` of `points` (N, 3) mm in camera `a`, given
+    their pixels in `a` and their distances, and which points (N,) are in both images."""
     i, j = rig.index(a), rig.index(b)
     cameras, known = rig.quoted
     first, second = cameras[i], cameras[j]
@@ -66,7 +66,7 @@ def transfer_covariance(rig: RigCalibration, a: str, b: str, points: Points) -> 
     _, seen1, d_pixels1_d_point, d_pixels1_d_parameters = first.project_with_jacobians(points)
     pixels, seen2, d_pixels2_d_point, d_pixels2_d_parameters = second.project_with_jacobians(there)
     rays = points / np.linalg.norm(points, axis=-1, keepdims=True)
-    # Across the ray: the distance is given, so the third row keeps it.
+    # The third row keeps the given distance.
     system = np.concatenate([d_pixels1_d_point, rays[:, None, :]], axis=1)
     held = np.concatenate(
         [-d_pixels1_d_parameters, np.zeros((len(points), 1, d_pixels1_d_parameters.shape[-1]))], axis=1

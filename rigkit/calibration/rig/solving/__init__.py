@@ -1,1 +1,1 @@
-"""All cameras, mounts, targets and places by one least squares."""
+"""The joint least squares of cameras, mounts, targets and boards on them."""

@@ -1,7 +1,7 @@
-"""What boards that are not quite what they were taken for have done to a rig: an error that all frames have in common.
+"""Error of a rig from the shape of the boards, which is common to all frames and so not in their scatter.
 
-How frames scatter does not show it. But the views say how the boards depart from their shape, and a step of the solver
-with boards of a richer one says how far that would move cameras and mounts: that far they may be off.
+One step of the solver with a richer board shape gives the change of cameras and mounts, which is taken as their error,
+if the deviation of the boards from their shape is significant.
 """
 
 from __future__ import annotations
@@ -16,23 +16,22 @@ from rigkit.calibration.solving.shape import SHAPES
 from rigkit.core.arrays import FloatArray
 
 CHANCE_SIGMAS = 3.0
-"""Boards depart from their shape where a richer one takes this many standard deviations more off the cost than chance
-does."""
+"""A richer shape is significant if it lowers the cost by this many standard deviations more than expected by chance."""
 STEP_DAMPING = 1e-12
-"""Of the one step: keeps what no view determines where it is."""
+"""Damping of the step: undetermined unknowns are not changed."""
 
 
 def shape_error(observations: RigObservations, state: RigState, sigma_px: float) -> FloatArray:
-    """Return by how much the globals but for the shape, (G,), would move if the boards had a richer shape: richer ones
-    are tried as long as the boards depart from the one they have by more than chance. Zero where they do not.
+    """Return the change of the globals except the shape, (G,), by the richest board shape that is significant against
+    the one before it; zero if none is.
 
-    `sigma_px` is the standard deviation of a corner, the disagreement of the frames counted in.
+    `sigma_px` is the standard deviation of a corner, overdispersion of the frames included.
     """
     count = state.layout(observations).shape.start
     found = np.zeros(count)
     if not sigma_px > 0.0:
         return found
-    # Which boards are seen often enough, all cameras together.
+    # A board's views in all cameras count together for whether its shape is determined.
     boards = np.concatenate([own.board for own in observations.cameras])
     everything = replace(observations.cameras[0], board=boards)
     for kind in SHAPES[SHAPES.index(observations.shape.kind) + 1 :]:

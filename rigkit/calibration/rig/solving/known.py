@@ -1,7 +1,7 @@
-"""Cameras of a rig that are known before: lenses, or lenses and mounts, that a joint solution leaves where they are.
+"""Known cameras of a rig: lenses, or lenses and mounts, that the joint solution holds.
 
-They are held near their values by an information so large that no corner moves them; what is not sure of them goes
-through to whatever is solved for beside them (`rigkit.calibration.rig.assemble`).
+They are held by priors so strong that no corner changes them. Their covariance is propagated to the other unknowns
+(`rigkit.calibration.rig.assemble`).
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rigid3 import Rigid3
 
 HOLD = 1e10
-"""So many times the information of its corners holds what is known: it moves by 1e-10 of what they would move it."""
+"""Information of these priors, as a multiple of that of the corners: a value changes by 1e-10 of the free change."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KnownCameras:
-    """What is known of some cameras of a rig.
+    """Known values of some cameras of a rig.
 
     Attributes
     ----------
-    cameras : by name, lens and cam_from_rig; a mount of None is to be found. Where one has a mount, the first of them
-        is the rig's frame, and the first of all its cameras.
-    covariance : (n, n) of all their parameters, camera by camera, then of the mounts (rad, mm) of all but the first
-        that have one; None: exact.
+    cameras : by name, lens and cam_from_rig; None for an unknown mount. The first one with a mount defines the rig's
+        frame, and has to be the first camera of the rig.
+    covariance : (n, n) of all their parameters, camera by camera, then of the known mounts (rad, mm) except the first;
+        None: exact.
     """
 
     cameras: Mapping[str, tuple[Camera, Rigid3 | None]]
@@ -59,13 +59,13 @@ class KnownCameras:
         return self.covariance[own, own]
 
     def index(self, names: Sequence[str], layout: Layout) -> IntArray:
-        """Return where what is known stands among the globals of a rig with the cameras `names`."""
+        """Return the indices of the known values among the globals of a rig with the cameras `names`."""
         runs = [layout.cameras[names.index(name)] for name in self.cameras]
         runs += [run for name in self.mounted for run in (layout.mounts[names.index(name)],) if run is not None]
         return np.concatenate([np.arange(run.start, run.stop) for run in runs])
 
     def weights(self, observations: RigObservations, layout: Layout) -> FloatArray:
-        """Return by which information every global is held, (G,); zero where it is free."""
+        """Return the prior information of every global, (G,); zero where it is free."""
         out = np.zeros(layout.count)
         for where, (_, information) in zip(layout.cameras, observations.held, strict=True):
             out[where] = np.diag(information)
@@ -75,12 +75,12 @@ class KnownCameras:
         return out
 
     def mounts(self, names: Sequence[str], found: Sequence[Rigid3]) -> list[Rigid3]:
-        """Return the mounts `found` with those that are known in their place."""
+        """Return the mounts `found`, with known ones replaced."""
         known = [self.cameras.get(name, (None, None))[1] for name in names]
         return [first if mount is None else mount for mount, first in zip(known, found, strict=True)]
 
     def hold(self, observations: RigObservations, state: RigState, names: Sequence[str]) -> RigObservations:
-        """Return the observations with what is known held; `state` is where the solution begins, with it in place."""
+        """Return the observations with priors at the known values, which the initial `state` has to contain."""
         layout = state.layout(observations)
         scale = np.diag(rig_normal(observations, state).gg)
         scale = HOLD * np.maximum(scale, np.finfo(float).eps * scale.max())

@@ -1,4 +1,4 @@
-"""Where the numbers of a rig stand: in a solution, in the covariance of its result, and in its file."""
+"""The order of a rig's unknowns: in a solution, in the covariance of its result, and in its file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from rigkit.cameras.base import Camera
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Layout:
-    """Where each kind of unknown stands among the globals: intrinsics of all cameras, mounts of all but the first, the
-    boards that have a place of their own on their target, lags of all cameras but the first, the boards' shape."""
+    """Slices of the globals: intrinsics of all cameras, mounts of all but the first, poses on their target of boards
+    that do not define it, lags of all cameras but the first, the boards' shape."""
 
     cameras: tuple[slice, ...]
     mounts: tuple[slice | None, ...]
@@ -22,7 +22,8 @@ class Layout:
 
     @classmethod
     def of(cls, sizes: Sequence[int], places: Sequence[bool], shape: int, lags: int = 0) -> Layout:
-        """Lay out cameras of so many parameters each, boards that have a place to find or not, lags, and the shape."""
+        """Return the layout for cameras with so many parameters each, boards with an unknown place or not, and numbers
+        of unknowns of the shape and of lags."""
         ends = accumulate([*sizes, *[6] * (len(sizes) - 1), *[6] * sum(places), lags, shape], initial=0)
         runs = starmap(slice, pairwise(ends))
         cameras = tuple(next(runs) for _ in sizes)
@@ -32,11 +33,11 @@ class Layout:
 
     @classmethod
     def of_cameras(cls, cameras: Iterable[Camera]) -> Layout:
-        """Lay out cameras and their mounts alone, as the covariance of a rig has them."""
+        """Return the layout of cameras and mounts alone, that of a rig's covariance."""
         return cls.of([camera.parameters.size for camera in cameras], (), 0)
 
     def mount(self, k: int) -> slice:
-        """Return where the mount of camera `k` > 0 stands."""
+        """Return the slice of the mount of camera `k` > 0."""
         run = self.mounts[k]
         assert run is not None
         return run

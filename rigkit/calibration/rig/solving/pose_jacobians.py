@@ -1,13 +1,13 @@
-"""How views follow from a rig: what a camera's own normal equations say of a view's pose, carried over to the rig's.
+"""Derivatives of each view's pose by the poses of a rig: targets, mounts, and boards on their targets.
 
-A camera sees board b of the target of frame f at  R = Rc Rf Rb,  t = Rc (Rf tb + tf) + tc. Perturbations from the left,
-(w, dt) of the target's pose, (e, ds) of the camera's mount and (b, du) of the board's place on its target, move the
-board in the camera by
+Camera c sees board b of the target of frame f at  R = Rc Rf Rb,  t = Rc (Rf tb + tf) + tc. Left perturbations (w, dt)
+of the target's pose, (e, ds) of the camera's mount and (b, du) of the board's pose on its target move the board in the
+camera by
 
     w_cam = Rc w + e + Rc Rf b,      dt_cam = Rc dt + (Rc w) x (Rc Rf tb) + ds + e x (t - tc) + Rc Rf du,
 
-so the six columns of each view's own pose are carried over to target, mount and place by 6x6 matrices. Of a camera
-alone (its mount the identity, every board a target) they are the identity, and nothing is carried anywhere.
+so 6x6 matrices transform the derivatives by a view's own pose to those by target, mount and board. For a single camera
+(its mount the identity, every board a target) they are the identity.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from rigkit.geometry.rotation import skew
 def pose_jacobians(
     observations: RigObservations, state: RigState, c: int, translation_mm: Points
 ) -> list[PoseJacobians]:
-    """Return how the views of camera `c`, at `translation_mm` (V, 3) from it, follow from targets, its mount where that
-    is free, (board by board, where boards have places on a target) from these, and from its lag where cameras lag."""
+    """Return the derivatives for the views of camera `c`, with boards at `translation_mm` (V, 3): by targets, by its
+    mount and lag if unknown, and by the boards' places on targets, then in one part for each board."""
     parts = at_own_moment(observations, state, c, translation_mm)
     if state.moments is None:
         return parts
@@ -36,7 +36,8 @@ def pose_jacobians(
 
 
 def gone_in_cam(observations: RigObservations, state: RigState, c: int, translation_mm: Points) -> FloatArray:
-    """Return by how much the boards of all views of camera `c` go on at their moments, (V, 6) a unit of time."""
+    """Return the velocities of the boards in all views of camera `c` when the images were taken, (V, 6) per unit of
+    time."""
     out = np.zeros((len(translation_mm), 6))
     for part in at_own_moment(observations, state, c, translation_mm):
         if state.moments is not None:
@@ -47,7 +48,7 @@ def gone_in_cam(observations: RigObservations, state: RigState, c: int, translat
 def at_own_moment(
     observations: RigObservations, state: RigState, c: int, translation_mm: Points
 ) -> list[PoseJacobians]:
-    """Return how the views of camera `c` follow from the targets where it has seen them, mount and places."""
+    """Return the derivatives for the views of camera `c` by the targets' poses when it took them, mount and places."""
     layout, frame, lever = state.layout(observations), observations.frame[c], translation_mm - state.mount_mm[c]
     turn = state.mount_rotation[c]
     if not observations.tied:
@@ -65,16 +66,17 @@ def at_own_moment(
 
 
 def pose_jacobians_of_mount(rotation: Mat3, mount: slice | None, poses: IntArray, lever: Points) -> PoseJacobians:
-    """Return how V boards, targets all, follow their `poses` (V,) in the rig and the `mount` of a camera, None where
-    that is not free: it has this `rotation`, and the boards lie at `lever` (V, 3) from where it has the rig."""
+    """Return the derivatives for V boards, each a target, by their `poses` (V,) in the rig and the `mount` of the
+    camera (None if held), which has this `rotation`; `lever` (V, 3) is from the rig's origin to the boards, in the
+    camera."""
     return PoseJacobians(
         np.arange(len(poses)), poses, _turned(rotation), *_free([(mount, _rotated_lever(lever))], len(poses))
     )
 
 
 def pose_products(observations: RigObservations, state: RigState, products: Sequence[FloatArray]) -> FloatArray:
-    """Return of every pose the sums of the products of its rows, (F, n + 7, n + 7), from those of every view of each
-    camera (`view_products`): derivatives by the n globals but for released corners, by the pose, and the residual."""
+    """Return J^T J of every pose, (F, n + 7, n + 7), from the `view_products` of each camera: columns are derivatives
+    by the n globals except released corners and by the pose, and the residual."""
     layout = state.layout(observations)
     n = layout.shape.start + observations.shape.basis.shape[-1]
     each = [
@@ -91,8 +93,8 @@ def pose_products(observations: RigObservations, state: RigState, products: Sequ
 def summed_products(
     each: Sequence[tuple[FloatArray, IntArray, Sequence[PoseJacobians]]], poses: int, count: int
 ) -> FloatArray:
-    """Return the products of so many poses and globals, (F, G + 7, G + 7): of each camera given are those of its views
-    (V, P + 7, P + 7), where its own P unknowns stand among the globals, and how the views follow."""
+    """Return J^T J for so many poses and globals, (F, G + 7, G + 7), from that of the views of each camera
+    (V, P + 7, P + 7), the indices of its own P unknowns among the globals, and the derivatives of its views."""
     out = np.zeros((poses, count + 7, count + 7))
     for own, direct, parts in each:
         p = len(direct)
@@ -107,14 +109,14 @@ def summed_products(
 
 
 def _turned(rotation: Mat3) -> FloatArray:
-    """Return how a pose (w, dt) is turned, (6, 6)."""
+    """Return the (6, 6) matrix that rotates both parts of (w, dt)."""
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = rotation
     return out
 
 
 def _rotated_lever(lever: Points) -> FloatArray:
-    """Return how a turn about a point, and a shift, move what is at `lever` (N, 3) from it, (N, 6, 6)."""
+    """Return the matrices (N, 6, 6) from a motion (w, dt) about a point to that at `lever` (N, 3) from it."""
     out = np.zeros((len(lever), 6, 6))
     out[:] = np.eye(6)
     out[:, 3:, :3] = -skew(lever)
@@ -122,8 +124,8 @@ def _rotated_lever(lever: Points) -> FloatArray:
 
 
 def _free(runs: Sequence[tuple[slice | None, FloatArray]], views: int) -> tuple[IntArray, FloatArray]:
-    """Return the globals that are free, (K,), and how so many views follow them, (N, 6, K)."""
-    found = [(np.arange(run.start, run.stop), how) for run, how in runs if run is not None]
+    """Return the indices of the free globals, (K,), and the derivatives of so many views by them, (N, 6, K)."""
+    found = [(np.arange(run.start, run.stop), by_run) for run, by_run in runs if run is not None]
     if not found:
         return np.zeros(0, dtype=np.int64), np.zeros((views, 6, 0))
-    return np.concatenate([run for run, _ in found]), np.concatenate([how for _, how in found], axis=-1)
+    return np.concatenate([run for run, _ in found]), np.concatenate([by_run for _, by_run in found], axis=-1)

@@ -1,4 +1,4 @@
-"""The boards' shape in a rig: one for all cameras, begun where the cameras alone have it."""
+"""The boards' shape in a rig, common to all cameras, with initial values from the cameras alone."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from rigkit.core.arrays import FloatArray, Points
 
 
 def common_shape(observations: Observations, single: Sequence[Calibration]) -> tuple[ShapeModel, FloatArray]:
-    """Return the shape model of all cameras' boards, and its unknowns as the cameras have them, on average.
+    """Return the shape model of all cameras' boards, and initial unknowns from the mean shape over the cameras.
 
-    It is the richest that a camera alone has chosen: a board that is bent for one camera is bent. How far corners stray
-    the cameras alone have asked of their views; the priors are as wide as what they found.
+    It is the richest kind that a camera alone has chosen: a board that is bent for one camera is bent. The widths of
+    the priors are those of the shapes that the cameras alone have found.
     """
     kind = max((b.kind for alone in single for b in alone.boards), key=SHAPES.index)
     shape = shape_model(kind, observations)
@@ -29,7 +29,7 @@ def common_shape(observations: Observations, single: Sequence[Calibration]) -> t
 
 
 def _average(observations: Observations, single: Sequence[Calibration]) -> Points:
-    """Return the corners of all boards, on average over the cameras that saw them."""
+    """Return the mean corners of all boards over the cameras that saw them."""
     found: dict[str, list[Points]] = {}
     for shape in (shape for alone in single for shape in alone.boards):
         found.setdefault(shape.board_id, []).append(shape.points_mm)
@@ -41,7 +41,7 @@ def _average(observations: Observations, single: Sequence[Calibration]) -> Point
 
 
 def _nearest(shape: ShapeModel, points: Points) -> FloatArray:
-    """Return the unknowns whose points are nearest to `points`: the warp's first, then what it leaves to released."""
+    """Return the unknowns that fit `points`: the warp by least squares, then the rest by released corners."""
     off = points - shape.flat
     count = shape.basis.shape[-1]
     warp = np.linalg.lstsq(shape.basis.reshape(-1, count), off.reshape(-1), rcond=None)[0]
@@ -49,7 +49,7 @@ def _nearest(shape: ShapeModel, points: Points) -> FloatArray:
 
 
 def _found(observations: Observations, shape: ShapeModel, unknowns: FloatArray) -> FloatArray:
-    """Return the prior standard deviation of each unknown: the size of those of one kind on one board."""
+    """Return the prior standard deviation of each unknown: the rms of those of one kind on one board."""
     sizes = shape.sigma.copy()
     groups = [*warp_groups(observations)]
     if shape.kind == "released":

@@ -19,7 +19,7 @@ from rigkit.geometry.rotation import log_so3
 
 
 def rig_normal(observations: RigObservations, state: RigState, sigma_px: float = 0.0) -> NormalEquations:
-    """Return the normal equations with all priors; `sigma_px`, the standard deviation of a corner, sets residuals
+    """Return the normal equations with all priors; `sigma_px`, the standard deviation of a corner, scales residuals
     against the priors of cameras and shape; zero for none of these."""
     return with_rig_priors(rig_data(observations, state), observations, state, sigma_px)
 
@@ -40,7 +40,7 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
             n = without_own_times(n, gone, moments.own[c, f], moments.information[c, f])
         each.append(n)
         size = alone.camera.parameters.size
-        # Where the camera's own unknowns stand in the rig, and by themselves.
+        # Slices of the camera's own unknowns in the rig, and in the camera's equations.
         parts = [(layout.cameras[c], slice(0, size))]
         if observations.shape.count:
             parts.append((layout.shape, slice(size, None)))
@@ -68,14 +68,14 @@ def rig_data(observations: RigObservations, state: RigState) -> NormalEquations:
                 gg[there, index] += both
                 gg[index, there] += both.T
     released = None
-    # Pictures with times of their own couple the points that they show.
+    # The times of images couple the points that they show.
     if observations.shape.kind == "released" and state.moments is None:
         released = layout.shape.start + observations.shape.basis.shape[-1]
     return replace(_joined(each), gg=gg, gp=gp, pp=pp, g=g, p=p, costs=costs, points_from=released)
 
 
 def _joined(each: Sequence[NormalEquations]) -> NormalEquations:
-    """Return the first with what those of all cameras know of their corners and views."""
+    """Return the first with the residuals and products of all."""
     residuals = tuple(own for normal in each for own in normal.residuals)
     return replace(each[0], residuals=residuals, products=tuple(own for normal in each for own in normal.products))
 
@@ -83,7 +83,7 @@ def _joined(each: Sequence[NormalEquations]) -> NormalEquations:
 def with_rig_priors(
     normal: NormalEquations, observations: RigObservations, state: RigState, sigma_px: float
 ) -> NormalEquations:
-    """Add what is known of cameras and shape without any corner, and what holds lenses near their own solutions."""
+    """Add the priors of cameras and shape, and those of held lenses and mounts."""
     layout = state.layout(observations)
     cameras = list(zip(layout.cameras, state.cameras, strict=True))
     normal = normal.with_priors(cameras, layout.shape, observations.shape.sigma, state.unknowns, sigma_px)
@@ -101,9 +101,9 @@ def with_rig_priors(
 def solve_rig(
     observations: RigObservations, start: RigState, sigma_px: float, tolerance: float = COST_TOLERANCE
 ) -> Solution[RigState]:
-    """Return the state of least weighted squares from `start`, and how the solver ended.
+    """Return the state that minimises the weighted residuals, from the initial state `start`.
 
-    `sigma_px` as for `rig_normal`; `tolerance` is the part of the cost that a step must promise to be taken.
+    `sigma_px` as for `rig_normal`; `tolerance` is the relative predicted decrease of the cost at which it stops.
     """
     layout = start.layout(observations)
 
@@ -115,7 +115,7 @@ def solve_rig(
 
 
 def refine_frames(observations: RigObservations, state: RigState) -> RigState:
-    """Return the state with the pose of every target at its own minimum, all else as it is."""
+    """Return the state with the pose of every target at its own minimum, and all else held."""
     seen = replace(observations, shape=observations.shape.held(state.unknowns))
     held = replace(state, unknowns=np.zeros(0))
 

@@ -1,12 +1,12 @@
-"""What a rig's cameras saw, and everything that is solved for: cameras, mounts, targets and their places.
+"""The observations of a rig's cameras, and its unknowns: cameras, mounts, targets, boards on targets.
 
-A target is what keeps its shape while it moves before the cameras: a single board, or several boards mounted to each
-other, whose frame is that of the first of them. The camera c sees board b of the target of frame f at
+A target is a rigid body that moves in front of the cameras: a single board, or several boards mounted to each other,
+whose frame is that of the first of them. Camera c sees board b of the target of frame f at
 
     cam_from_board = cam_from_rig[c] rig_from_target[f] target_from_board[b].
 
-Where cameras lag, rig_from_target is that of the first camera's moment, and each sees the target where it has gone
-meanwhile (`rigkit.calibration.rig.solving.moments`).
+Without a common trigger, rig_from_target is the pose when the first camera took its image, and each camera sees the
+target where it was at its own time (`rigkit.calibration.rig.solving.moments`).
 """
 
 from __future__ import annotations
@@ -28,26 +28,25 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 Key = tuple[str, str]
-"""(frame, target): views that have a key in common see the same target in the same place."""
+"""(frame, target): views with the same key share one pose of the target."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigObservations:
-    """What every camera saw.
+    """The observations of every camera.
 
     Attributes
     ----------
     cameras : observations of each camera; all have the same table of boards.
     weights : (V_c, C) of each camera, zero for corners to ignore: weighted residuals are in px of a corner of median
         quality.
-    shape : how the boards' points depend on the shape's unknowns.
-    frame : (V_c,) int of each camera, row of each view's key in `keys`.
+    shape : model of the boards' shape.
+    frame : (V_c,) int of each camera, index of each view's key in `keys`.
     keys : (frame, target) of every pose.
-    places : (B,) whether a board has a place to find on its target (the first one of a target is its frame).
-    held : near which parameters (P,) the lens of each camera is held, and by which information (P, P) px^2; empty where
-        none is.
-    held_mounts : near which mount each camera is held, and by which information (6, 6) px^2 per rad and mm; None or
-        empty where none is.
+    places : (B,) whether a board has an unknown pose on its target (the first one of a target defines its frame).
+    held : prior mean (P,) and information (P, P) px^2 of each camera's parameters; empty without priors.
+    held_mounts : prior mean and information (6, 6) px^2 per rad and mm of each camera's mount, None without a prior;
+        empty without any.
     """
 
     cameras: tuple[Observations, ...]
@@ -70,7 +69,7 @@ class RigObservations:
         return int(sum(int((w > 0.0).sum()) for w in self.weights))
 
     def subset(self, poses: BoolArray) -> RigObservations:
-        """Return the views of the poses chosen (F,); all poses stay in the table."""
+        """Return the views of the poses chosen (F,); `keys` still has all poses."""
         chosen = [np.flatnonzero(poses[f]) for f in self.frame]
         return replace(
             self,
@@ -82,9 +81,17 @@ class RigObservations:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class RigState:
-    """Cameras, their mounts cam_from_rig (n, 3, 3), (n, 3) mm, the first the identity, rig_from_target of every key
-    (F, 3, 3), (F, 3) mm, target_from_board of every board (B, 3, 3), (B, 3) mm, the shape's unknowns, and where cameras
-    have no common trigger the moments of their pictures."""
+    """The unknowns of a rig.
+
+    Attributes
+    ----------
+    cameras : the cameras.
+    mount_rotation, mount_mm : (n, 3, 3) and (n, 3), cam_from_rig of each; the first is the identity.
+    frame_rotation, frame_mm : (F, 3, 3) and (F, 3), rig_from_target of every key.
+    board_rotation, board_mm : (B, 3, 3) and (B, 3), target_from_board of every board.
+    unknowns : of the boards' shape.
+    moments : times of the images, if cameras have no common trigger.
+    """
 
     cameras: tuple[Camera, ...]
     mount_rotation: Mat3
@@ -97,19 +104,19 @@ class RigState:
     moments: Moments | None = None
 
     def layout(self, observations: RigObservations) -> Layout:
-        """Return where the unknowns stand."""
+        """Return the order of the unknowns."""
         lags = 0 if self.moments is None else len(self.cameras) - 1
         sizes = [c.parameters.size for c in self.cameras]
         return Layout.of(sizes, observations.places, observations.shape.count, lags)
 
     def targets(self, c: int, observations: RigObservations) -> tuple[Mat3, Points]:
-        """Return rig_from_target of every view of camera `c` when it was taken, (V, 3, 3) and (V, 3)."""
+        """Return rig_from_target of every view of camera `c` at the time of its image, (V, 3, 3) and (V, 3)."""
         f = observations.frame[c]
         poses = self.frame_rotation[f], self.frame_mm[f]
         return poses if self.moments is None else self.moments.targets(c, f, poses)
 
     def of_camera(self, c: int, observations: RigObservations) -> State:
-        """Return the state of camera `c` alone, every view with its pose in that camera."""
+        """Return the state of camera `c` alone, with the pose of every view in that camera."""
         rotation, place = self.targets(c, observations)
         if observations.tied:
             b = observations.cameras[c].board
@@ -120,7 +127,7 @@ class RigState:
         return State(self.cameras[c], rotation, translation, observations.shape, self.unknowns)
 
     def moved(self, step: SchurStep, layout: Layout) -> RigState:
-        """Return the state after a step; raises InputError or DegenerateError where the parameters make no camera."""
+        """Return the state after a step; raises InputError or DegenerateError where the parameters are invalid."""
         lenses = zip(self.cameras, layout.cameras, strict=True)
         mounts, boards = _steps(step.globals, layout.mounts), _steps(step.globals, layout.boards)
         return RigState(
@@ -136,7 +143,7 @@ class RigState:
         )
 
     def with_frames(self, other: RigState) -> RigState:
-        """Return this state with the poses of the targets of another."""
+        """Return this state with the targets' poses of another one."""
         return replace(self, frame_rotation=other.frame_rotation, frame_mm=other.frame_mm)
 
 
