@@ -1,7 +1,7 @@
-"""The contract of every central camera: project, unproject, and the derivatives of both.
+"""The interface of every central camera: project, unproject, and the derivatives of both.
 
 Pixel (0, 0) is the centre of the top-left pixel; x right, y down, z forward. Fields of view beyond 180 degrees are
-ordinary: rays are unit vectors and z may be negative.
+supported: rays are unit vectors and z may be negative.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from rigkit.core.arrays import (
     RayJacobians,
     Rays,
     as_array,
+    as_floats,
 )
 from rigkit.core.errors import InputError
 
 MAX_SIDE_PX = 2**20
-"""Some sixty times the longest line sensor: a larger image is a mistyped number."""
+"""Some sixty times the longest line sensor: a larger image size is a typing error."""
 MAX_PARAMETER = 1e15
-"""A double of this size has no digits left for tenths, and products of much larger ones overflow; what lenses need is
-below it (the k3 that bends the rim of a lens of one degree: 1e12)."""
+"""Parameters of real lenses are below (k3 of a lens of one degree: 1e12); products of much larger ones overflow."""
 
 
 def image_center(size_px: tuple[int, int]) -> FloatArray:
@@ -40,14 +40,14 @@ def image_center(size_px: tuple[int, int]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RadialCurve:
-    """How far from its centre a lens images what lies off its axis, in samples.
+    """Samples of the radial profile of a lens: the image radius as a function of the angle from the axis.
 
     Raises InputError: fewer than four samples off the axis, angles or radii that do not increase, or angles of 180
     degrees and more.
 
     Attributes
     ----------
-    centre_px : (2,) where the optical axis meets the image.
+    centre_px : (2,) pixel of the optical axis.
     theta_rad, radius_px : (N,) angles from the axis and distances from the centre, both increasing; samples on the
         axis are left out.
     """
@@ -74,7 +74,7 @@ class RadialCurve:
         object.__setattr__(self, "radius_px", radius)
 
     def below(self, limit_rad: float, model: str) -> tuple[FloatArray, FloatArray]:
-        """Return angles and radii; raises InputError where they reach `limit_rad`, beyond which `model` is blind."""
+        """Return angles and radii; raises InputError where they reach `limit_rad`, the limit of `model`."""
         if self.theta_rad[-1] >= limit_rad:
             raise InputError(
                 f"radial curve: it reaches {np.degrees(self.theta_rad[-1]):.1f} degrees, a {model} camera sees less "
@@ -85,16 +85,16 @@ class RadialCurve:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Camera(ABC):
-    """A central camera: every pixel sees along one ray through one centre.
+    """A central camera: all rays meet in one point.
 
     Attributes
     ----------
     size_px : (width, height)
     parameters : (P,) float64, read-only, in the order of `parameter_names()`.
 
-    Every model is one file with one subclass and one line in `registry`. A model writes its formulas on flat arrays of
-    coordinates (`_project`, `_unproject`, `_derivatives`); shapes, NaN and memory are dealt with here, once.
-    Validity is the model's own field of view; whether a pixel lies on the sensor is another question (`on_image`).
+    Every model is one file with one subclass and one line in `registry`. A model implements its formulas for flat
+    arrays of coordinates (`_project`, `_unproject`, `_derivatives`); this class handles shapes, NaN and memory. A point
+    or pixel is valid inside the model's field of view; `on_image` says whether a pixel is on the sensor.
     """
 
     size_px: tuple[int, int]
@@ -103,11 +103,12 @@ class Camera(ABC):
     model: ClassVar[str]
     """Name in the registry and in files."""
     orders: ClassVar[tuple[int, ...]] = ()
-    """The sizes that a model of several sizes can have: Brown's numbers of distortion terms, Scaramuzza's degrees."""
+    """Sizes of a model that has several: Brown's numbers of distortion terms, Scaramuzza's degrees."""
 
     @property
     def series(self) -> tuple[int, ...]:
-        """Which parameters are terms of a power series along the radius, the lowest first: none of a closed formula."""
+        """Indices of the parameters that are terms of a power series in the radius, lowest first; empty for a closed
+        formula."""
         return ()
 
     def __post_init__(self) -> None:
@@ -121,7 +122,7 @@ class Camera(ABC):
         self._keep(self.parameters)
 
     def _keep(self, parameters: ArrayLike) -> None:
-        """Check the parameters and keep them, with what the formulas need of them."""
+        """Check and store the parameters, and compute values that depend on them."""
         _require_numbers(parameters, f"{self.model} parameters")
         array = as_array(parameters, (None,), f"{self.model} parameters")
         object.__setattr__(self, "parameters", array)
@@ -144,23 +145,22 @@ class Camera(ABC):
         return f"{type(self).__name__}({self.size_px[0]}x{self.size_px[1]} px: {values})"
 
     def named(self, values: FloatArray) -> dict[str, float]:
-        """Return values (P,) of the parameters, or their standard deviations, by the parameters' names."""
+        """Return the `values` (P,), of parameters or their standard deviations, by the parameters' names."""
         return dict(zip(self.parameter_names(), values.tolist(), strict=True))
 
     def _prepare(self) -> None:
-        """Check the values of the parameters and compute what the formulas need of them."""
+        """Check the parameters and compute values that depend on them."""
         return
 
     @classmethod
     def from_radial_curve(cls, size_px: tuple[int, int], curve: RadialCurve, *, order: int | None = None) -> Self:
-        """Return the camera of this model nearest to a sampled radial curve: where every calibration starts.
+        """Return the camera of this model that fits a radial curve: the initial values of a calibration.
 
-        Raises InputError: a model of this kind cannot follow the curve (a pinhole beyond 90 degrees), or is no lens
-        that a calibration starts with.
+        Raises InputError: the model cannot represent the curve (a pinhole beyond 90 degrees), or has no such fit.
 
         Parameters
         ----------
-        curve : where the optical axis meets the image, and radii over angles.
+        curve : pixel of the optical axis, and radii over angles.
         order : for models of several sizes: Brown's number of distortion terms, Scaramuzza's degree.
         """
         raise InputError(f"no '{cls.model}' camera starts at a radial curve")
@@ -172,11 +172,11 @@ class Camera(ABC):
     @property
     @abstractmethod
     def max_angle_rad(self) -> float:
-        """The largest angle from the optical axis that the model sees; at most pi."""
+        """Largest angle from the optical axis in the model's field of view; at most pi."""
 
     @abstractmethod
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
-        """Return u, v, valid of flat coordinates; NaN in must give invalid out, values at invalid places are free."""
+        """Return u, v, valid of flat coordinates; NaN has to be invalid, values at invalid places are arbitrary."""
 
     @abstractmethod
     def _unproject(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
@@ -189,11 +189,11 @@ class Camera(ABC):
         """Project, fill `d_pixels_d_point` (2, 3, N) and, unless None, `d_pixels_d_parameters` (2, P, N)."""
 
     def project(self, points: Points) -> tuple[Pixels, BoolArray]:
-        """Return the pixels of points (..., 3) given in the camera frame, and where they are valid.
+        """Return the pixels (..., 2) of points (..., 3) in the camera frame, and which are valid.
 
-        The length of a point does not matter. Invalid (outside the model's field of view, at the centre, NaN): NaN.
+        Points may have any length. Invalid ones (outside the field of view, at the centre, NaN) get NaN.
         """
-        points = _rows(points, 3, "points")
+        points = as_floats(points, (3,), "points")
         batch = points.shape[:-1]
         flat = points.reshape(-1, 3)
         with np.errstate(all="ignore"):
@@ -203,8 +203,9 @@ class Camera(ABC):
         return pixels.reshape(*batch, 2), valid.reshape(batch)
 
     def unproject(self, pixels: Pixels) -> tuple[Rays, BoolArray]:
-        """Return the unit rays of pixels (..., 2) in the camera frame, and where they are valid (NaN elsewhere)."""
-        pixels = _rows(pixels, 2, "pixels")
+        """Return the unit rays (..., 3) of pixels (..., 2) in the camera frame, and which are valid (others are
+        NaN)."""
+        pixels = as_floats(pixels, (2,), "pixels")
         batch = pixels.shape[:-1]
         flat = pixels.reshape(-1, 2)
         with np.errstate(all="ignore"):
@@ -242,10 +243,10 @@ class Camera(ABC):
     def project_with_jacobians(self, points: Points) -> tuple[Pixels, BoolArray, FloatArray, FloatArray]:
         """Return pixels, valid, d pixel / d point (..., 2, 3) in px/mm, and d pixel / d parameters (..., 2, P).
 
-        The Jacobians are NaN where invalid. They are views of memory in the order (2, 3, ...) and (2, P, ...):
-        a solver that wants long contiguous rows moves the last two axes to the front at no cost.
+        The Jacobians are NaN where invalid. Their memory has the order (2, 3, ...) and (2, P, ...), so that moving the
+        last two axes to the front gives long contiguous rows.
         """
-        points = _rows(points, 3, "points")
+        points = as_floats(points, (3,), "points")
         batch = points.shape[:-1]
         flat = points.reshape(-1, 3)
         d_pixels_d_point = np.zeros((2, 3, flat.shape[0]))
@@ -273,48 +274,48 @@ class Camera(ABC):
         d_pixels_d_point: FloatArray,
         d_pixels_d_parameters: FloatArray,
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Project N points given by flat coordinates and write the Jacobians into `d_pixels_d_point` (2, 3, N) and
-        `d_pixels_d_parameters` (2, P, N): `project_with_jacobians` into memory that the caller keeps.
+        """Return u, v and valid, each (N,), of N points given by flat coordinates, and write the Jacobians into
+        `d_pixels_d_point` (2, 3, N) and `d_pixels_d_parameters` (2, P, N): `project_with_jacobians` without allocation.
 
-        Return u, v and valid, each (N,); what is not valid is left arbitrary, NaN too. Entries of
-        `d_pixels_d_parameters` that are zero for every camera of the model are not written: the caller provides the
-        zeros.
+        Invalid entries are arbitrary, also NaN. The caller has to fill `d_pixels_d_parameters` with zeros: entries that
+        are zero for every camera of the model are not written.
         """
         with np.errstate(all="ignore"):
             return self._derivatives((x, y, z), d_pixels_d_point, d_pixels_d_parameters)
 
     def with_parameters(self, parameters: ArrayLike) -> Self:
-        """Return the same model and size with other parameters.
+        """Return a camera of the same model and size with other parameters.
 
-        Raises InputError where they are outside of what the model is defined for; a solver takes that as a failed step.
+        Raises InputError where they are invalid for the model; for a solver that is a refused step.
         """
-        # The size is checked already, and a solver asks for many.
+        # The size was checked before, and a solver makes many cameras.
         out = object.__new__(type(self))
         object.__setattr__(out, "size_px", self.size_px)
         out._keep(parameters)
         return out
 
     def on_image(self, pixels: Pixels) -> BoolArray:
-        """Say which pixels (..., 2) lie on the sensor, whose outermost pixels reach half a pixel further out."""
-        pixels = _rows(pixels, 2, "pixels")
+        """Return which pixels (..., 2) are on the sensor, up to half a pixel beyond the centres of its border
+        pixels."""
+        pixels = as_floats(pixels, (2,), "pixels")
         limit = np.array(self.size_px) - 0.5
         with np.errstate(invalid="ignore"):
             return np.asarray(((pixels >= -0.5) & (pixels <= limit)).all(axis=-1))
 
     @property
     def axis_px(self) -> Pixels:
-        """Pixel (2,) of the optical axis; NaN where the camera does not see it."""
+        """Pixel (2,) of the optical axis; NaN if it is outside the field of view."""
         return self.project(np.array([0.0, 0.0, 1.0]))[0]
 
     @property
     def focal_px(self) -> float:
-        """Pixels per radian on the optical axis: the scale of an angular error, whatever the model."""
+        """Pixels per radian on the optical axis, for any model."""
         _, _, d_pixels_d_point, _ = self.project_with_jacobians(np.array([0.0, 0.0, 1.0]))
         return float(np.sqrt(abs(np.linalg.det(d_pixels_d_point[:, :2]))))
 
 
 def _require_numbers(values: object, what: str) -> None:
-    """Raise InputError for texts and truth values, which numpy would take for numbers."""
+    """Raise InputError for strings and booleans, which numpy would convert to numbers."""
     entries = () if isinstance(values, np.ndarray) and values.dtype.kind in "iuf" else values
     for value in entries if isinstance(entries, list | tuple | np.ndarray) else (entries,):
         if isinstance(value, bool | np.bool_ | str | bytes):
@@ -322,14 +323,6 @@ def _require_numbers(values: object, what: str) -> None:
 
 
 def _blank(values: FloatArray, valid: BoolArray) -> None:
-    """Write NaN into the rows of a fresh array that are not valid."""
+    """Write NaN into the invalid rows of `values`."""
     if not valid.all():
         values[~valid] = np.nan
-
-
-def _rows(values: ArrayLike, size: int, name: str) -> FloatArray:
-    """Return float64 (..., size); raises InputError for any other shape, such as coordinates in columns."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] != size:
-        raise InputError(f"{name}: expected shape (..., {size}), got {array.shape}")
-    return array

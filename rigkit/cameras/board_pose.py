@@ -11,11 +11,11 @@ from rigkit.geometry.board_pose import board_pose, moved_board_poses
 from rigkit.geometry.rigid3 import Rigid3
 
 MAX_PUPIL_ROUNDS, SETTLED_PX = 30, 1e-6
-"""Each round takes off all of the error but as much as the pupil moves over the board's distance."""
+"""Each round multiplies the error by the pupil's movement over the board's distance."""
 
 
 def cam_from_seen_board(camera: Camera, pixels: Pixels, points_mm: Points) -> Rigid3:
-    """Return the pose of a board with corners `points_mm` (N, 3) at `pixels` (N, 2), by those that the lens can see.
+    """Return the pose of a board with corners `points_mm` (N, 3) at `pixels` (N, 2), from those in the field of view.
 
     Raises as `board_pose`: DegenerateError for fewer than four, or collinear ones.
     """
@@ -26,8 +26,8 @@ def cam_from_seen_board(camera: Camera, pixels: Pixels, points_mm: Points) -> Ri
 
 
 def board_with_fixed_pupil(camera: NearCamera, pixels: Pixels, points_mm: Points) -> Pixels:
-    """Return where a board's corners `points_mm` (N, 3), seen at `pixels` (N, 2), would lie if the pupil did not move:
-    for whatever takes the lens for central. Corners that the lens cannot see stay where they are.
+    """Return the pixels (N, 2) that a board's corners `points_mm` (N, 3), seen at `pixels` (N, 2), would have if the
+    pupil did not move, for functions that assume a central lens. Corners outside the field of view are not changed.
 
     Raises as `board_pose`.
     """
@@ -35,14 +35,14 @@ def board_with_fixed_pupil(camera: NearCamera, pixels: Pixels, points_mm: Points
 
 
 def _settled(camera: NearCamera, pixels: Pixels, points_mm: Points) -> tuple[Pixels, Rigid3]:
-    """Return the corners of `board_with_fixed_pupil`, and the pose of the board that they and the pupil show."""
+    """Return the corners of `board_with_fixed_pupil`, and the pose of the board."""
     out, pose = pixels, cam_from_seen_board(camera.lens, pixels, points_mm)
     for _ in range(MAX_PUPIL_ROUNDS):
         moved = camera.as_with_fixed_pupil(pixels, pose.apply(points_mm))
         moved = np.where(np.isfinite(moved), moved, pixels)
         change = float(np.abs(moved - out).max())
         out = moved
-        # Sought from where it was: with a pose anew in each round all takes 1.8 times as long.
+        # Refined from the last pose: estimating it from scratch in each round takes 1.8 times as long.
         rays, valid = camera.lens.unproject(out)
         pose = moved_board_poses(rays[valid][None], points_mm[valid], pose)[0].cam_from_board
         if change <= SETTLED_PX:

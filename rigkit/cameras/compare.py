@@ -1,7 +1,7 @@
-"""The difference of two cameras over the image, after the rotation that a recalibration leaves open.
+"""The difference of two cameras over the image, in pixels, after the rotation that fits best.
 
-Two calibrations of one camera may differ by a rotation that all board poses take up: it is no error. What is left over
-the image, in pixels, is. As mrcal does (D. Kogan, "A tour of mrcal: differencing"), written anew.
+Two calibrations of one camera may differ by a rotation that all board poses absorb, which is no error. The method is
+that of mrcal (D. Kogan, "A tour of mrcal: differencing"), with code of our own.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from rigkit.geometry.rotation import exp_so3, nearest_rotation, rotation_angle, 
 
 MAX_ROTATION_STEPS = 20
 ROTATION_SETTLED_RAD = 1e-12
-"""The fit of the rotation stops at steps that move no pixel by a millionth."""
+"""The fit of the rotation stops at smaller steps, which move no pixel by a millionth."""
 MIN_PIXELS = 20
-"""Fewer common pixels say nothing about the image."""
+"""Fewest common pixels for a comparison."""
 MAX_WEIGHT = 1e150
 MAX_GRID = 10_000
-"""Of a map's columns and rows: more than any image has pixels to show."""
+"""Most columns or rows of a map."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraDifference:
-    """Where camera b sees what camera a sees, minus where camera a sees it.
+    """The projection by camera b minus that by camera a, along the rays of camera a.
 
     Attributes
     ----------
     pixels : (rows, columns, 2) the grid in the image of camera a.
     difference_px : (rows, columns, 2), NaN where not covered.
-    covered : (rows, columns) both cameras see the ray (and the caller's mask holds).
-    b_from_a : (3, 3) the rotation taken out: x_in_b = b_from_a @ x_in_a.
+    covered : (rows, columns) where the ray is in the field of view of both cameras (and in the caller's mask).
+    b_from_a : (3, 3) the fitted rotation: x_in_b = b_from_a @ x_in_a.
     """
 
     pixels: Pixels
@@ -55,7 +55,7 @@ class CameraDifference:
 
     @property
     def rms_px(self) -> float:
-        """Root of the mean squared length over the covered pixels."""
+        """Root mean square length over the covered pixels."""
         return float(np.sqrt(np.mean(self.map_px[self.covered] ** 2)))
 
     @property
@@ -64,7 +64,7 @@ class CameraDifference:
 
     @property
     def rotation_deg(self) -> float:
-        """Angle of the rotation that was taken out."""
+        """Angle of the fitted rotation."""
         return float(np.degrees(rotation_angle(self.b_from_a)))
 
     @property
@@ -91,9 +91,9 @@ def compare_cameras(
     ----------
     a, b : cameras of any models and of one image size.
     grid : (columns, rows) of the map, spread evenly from corner pixel to corner pixel.
-    mask : (rows, columns) where the boards of the calibration were: elsewhere both cameras extrapolate.
-    fit_rotation : take out the rotation that makes the sum of the squared differences least.
-    weights : (rows, columns) of the squared differences in that fit, such as the inverse variances predicted.
+    mask : (rows, columns) pixels to compare, such as those that boards of the calibration covered.
+    fit_rotation : whether the rotation that minimises the sum of the squared differences is applied.
+    weights : (rows, columns) of the squared differences in that fit, such as the inverse of predicted variances.
     """
     if a.size_px != b.size_px:
         raise InputError(f"cameras of {a.size_px} and {b.size_px} px cannot be compared; calibrate at one image size")
@@ -124,7 +124,7 @@ def compare_cameras(
 
 
 def _checked_grid(grid: tuple[int, int]) -> tuple[int, int]:
-    """Return (columns, rows) as integers; InputError for what cannot be the counts of a map."""
+    """Return (columns, rows) as integers; raises InputError for invalid counts."""
     numbers = as_array(grid, (2,), "grid")
     if not ((numbers == np.rint(numbers)) & (numbers >= 1) & (numbers <= MAX_GRID)).all():
         raise InputError(f"grid: columns and rows must be whole numbers from 1 to {MAX_GRID}, got {grid}")
@@ -138,10 +138,9 @@ def grid_pixels(size_px: tuple[int, int], grid: tuple[int, int]) -> Pixels:
 
 
 def best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: Camera) -> Mat3:
-    """Return the rotation b_from_a at which `b` projects `rays` nearest to `pixels`: rays first, then pixels.
+    """Return the rotation b_from_a with which `b` projects `rays` (N, 3) closest to `pixels` (N, 2).
 
-    Undamped Gauss-Newton: the fit of the rays starts it within pixels of the end, with hundreds of rays for three
-    unknowns.
+    Undamped Gauss-Newton from the rotation that fits the rays, which is within pixels of the solution.
     """
     rays_b, seen = b.unproject(pixels)
     covariance = np.einsum("n,ni,nj->ij", weight[seen], rays_b[seen], rays[seen])
@@ -151,7 +150,7 @@ def best_rotation(rays: FloatArray, pixels: FloatArray, weight: FloatArray, b: C
         projected, valid, d_pixels_d_point, _ = b.project_with_jacobians(turned)
         if valid.sum() < 3:
             break
-        # d pixel / d w for the turn exp([w]x) on the left: J d(w x ray) = -J [ray]x w.
+        # d pixel / d w for the left rotation exp([w]x): J d(w x ray) = -J [ray]x w.
         by_turn = -d_pixels_d_point[valid] @ skew(turned[valid])
         residual = projected[valid] - pixels[valid]
         w = weight[valid]

@@ -1,4 +1,4 @@
-"""The nearest camera of another model: for exchange with programs that lack the model, and for comparisons."""
+"""Conversion of a camera to another model, for programs that lack its model, and for comparisons."""
 
 from __future__ import annotations
 
@@ -15,35 +15,36 @@ from rigkit.core.errors import InputError
 from rigkit.optim.damping import Stop
 
 CONVERT_GRID = (64, 48)
-"""Pixels of the source at which the two cameras are held against each other."""
+"""Columns and rows of pixels of the source at which the two cameras are compared."""
 MIN_COVERED_SAMPLES = 60
 LIMITS_RAD = (np.pi, *np.radians([80.0, 70.0, 60.0, 50.0, 40.0]))
-"""Angles from the axis out to which a model is fitted: the widest at which it follows the lens."""
+"""Angles from the axis up to which a model is fitted: the largest at which its error is small is taken."""
 FOLLOWS_PX = 1.0
-"""A model follows the lens where its largest error is below this."""
+"""Largest error of a model that represents the lens."""
 WIDE_RAD = np.radians(60.0)
-"""Narrower limits are tried for perspective models of lenses that reach beyond this; others are to hold everywhere."""
+"""Smaller limits are tried for perspective models of lenses that are wider than this; others are fitted everywhere."""
 MAX_CONVERT_STEPS = 60
 CONVERT_SETTLED = 1e-10
-"""The fit stops where a step gains less than this share of the cost,"""
+"""Relative decrease of the cost at which the fit stops."""
 OUTSIDE_WEIGHT = 0.02
-"""An error outside the outline of what was seen counts by this much: there the lens is but extrapolated."""
+"""Weight of errors outside the outline of the calibration's corners, where the lens is extrapolated."""
 ROUNDING_PX = 1e-10
-"""or where pixels are met this well."""
+"""Error at which the fit stops: rounding."""
 INSIDE = 0.995
-"""Rays within this share of the start's field of view take part: at its edge the derivatives have no end."""
+"""Part of the initial camera's field of view that is fitted: at its edge the derivatives diverge."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Conversion:
-    """A camera in place of another one.
+    """A camera that replaces another one.
 
     Attributes
     ----------
-    max_px, rms_px : error of projection over the part of the image that the new camera covers, inside the outline.
-    outside_px : largest error of projection over the rest of that part; 0 without an outline.
-    covered : that part, as a share of the pixels that the source covers.
-    reach_rad : that part, as an angle from the optical axis; pi where nothing was left out.
+    camera : the new camera.
+    max_px, rms_px : its projection error inside the outline, where it covers the image.
+    outside_px : its largest projection error outside the outline; 0 without an outline.
+    covered : part of the source's pixels that it covers.
+    reach_rad : largest angle from the axis that was fitted; pi for all.
     """
 
     camera: Camera
@@ -57,14 +58,14 @@ class Conversion:
 def convert_camera(
     camera: Camera, model: str, *, order: int | None = None, outline: Pixels | None = None
 ) -> Conversion:
-    """Return the camera of `model` nearest to `camera` over its image, in the same frame: poses stay as they are.
+    """Return the camera of `model` that fits `camera` best over its image, in the same frame: poses do not change.
 
-    Raises InputError: `model` is unknown, or the model cannot follow the lens at all.
+    Raises InputError: `model` is unknown, or cannot represent the lens at all.
 
     Parameters
     ----------
     order : Brown's number of terms or Scaramuzza's degree, as in `Camera.from_radial_curve`.
-    outline : (N, 2) convex, of the part of the image where the camera is known, which then counts; None: all of it.
+    outline : (N, 2) convex hull of the calibration's corners, inside which errors count most; None: whole image.
     """
     pixels = grid_pixels(camera.size_px, CONVERT_GRID).reshape(-1, 2)
     rays, valid = camera.unproject(pixels)
@@ -87,7 +88,7 @@ def convert_camera(
         except InputError:
             continue
         fitted = refit_camera(start, rays[near], pixels[near], weight=weight[near])
-        trial = _held_against(fitted, rays, pixels, near, inside, float(limit))
+        trial = _compared(fitted, rays, pixels, near, inside, float(limit))
         if found is None or trial.max_px < found.max_px:
             found = trial
         if found.max_px < FOLLOWS_PX or fitted.max_angle_rad > np.pi / 2 or theta.max() < WIDE_RAD:
@@ -97,10 +98,11 @@ def convert_camera(
     return found
 
 
-def _held_against(
+def _compared(
     fitted: Camera, rays: Rays, pixels: Pixels, near: BoolArray, inside: BoolArray, limit_rad: float
 ) -> Conversion:
-    """Return the conversion into `fitted`, its errors at the rays `near` the axis, those `inside` the outline apart."""
+    """Return the conversion to `fitted`, with its errors at the rays `near` the axis, inside and outside the
+    outline."""
     projected, seen = fitted.project(rays)
     error_px = np.linalg.norm(projected - pixels, axis=-1)
     seen &= near
@@ -121,21 +123,19 @@ def fit_camera(
     *,
     order: int | None = None,
 ) -> Camera:
-    """Return the camera of `model` that projects `rays` (N, 3) nearest to `pixels` (N, 2), by least squares.
+    """Return the camera of `model` that projects `rays` (N, 3) closest to `pixels` (N, 2), by least squares.
 
-    Started from the radial curve around `centre_px`. Rays that the model cannot see are left out.
-    Raises InputError where the model has no start for this lens.
+    The initial values come from the radial curve around `centre_px`. Rays outside the model's field of view are left
+    out. Raises InputError where the model cannot represent the curve.
     """
-    theta = _off_axis_rad(rays)
-    start = _start(model, size_px, theta, pixels, centre_px, order)
-    return refit_camera(start, rays, pixels)
+    return refit_camera(_start(model, size_px, _off_axis_rad(rays), pixels, centre_px, order), rays, pixels)
 
 
 def refit_camera(start: Camera, rays: Rays, pixels: Pixels, *, weight: FloatArray | None = None) -> Camera:
-    """Return `start` with the parameters that project `rays` (N, 3) nearest to `pixels` (N, 2).
+    """Return `start` with the parameters that project `rays` (N, 3) closest to `pixels` (N, 2).
 
-    Rays that the start cannot see, or only at the edge of its field of view, are left out; `weight` (N,) is that of
-    each error, None: all count alike.
+    Rays outside the field of view of `start`, or at its edge, are left out; `weight` (N,) is that of each error, 1 by
+    default.
     """
     weight = np.ones(len(rays)) if weight is None else weight
     theta = _off_axis_rad(rays)
@@ -152,7 +152,7 @@ def _off_axis_rad(rays: Rays) -> FloatArray:
 
 
 def _inside(outline: Pixels, pixels: Pixels) -> BoolArray:
-    """Say which of `pixels` (..., 2) lie inside a convex `outline` (N, 2), in whichever sense it turns, (...,)."""
+    """Return which of `pixels` (..., 2) are inside a convex `outline` (N, 2) of either orientation, (...,)."""
     side = np.roll(outline, -1, axis=0) - outline
     to = pixels[..., None, :] - outline
     turn = side[:, 0] * to[..., 1] - side[:, 1] * to[..., 0]
@@ -167,7 +167,7 @@ def _start(
     centre: FloatArray,
     order: int | None,
 ) -> Camera:
-    """Return a first camera from the radial curve: means over rings of equal width in the angle."""
+    """Return the initial camera from the radial curve of means over rings of equal width in the angle."""
     radius = np.linalg.norm(pixels - centre, axis=-1)
     edges = np.linspace(0.0, theta.max() * (1.0 + 1e-9), MIN_COVERED_SAMPLES + 1)
     ring = np.digitize(theta, edges) - 1

@@ -1,4 +1,4 @@
-"""The camera whose projection is nearest to given pixels: damped least squares over some of its parameters."""
+"""Fit of a camera's parameters to given pixels of given points, by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from rigkit.optim.levenberg_marquardt import DenseStep, LinearisedProblem, dampe
 
 FIT_DAMPING = Damping(start=1e-6, ceiling=1e6)
 HALVINGS = 8
-"""A step out of the model's domain is halved until it is inside, so many times at the most."""
+"""Maximal number of halvings of a step that leads to invalid parameters."""
 
 C = TypeVar("C", bound=Camera)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Projection(LinearisedProblem, Generic[C]):
-    """A camera against pixels (N, 2) of points (N, 3), weighted (N,), moved along the columns of `free` (P, F)."""
+    """The fit of a camera to pixels (N, 2) of points (N, 3), weighted (N,), in the columns of `free` (P, F)."""
 
     camera: C
     points: Points
@@ -33,12 +33,12 @@ class _Projection(LinearisedProblem, Generic[C]):
 
     @property
     def cost(self) -> float:
-        """Sum of squared errors, infinite where a point is not seen."""
+        """Sum of squared errors, infinite where a point is outside the field of view."""
         return self.sum_of_squares
 
     def step(self, damping: float) -> DenseStep | None:
         projected, _, _, d_pixels_d_parameters = self.camera.project_with_jacobians(self.points)
-        # Long rows in memory, as cameras make them: two large products, not thousands of small ones.
+        # Long rows in memory: two large products, not thousands of small ones.
         by_parameter = np.moveaxis(d_pixels_d_parameters, (-2, -1), (0, 1))
         jacobian = np.empty((self.free.shape[1], 2, len(self.points)))
         for axis in (0, 1):
@@ -50,10 +50,10 @@ class _Projection(LinearisedProblem, Generic[C]):
 def nearest_camera(
     start: C, points: Points, pixels: Pixels, free: FloatArray, stop: Stop, weight: FloatArray | None = None
 ) -> tuple[C, float]:
-    """Return the camera near `start` that projects points (N, 3) nearest to pixels (N, 2), and the sum of squares.
+    """Return the camera near `start` that projects points (N, 3) closest to pixels (N, 2), and the sum of squares.
 
-    `free` (P, F) are the directions in which its parameters change, `weight` (N,) is that of each error. The sum is
-    infinite where the start does not see all points.
+    Columns of `free` (P, F) are the directions in which its parameters may change, `weight` (N,) is that of each error.
+    The sum is infinite where not all points are in the field of view of `start`.
     """
     weight = np.ones(len(points)) if weight is None else weight
 

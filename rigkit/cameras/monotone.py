@@ -11,10 +11,10 @@ from rigkit.core.errors import InputError
 from rigkit.kernels.monotone import inverses, smallest_root
 
 CELLS_PER_KNOT = 4
-"""The table is looked up in equal cells of the target, found by a division instead of a search."""
+"""Resolution of the table of initial values: equal cells of the target, found by a division instead of a search."""
 
 KNOTS = 129
-"""Samples of a radial curve from which its inverse starts; Newton does the rest."""
+"""Samples of a radial curve that give initial values of its inverse for Newton's method."""
 
 
 def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
@@ -31,10 +31,10 @@ def horner(coefficients: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def first_root(coefficients: FloatArray, limit: float) -> float:
-    """Return the smallest root in (0, `limit`] of the polynomials sum_k coefficients[..., k] x^k, (..., K) of them, or
-    `limit` where there is none. They must not vanish at zero.
+    """Return the smallest root in (0, `limit`] of all the polynomials sum_k coefficients[..., k] x^k, or `limit` if
+    there is none. They must not vanish at zero.
 
-    Raises InputError where a polynomial overflows: what a solver tries may be far from any lens.
+    Raises InputError where a polynomial overflows: a solver may try parameters far from any lens.
     """
     root = smallest_root(np.atleast_2d(coefficients), limit)
     if math.isnan(root):
@@ -49,15 +49,14 @@ def invert_increasing(
     knots: FloatArray,
     values: FloatArray,
 ) -> FloatArray:
-    """Return x (N,) with linear x + factor P(x) = offset, where that increases in x, by Newton's method kept inside a
-    bracket.
+    """Return x (N,) with linear x + factor P(x) = offset, where that increases in x, by Newton's method in a bracket.
 
     Parameters
     ----------
     polynomial : coefficients of P, of the power zero first.
     parts : linear, factor and offset, (N,) each.
-    target : (N,) values in [values[0], values[-1]] of a function of x; the caller replaces what is outside, and NaN.
-    knots, values : (K,) a table of that function, both increasing: it gives the bracket and the start.
+    target : (N,) values in [values[0], values[-1]] of a function of x; the caller has to replace others and NaN.
+    knots, values : (K,) a table of that function, both increasing, for brackets and initial values.
     """
     cells = CELLS_PER_KNOT * (knots.size - 1)
     ends = float(values[0]), float(values[-1])

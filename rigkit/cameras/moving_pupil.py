@@ -1,15 +1,15 @@
-"""A lens that does not look from one point, before points at a finite distance.
+"""A lens with a moving entrance pupil, which is not central for points at a finite distance.
 
-Wide lenses see what is at the angle t from their axis from a place on it that moves with t: their entrance pupil is at
+The entrance pupil of wide lenses moves with the angle t of a ray from the axis, by
 
-    s(t) = e1 t^2 + e2 t^4        mm along the optical axis, forwards,
+    s(t) = e1 t^2 + e2 t^4        mm forwards along the optical axis.
 
-from where it is on the axis. The ray of a pixel keeps its direction, which the central camera has; it starts at
-(0, 0, s). Far away that is nothing, and the central camera is exact. A point p is seen at the angle t for which
+The ray of a pixel has the direction given by the central camera, and starts at (0, 0, s). For far points the pupil has
+no effect, and the central camera is exact. A point p is seen at the angle t for which
 
     p - s(t) (0, 0, 1)        is at the angle t,
 
-solved by Newton's rule; a point so near that several rays meet it is not seen.
+which Newton's method solves; a point so near that it is on several rays is invalid.
 
 Reference: D. B. Gennery, "Generalized camera calibration including fish-eye lenses", IJCV 68 (2006), section 2, the E
 terms of CAHVORE.
@@ -29,25 +29,25 @@ from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Pixels, Point
 PUPIL_TERMS = 2
 PUPIL_NAMES = ("pupil_mm_per_rad2", "pupil_mm_per_rad4")
 MAX_NEWTON_ROUNDS, ROUNDING_RAD = 12, 1e-13
-"""Newton's rule doubles its digits: points not nearer than the pupil moves need four to six rounds."""
+"""Newton's method needs four to six rounds for points farther than the pupil moves."""
 
 
 def pupil_shift_mm(theta_rad: FloatArray, pupil: FloatArray) -> FloatArray:
-    """Return how far (...,) the pupil (2,) has moved along the axis at angles (...,) from it."""
+    """Return the movement (...,) mm of the pupil (2,) along the axis at angles (...,) from it."""
     square = theta_rad * theta_rad
     return np.asarray(square * (pupil[0] + pupil[1] * square))
 
 
 def pupil_shift_of_rays_mm(rays: Rays, pupil: FloatArray) -> FloatArray:
-    """Return how far (...,) along the axis rays (..., 3) of a lens with this pupil (2,) start."""
+    """Return the position (...,) mm on the axis at which rays (..., 3) of a lens with this pupil (2,) start."""
     return pupil_shift_mm(np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2]), pupil)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class NearCamera(Camera):
-    """The camera of points in mm: `project` and all derivatives take the length of a point for its distance, unlike
-    those of other cameras. `parameters` are those of its `lens`, the central camera of what is far away, and the
-    pupil's two terms. `unproject` returns the directions of rays, the lens's own."""
+    """The camera that projects points in mm: unlike other cameras, its `project` and derivatives depend on the distance
+    of a point. `parameters` are those of its `lens`, the central camera for far points, and the two terms of the pupil.
+    `unproject` returns the directions of rays, those of the lens."""
 
     lens: Camera
 
@@ -78,7 +78,7 @@ class NearCamera(Camera):
     def max_angle_rad(self) -> float:
         return self.lens.max_angle_rad
 
-    # Rays have directions alone: what is asked of them is the lens's.
+    # Directions of rays are those of the lens.
     def ray_jacobian(self, pixels: Pixels) -> RayJacobians:
         return self.lens.ray_jacobian(pixels)
 
@@ -91,22 +91,22 @@ class NearCamera(Camera):
         return self.lens.focal_px
 
     def seen(self, points: Points) -> Points:
-        """Return points (N, 3) as from the pupil that sees each: the central camera shows these where it shows those;
-        NaN where a point is too near."""
+        """Return points (N, 3) relative to the entrance pupil of their own ray, so that the central lens projects them
+        to the same pixels; NaN where a point is too near."""
         x, y, z = points.T
         _, ahead, _, _, valid = self._through_pupil(x, y, z)
         return np.where(valid[:, None], np.stack([x, y, ahead], axis=1), np.nan)
 
     def as_with_fixed_pupil(self, pixels: Pixels, points: Points) -> Pixels:
-        """Return where the pixels (N, 2) that show points (N, 3) at known places would lie if the pupil did not move;
-        NaN where a point is not seen."""
+        """Return the pixels (N, 2) that points (N, 3), measured at `pixels` (N, 2), would have if the pupil did not
+        move; NaN where a point is invalid."""
         return np.asarray(pixels - self.project(points)[0] + self.lens.project(points)[0])
 
     def _through_pupil(
         self, x: FloatArray, y: FloatArray, z: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return the distance from the axis, how far before their pupil points are, at which angle, ds / dt there, and
-        which are not too near; all (N,)."""
+        """Return the distance of points from the axis, their z relative to their pupil, their angle, ds / dt there, and
+        which are valid; all (N,)."""
         e1, e2 = self.pupil.tolist()
         across = np.hypot(x, y)
         theta = np.arctan2(across, z)
@@ -122,7 +122,7 @@ class NearCamera(Camera):
         ahead, slope = z - square * (e1 + e2 * square), theta * (2.0 * e1 + 4.0 * e2 * square)
         sine = np.sin(theta)
         along = across * sine + ahead * np.cos(theta)
-        # Along the ray the next one is met behind the point.
+        # The ray crosses its neighbours in front of the point, not behind it.
         valid = (np.abs(step) <= 1e3 * ROUNDING_RAD) & (along > np.abs(slope * sine)) & (theta >= 0.0)
         return across, ahead, theta, slope, valid
 
@@ -141,7 +141,7 @@ class NearCamera(Camera):
         across, ahead, theta, slope, near = self._through_pupil(x, y, z)
         of_lens = None if d_pixels_d_parameters is None else d_pixels_d_parameters[:, :-PUPIL_TERMS]
         u, v, valid = self.lens._derivatives((x, y, ahead), d_pixels_d_point, of_lens)
-        # With c = (t^2, t^4), g the gradient of the angle at the point before its pupil, and R its distance:
+        # With c = (t^2, t^4), g the gradient of the angle at the point relative to its pupil, and R its distance:
         # ds = s' dt + c de and dt = g dp + rho / R^2 ds give ds = (s' g dp + c de) / (1 - s' rho / R^2).
         distance = across * across + ahead * ahead
         grown = 1.0 / (1.0 - slope * across / distance)
@@ -159,8 +159,8 @@ class NearCamera(Camera):
 
 
 def as_other_with_fixed_pupil(pixels: Pixels, points: Points, camera: Camera, other: Camera) -> Pixels:
-    """Return pixels (N, 2) of points (N, 3), which are `as_with_fixed_pupil` by a camera, as they are by another
-    that saw the same; the pixels where one of the two is central, and of points that are not seen."""
+    """Return pixels (N, 2) of points (N, 3), given `as_with_fixed_pupil` of `camera`, as those of `other`, which saw
+    the same image. Pixels of invalid points, and all if one camera is central, are returned unchanged."""
     if not (isinstance(camera, NearCamera) and isinstance(other, NearCamera)):
         return pixels
     seen = pixels - camera.as_with_fixed_pupil(np.zeros_like(pixels), points)
@@ -174,5 +174,5 @@ def with_pupil_of(lens: Camera, camera: Camera) -> Camera:
 
 
 def far_camera(camera: Camera) -> Camera:
-    """Return the central camera that is exact far away: of one with a moving pupil its lens, else the camera."""
+    """Return the central camera for far points: the lens of a `NearCamera`, else the camera itself."""
     return camera.lens if isinstance(camera, NearCamera) else camera

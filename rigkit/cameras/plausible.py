@@ -1,5 +1,5 @@
-"""What no lens can be, told of cameras that come from files: numbers that were mistyped, damaged or left in another
-unit would only overflow later, in the middle of some computation."""
+"""Plausibility check of cameras from files: parameters that were mistyped, damaged or in another unit would overflow
+later in some computation."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from rigkit.cameras.base import MAX_SIDE_PX, Camera
 from rigkit.cameras.compare import grid_pixels
 
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e7
-"""A pixel that sees a radian, and one that sees a fiftieth of an arc second."""
+"""A pixel of one radian, and one of a fiftieth of an arc second."""
 MAX_FOCAL_RATIO = 100.0
 """Of the focal lengths along x and y; line scanners have tens."""
 ASKED_PIXELS = (32, 24)
-"""Pixels, spread over the image, that are asked what they see."""
+"""Columns and rows of pixels that are unprojected and projected again."""
 MIN_ANSWERS = 4
-"""Of those."""
+"""Fewest of those that must return to themselves."""
 
 
 def fault_of_lens(camera: Camera) -> str | None:
-    """Return what shows that no lens has these parameters, in words; None where nothing does.
+    """Return words for why no lens can have these parameters; None if they are plausible.
 
-    Looked at are the pixel on the optical axis, how many pixels a radian takes there, and how much of the image is
-    seen at all: by a ray that comes back to its pixel.
+    Tested are the pixel of the optical axis, the focal lengths there, and which pixels have a ray that projects back to
+    them.
     """
     with np.errstate(all="ignore"):
         pixels, valid, d_pixels_d_point, _ = camera.project_with_jacobians(np.array([[0.0, 0.0, 1.0]]))

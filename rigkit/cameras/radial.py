@@ -1,7 +1,7 @@
-"""Cameras that look the same in every direction around the axis: pixel = L s(r, z) (x, y) + centre.
+"""Radially symmetric cameras: pixel = L s(r, z) (x, y) + centre.
 
-r = |(x, y)|, s is the model's own scale, homogeneous of degree -1; L is diag(fx, fy), or Scaramuzza's affine part.
-A model supplies s with its derivatives and the inverse profile; everything else is here.
+r = |(x, y)|, s is the model's scale, homogeneous of degree -1; L is diag(fx, fy), or Scaramuzza's affine part. A model
+implements s with its derivatives and the inverse profile; everything else is here.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class ScaleDerivatives(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class RadialCamera(Camera):
-    """What radially symmetric models have in common; see the module."""
+    """Common part of radially symmetric models; see the module."""
 
     @abstractmethod
     def _profile(self, radius2: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return sin(theta) / radius, cos(theta) and valid, from the squared radius |s (x, y)|^2."""
 
     def _linear(self) -> tuple[float, float, float, float, float]:
-        """Return l00, l01, l11 of L (l10 = 0) and the centre: of a model that begins with fx, fy, cx, cy."""
+        """Return l00, l01, l11 of L (l10 = 0) and the centre; here for parameters that begin with fx, fy, cx, cy."""
         fx, fy, cx, cy = self.parameters[:4].tolist()
         return fx, 0.0, fy, cx, cy
 
@@ -56,11 +56,11 @@ class RadialCamera(Camera):
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class CompiledCamera(RadialCamera):
-    """Radial models whose formulas are a kernel in radial.c, of the model's name."""
+    """Radial models whose formulas are in the kernel of their name in radial.c."""
 
     @abstractmethod
     def _shape(self) -> tuple[FloatArray, tuple[float, float]]:
-        """Return the polynomial and the limits that `radial_pixels` asks for."""
+        """Return the polynomial and the limits for `radial_pixels`."""
 
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         polynomial, limits = self._shape()
@@ -84,7 +84,7 @@ class FocalCamera(RadialCamera):
 
     @abstractmethod
     def _scale_derivatives(self, r2: FloatArray, z: FloatArray, shape: bool) -> ScaleDerivatives:
-        """Return s with its derivatives; those by the shape parameters only where asked for."""
+        """Return s with its derivatives, with those by the shape parameters if `shape`."""
 
     def _project(self, x: FloatArray, y: FloatArray, z: FloatArray) -> Projected:
         scale, valid = self._scale(x * x + y * y, z)
@@ -120,9 +120,10 @@ _Focal = TypeVar("_Focal", bound=FocalCamera)
 def fit_shape(
     model: type[_Focal], size_px: tuple[int, int], curve: RadialCurve, starts: Sequence[Sequence[float]]
 ) -> _Focal:
-    """Return the camera of `model` nearest to the curve: one focal length and its shape, by least squares.
+    """Return the camera of `model` that fits the curve best: one focal length and its shape, by least squares.
 
-    Each of `starts` is a shape; the best end is returned. Raises InputError where no start sees the whole curve.
+    `starts` are initial shapes, of which the best result is returned. Raises InputError where the field of view of none
+    includes the whole curve.
     """
     theta, centre = curve.theta_rad, curve.centre_px
     points = np.stack([np.sin(theta), np.zeros_like(theta), np.cos(theta)], axis=-1)
@@ -135,7 +136,7 @@ def fit_shape(
             continue
         radius = reached[:, 0] - centre[0]
         focal = float(radius @ curve.radius_px / (radius @ radius))
-        # One focal length along both axes, and the shape; the centre stays.
+        # One focal length for both axes, and the shape; the centre is held.
         free = np.eye(camera.parameters.size)[:, [0, *range(4, camera.parameters.size)]]
         free[1, 0] = 1.0
         camera = camera.with_parameters([focal, focal, *camera.parameters[2:]])

@@ -1,4 +1,4 @@
-"""Cameras and how sure they are: what all that is measured with them propagates."""
+"""Cameras with covariance, for everything that propagates it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy as np
 from rigkit.cameras.base import Camera
 from rigkit.core.arrays import FloatArray
 from rigkit.geometry.principal_axes import principal_axes
+from rigkit.geometry.relative_pose import relative_pose, relative_pose_jacobian
 from rigkit.geometry.rigid3 import Rigid3
-from rigkit.geometry.rotation import exp_so3, skew
+from rigkit.geometry.rotation import exp_so3
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -23,14 +24,14 @@ class UncertainCamera:
     covariance: FloatArray
 
     def moved(self) -> list[Camera]:
-        """Return the camera moved by one standard deviation along each principal axis of the covariance. The axes are
-        independent: the squares of what they change in a quantity add up to its variance."""
+        """Return the camera changed by one standard deviation along each principal axis of the covariance. The axes are
+        independent: the variance of a quantity is the sum of its squared changes."""
         camera = self.camera
         return [camera.with_parameters(camera.parameters + axis) for axis in principal_axes(self.covariance)]
 
 
 class PosedPair(NamedTuple):
-    """Two cameras, and the pose between them, mm."""
+    """Two cameras and their relative pose, mm."""
 
     camera1: Camera
     camera2: Camera
@@ -39,15 +40,14 @@ class PosedPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class UncertainPair:
-    """Two cameras on one mount and the covariance (P, P) of the parameters of both and of the pose between them: left
-    rotation perturbation, rad, and translation, mm. What lenses and mount err by together is in it."""
+    """Two cameras on one mount and the joint covariance (P, P) of the parameters of both and of the relative pose: left
+    rotation perturbation, rad, and translation, mm."""
 
     posed: PosedPair
     covariance: FloatArray
 
     def moved(self) -> list[PosedPair]:
-        """Return the pair moved by one standard deviation along each principal axis of the covariance, see
-        `UncertainCamera.moved`."""
+        """Return the pair changed by one standard deviation along each principal axis, as `UncertainCamera.moved`."""
         one, two, pose = self.posed
         end1 = one.parameters.size
         end2 = end1 + two.parameters.size
@@ -63,11 +63,11 @@ class UncertainPair:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class UncertainRig:
-    """Cameras of a rig and how sure they are.
+    """Cameras of a rig with covariance.
 
     Attributes
     ----------
-    cameras, cam_from_rig : of all cameras, the first is the rig's frame.
+    cameras, cam_from_rig : all cameras with their mounts; the first defines the rig's frame.
     covariance : (G, G) of the parameters, camera by camera, then of the mounts of all cameras but the first: left
         rotation perturbation, rad, and translation, mm.
     scale_sigma : relative standard deviation of all lengths.
@@ -79,16 +79,13 @@ class UncertainRig:
     scale_sigma: float = 0.0
 
     def pair(self, first: int, second: int) -> UncertainPair:
-        """Return two of the cameras, and how sure they and the pose between them are."""
+        """Return two of the cameras with the joint covariance of their parameters and relative pose."""
         ends = np.cumsum([0, *(camera.parameters.size for camera in self.cameras)])
         unknowns = np.eye(len(self.covariance))
-        pose = self.cam_from_rig[second] @ self.cam_from_rig[first].inverse()
-        # How R2 R1^T and t2 - R2 R1^T t1 move with each mount, R <- exp(w) R, t <- t + dt.
-        turn, arm = pose.rotation, skew(pose.rotation @ self.cam_from_rig[first].translation_mm)
-        by_first = np.block([[-turn, np.zeros((3, 3))], [-arm @ turn, -turn]])
-        by_second = np.block([[np.eye(3), np.zeros((3, 3))], [arm, np.eye(3)]])
+        mounts = self.cam_from_rig[first], self.cam_from_rig[second]
+        pose, by_mounts = relative_pose(*mounts), relative_pose_jacobian(*mounts)
         of_pose = np.zeros((6, len(unknowns)))
-        for k, by_mount in ((first, by_first), (second, by_second)):
+        for k, by_mount in zip((first, second), np.split(by_mounts, 2, axis=1), strict=True):
             if k > 0:
                 of_pose += by_mount @ unknowns[ends[-1] + 6 * (k - 1) :][:6]
         rows = np.concatenate([*(unknowns[ends[k] : ends[k + 1]] for k in (first, second)), of_pose])

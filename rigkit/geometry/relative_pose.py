@@ -1,4 +1,4 @@
-"""The relative pose of two cameras that see the same frame, and its covariance."""
+"""The relative pose of two cameras from their poses, and its covariance."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def relative_pose(cam1_from_world: Rigid3, cam2_from_world: Rigid3) -> Rigid3:
     return cam2_from_world @ cam1_from_world.inverse()
 
 
-def relative_pose_covariance(cam1_from_world: Rigid3, cam2_from_world: Rigid3, covariance: FloatArray) -> FloatArray:
-    """Return the (6, 6) covariance of cam2_from_cam1 from the joint (12, 12) one of both poses.
+def relative_pose_jacobian(cam1_from_world: Rigid3, cam2_from_world: Rigid3) -> FloatArray:
+    """Return the derivative (6, 12) of cam2_from_cam1 by both poses.
 
     Every pose is perturbed as R' = exp([w]x) R, t' = t + v, in the order (w, v), rad and mm; camera 1 first.
 
@@ -28,4 +28,11 @@ def relative_pose_covariance(cam1_from_world: Rigid3, cam2_from_world: Rigid3, c
     by_both[:3, 0:3], by_both[:3, 6:9] = -rotation, np.eye(3)
     by_both[3:] = skew(rotation @ cam1_from_world.translation_mm) @ by_both[:3]
     by_both[3:, 3:6], by_both[3:, 9:12] = -rotation, np.eye(3)
+    return by_both
+
+
+def relative_pose_covariance(cam1_from_world: Rigid3, cam2_from_world: Rigid3, covariance: FloatArray) -> FloatArray:
+    """Return the (6, 6) covariance of cam2_from_cam1 from the joint (12, 12) one of both poses, perturbed as in
+    `relative_pose_jacobian`."""
+    by_both = relative_pose_jacobian(cam1_from_world, cam2_from_world)
     return np.asarray(by_both @ covariance @ by_both.T)
