@@ -1,8 +1,8 @@
-"""Pose of a flat target from the unit rays of any central camera, fields of view beyond 180 degrees included.
+"""Pose of a planar target from unit rays of any central camera, also with a field of view beyond 180 degrees.
 
-The homography between target and rays comes linearly (rows `T_k H x_k = 0`, T_k a tangent basis at ray k), the pose
-from its columns. A flat target seen from afar has a second local optimum, tilted the other way; both are refined and
-the better one is kept. Nothing needs z > 0: "in front" means along the ray.
+The homography from target to rays is found linearly (rows `T_k H x_k = 0`, T_k a tangent basis at ray k), the pose from
+its columns. A distant planar target has a second local optimum with the opposite tilt (planar ambiguity); both are
+refined and the better one is returned. Points may have z < 0: "in front" means along the ray.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from rigkit.optim.batched import BatchedProblem, minimise_each
 from rigkit.optim.damping import Damping, Stop
 
 MIN_SPREAD = 1e-6
-"""Points are collinear where their second principal extent is below this part of the first."""
+"""Second principal extent over the first, below which points are collinear."""
 MIN_HOMOGRAPHY_GAP = 1e-9
-"""The homography is not unique where the second smallest singular value is below this part of the largest."""
+"""Second smallest singular value over the largest, below which the homography is not unique."""
 POSE_STEP_TOLERANCE = 1e-12
-"""Stop when a step gains less than this part of the cost, or moves the pose by less than this part of a radian."""
+"""Relative decrease of the cost, or change of the pose in radians, at which the refinement stops."""
 STOP = Stop(steps=50, gain=POSE_STEP_TOLERANCE)
 BOARD_DAMPING = Damping(start=1e-4, floor=1e-12, ceiling=1e6)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoardPose:
-    """Where a flat target stands.
+    """Pose of a planar target.
 
     Attributes
     ----------
     cam_from_board : the pose, mm.
     rms_rad : root mean square angle between measured and predicted rays (2-D per point), radians.
     covariance : (6, 6) of (w, v): R' = exp([w]x) R, t' = t + v, in rad and mm, in the camera frame. From `sigma_rad`
-        where given, otherwise scaled by the residual; NaN where there are no more equations than unknowns.
+        if given, otherwise scaled by the residuals; NaN without degrees of freedom.
     """
 
     cam_from_board: Rigid3
@@ -53,10 +53,10 @@ def facing_normal(cam_from_board: Rigid3) -> FloatArray:
 
 
 def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None) -> BoardPose:
-    """Return the pose of a flat target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
+    """Return the pose of a planar target from rays (N, 3) to its points (N, 3), mm; `sigma_rad` (N,) weights them.
 
-    Raises InputError: shapes that do not fit, values that are not finite, points that do not lie in a plane;
-    DegenerateError: fewer than four points, or points or rays that are (but for one) collinear.
+    Raises InputError: wrong shapes, values that are not finite, points that are not coplanar; DegenerateError: fewer
+    than four points, or points or rays of which all but one are collinear.
     """
     return board_poses(rays, points_mm, sigma_rad)[0]
 
@@ -64,10 +64,10 @@ def board_pose(rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = Non
 def board_poses(
     rays: Rays, points_mm: Points, sigma_rad: FloatArray | None = None, *, bases: FloatArray | None = None
 ) -> tuple[BoardPose, ...]:
-    """Return the local optima of `board_pose`, best first: one or two (the target tilted the other way).
+    """Return the local optima of `board_pose`, best first: one, or two with opposite tilts.
 
-    `bases` (N, 2, 3), rows perpendicular to the rays, set the unit of the residuals: orthonormal rows by default,
-    the pseudo-inverses of d ray / d pixel for pixels; sigma and rms are then pixels too. Else as `board_pose`.
+    `bases` (N, 2, 3), rows perpendicular to the rays, determine the unit of the residuals: radians for orthonormal rows
+    (default), pixels for the pseudo-inverses of d ray / d pixel; sigma and rms are then in pixels, too.
     """
     f = as_array(rays, (None, 3), "rays")
     n = len(f)
@@ -92,9 +92,9 @@ def board_poses(
 
 
 def moved_board_poses(rays: Rays, points_mm: Points, start: Rigid3) -> tuple[BoardPose, ...]:
-    """Return the poses of a flat target for M sets of rays (M, N, 3), each near the pose `start` found for one of them.
+    """Return the poses of a planar target for M sets of rays (M, N, 3), refined from the common initial pose `start`.
 
-    Much faster than `board_pose` for each, and always the same of two optima.
+    Much faster than `board_pose` for each, and always the same one of two optima.
     """
     f = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     plane_from_target, flat = _flatten(as_array(points_mm, (f.shape[1], 3), "points_mm"))
@@ -117,14 +117,14 @@ def _poses(
     plane_from_target: Rigid3,
     variance: float | None,
 ) -> tuple[BoardPose, ...]:
-    """Return the poses of a target from those of its plane (M, ...), with their rms and covariance."""
+    """Return the poses of a target, with rms and covariance, from those of its plane (M, ...)."""
     residual, jacobian = ray_residuals(rays, bases, flat, rotation, translation)
     rms = np.sqrt((residual**2).sum(axis=-1).mean(axis=-1))
     jacobian = jacobian * weight[:, None, None]
     poses = []
     for k, cam_from_plane in enumerate(Rigid3.stack(rotation, translation)):
         covariance = _covariance(jacobian[k], cost[k], variance)
-        # t = t_plane + R_plane m, so a turn moves t too: v = v_plane - [R_plane m]x w.
+        # t = t_plane + R_plane m, so a rotation changes t, too: v = v_plane - [R_plane m]x w.
         shift = np.eye(6)
         shift[3:, :3] = -skew(rotation[k] @ plane_from_target.translation_mm)
         poses.append(BoardPose(cam_from_plane @ plane_from_target, float(rms[k]), shift @ covariance @ shift.T))
@@ -132,7 +132,7 @@ def _poses(
 
 
 def tangent_bases(rays: Rays) -> FloatArray:
-    """Return (..., 2, 3): two orthonormal rows perpendicular to each unit ray, smooth but for one direction (-z)."""
+    """Return (..., 2, 3): two orthonormal rows perpendicular to each unit ray, smooth except at -z."""
     x, y, z = np.moveaxis(np.asarray(rays, dtype=np.float64), -1, 0)
     sign = np.where(z < 0.0, -1.0, 1.0)
     a = -1.0 / (sign + z)
@@ -147,8 +147,8 @@ def ray_residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return residuals (..., N, 2) of a rigid target against rays, and their derivatives (..., N, 2, 6) by (w, v).
 
-    `rotation` (..., 3, 3) and `translation` (..., 3) change as R' = exp([w]x) R, t' = t + v. Rays (N, 3) are for all
-    poses, or (..., N, 3) one set for each. Else as `point_residuals`.
+    `rotation` (..., 3, 3) and `translation` (..., 3) are perturbed as R' = exp([w]x) R, t' = t + v. Rays are (N, 3),
+    common to all poses, or (..., N, 3). Else as `point_residuals`.
     """
     n, poses = len(points), rotation.shape[:-2]
     residual, jacobian = kernel.ray_residuals(
@@ -209,10 +209,8 @@ def _pose_from_homography(h: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _both_tilts(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pose and the one that looks the same under weak perspective: tilt about the line of sight reversed.
-
-    Its axes have the same components across the line of sight to the target's centre and opposite ones along it.
-    """
+    """Return the pose and its planar ambiguity, which has the same image under weak perspective: the target's axes have
+    the same components perpendicular to the line of sight to its centre, and opposite ones along it."""
     sight = translation / np.linalg.norm(translation)
     axes = rotation[:, :2] - 2.0 * np.outer(sight, sight @ rotation[:, :2])
     other = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
@@ -222,7 +220,7 @@ def _both_tilts(rotation: FloatArray, translation: FloatArray) -> tuple[FloatArr
 def _refine(
     rays: Rays, bases: FloatArray, flat: FloatArray, weight: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Levenberg-Marquardt on weighted ray residuals, all start poses (K, ...) at once; returns poses and costs (K,)."""
+    """Return the refined poses and costs (K,) of K initial poses: Levenberg-Marquardt on weighted ray residuals."""
     # Residuals are in units of the bases.
     weighted = bases * weight[:, None, None]
 
@@ -243,12 +241,12 @@ def _refine(
 
 
 def stepped(poses: tuple[FloatArray, ...], step: FloatArray) -> tuple[FloatArray, ...]:
-    """Return poses (N, 3, 3), (N, 3) after steps (N, 6), as solvers step: R <- exp(w) R, t <- t + dt."""
+    """Return poses (N, 3, 3), (N, 3) after steps (w, dt) (N, 6): R <- exp(w) R, t <- t + dt."""
     return exp_so3(step[:, :3]) @ poses[0], poses[1] + step[:, 3:]
 
 
 def _differ(rotation: FloatArray, translation: FloatArray, flat: FloatArray, cost: FloatArray) -> bool:
-    """Say whether the two optima are distinct: both finite and some point moved by a thousandth of its distance."""
+    """Return whether the two optima are distinct: both finite, and some point differs by 0.001 of its distance."""
     if not np.isfinite(cost).all():
         return False
     moved = flat @ (rotation[0] - rotation[1]).T + (translation[0] - translation[1])

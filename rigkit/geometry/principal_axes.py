@@ -1,4 +1,4 @@
-"""A covariance as independent moves of one standard deviation each."""
+"""Decomposition of a covariance into independent steps of one standard deviation each."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 
 NEGLIGIBLE = 1e-12
-"""Principal axes with less than this part of the largest variance (parameters scaled to one sigma) are left out."""
+"""Relative variance (of parameters scaled to one sigma) up to which a principal axis is left out."""
 
 
 def principal_axes(covariance: FloatArray) -> FloatArray:
-    """Return rows (K, P) with sum of outer products equal to `covariance`: independent moves of one sigma each."""
+    """Return rows (K, P) whose outer products sum up to `covariance`: independent steps of one sigma each."""
     sigma = np.sqrt(np.diag(covariance))
     safe = np.where(sigma > 0.0, sigma, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))

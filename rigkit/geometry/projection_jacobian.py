@@ -1,4 +1,4 @@
-"""d pixel / d point of any central camera, from its ray, its ray Jacobian and the range alone."""
+"""d pixel / d point of any central camera, from its ray, ray Jacobian and range."""
 
 from __future__ import annotations
 

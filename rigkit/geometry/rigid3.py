@@ -12,9 +12,9 @@ from rigkit.core.errors import InputError
 from rigkit.geometry.rotation import exp_so3, log_so3, nearest_rotation, unit
 
 ROTATION_TOLERANCE = 1e-4
-"""A matrix further than this from orthonormal is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
+"""Deviation from orthonormal that is a mistake (a scale, a transposed homogeneous matrix), not rounding."""
 ROUNDING = 1e-9
-"""A matrix this near to orthonormal needs no singular values to be a rotation to the last digit."""
+"""Deviation up to which one Newton step makes a matrix orthonormal to the last digit, without singular values."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, init=False)
@@ -44,7 +44,7 @@ class Rigid3:
 
     @classmethod
     def stack(cls, rotation: Mat3, translation_mm: FloatArray) -> tuple[Rigid3, ...]:
-        """Return the motions of rotations (N, 3, 3) and translations (N, 3), checked together as one is alone."""
+        """Return the motions of rotations (N, 3, 3) and translations (N, 3), checked all at once."""
         rotation = _checked(as_array(rotation, (None, 3, 3), "rotation"))
         translation = as_array(translation_mm, (len(rotation), 3), "translation_mm")
         rotation.flags.writeable = False
@@ -52,13 +52,13 @@ class Rigid3:
 
     @classmethod
     def _own(cls, rotation: Mat3, translation_mm: FloatArray) -> Rigid3:
-        """Return the motion of arrays of its own that need no check: they come from motions that were checked."""
+        """Return the motion of newly allocated arrays, without checks: they come from motions that were checked."""
         rotation.flags.writeable = translation_mm.flags.writeable = False
         return cls._of(rotation, translation_mm)
 
     @classmethod
     def _of(cls, rotation: Mat3, translation_mm: FloatArray) -> Rigid3:
-        """The same of arrays that nobody can write to."""
+        """Return the motion of read-only arrays, without checks."""
         motion = object.__new__(cls)
         object.__setattr__(motion, "rotation", rotation)
         object.__setattr__(motion, "translation_mm", translation_mm)
@@ -87,14 +87,14 @@ class Rigid3:
         return as_floats(points, (3,), "points") @ self.rotation.T + self.translation_mm
 
     def moved(self, step: FloatArray) -> Rigid3:
-        """Return the motion after a small change (6,): exp of the rotation vector (rad) from the left, mm added.
+        """Return the motion after a small step (w, v) (6,), rad and mm: R' = exp([w]x) R, t' = t + v.
 
         Every covariance of a pose in the package is of such a step.
         """
         return Rigid3(exp_so3(step[:3]) @ self.rotation, self.translation_mm + step[3:])
 
     def step_from(self, other: Rigid3) -> FloatArray:
-        """Return the small change (6,) that takes `other` to this motion: `other.moved(step)` is this one."""
+        """Return the step (6,) from `other` to this motion: `other.moved(step)` is this one."""
         turn = log_so3(self.rotation @ other.rotation.T)
         return np.concatenate([turn, self.translation_mm - other.translation_mm])
 
@@ -117,7 +117,7 @@ class Rigid3:
 
 
 def _checked(matrix: Mat3) -> Mat3:
-    """Return the rotations nearest to `matrix` (..., 3, 3); raises InputError where one is further than rounding."""
+    """Return the rotations nearest to `matrix` (..., 3, 3); raises InputError if one differs by more than rounding."""
     off = _off(matrix)
     if np.abs(off).max(initial=0.0) <= ROUNDING and (np.linalg.det(matrix) > 0.0).all():
         return _orthonormal(matrix, off)
@@ -128,18 +128,18 @@ def _checked(matrix: Mat3) -> Mat3:
 
 
 def _off(matrix: Mat3) -> Mat3:
-    """Return by how much matrices (..., 3, 3) are not orthonormal."""
+    """Return M^T M - I of matrices (..., 3, 3)."""
     return np.asarray(np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3))
 
 
 def _orthonormal(matrix: Mat3, off: Mat3 | None = None) -> Mat3:
-    """Return matrices (..., 3, 3) that are rotations but for rounding without that: the first step of Newton's
-    iteration for the polar factor, which leaves the square of `off`."""
+    """Return matrices (..., 3, 3) that are rotations up to rounding, made orthonormal: one step of Newton's iteration
+    for the polar factor, which squares the deviation `off`."""
     return np.asarray(matrix - 0.5 * (matrix @ (_off(matrix) if off is None else off)))
 
 
 def cam_from_world_look_at(eye_mm: ArrayLike, target_mm: ArrayLike, down: ArrayLike = (0.0, 1.0, 0.0)) -> Rigid3:
-    """Return cam_from_world of a camera at `eye_mm` that looks at `target_mm` with its y axis leaning to `down`.
+    """Return cam_from_world of a camera at `eye_mm` that looks at `target_mm`, with its y axis towards `down`.
 
     Raises InputError where eye and target coincide or the viewing direction is parallel to `down`.
     """

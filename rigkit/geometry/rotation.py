@@ -18,7 +18,7 @@ def skew(v: FloatArray) -> Mat3:
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b of `a` and `b` (..., 3), a good deal faster than numpy's own."""
+    """Return a x b of `a` and `b` (..., 3), much faster than np.cross."""
     a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
     b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)
@@ -40,7 +40,7 @@ def left_jacobian(rotation_vector: ArrayLike) -> Mat3:
     w = np.asarray(rotation_vector, dtype=np.float64)
     angle, k = float(np.linalg.norm(w)), skew(w)
     second = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 0.0 else 0.5
-    # (a - sin a) / a^3 loses its digits at small angles, where the series has them all.
+    # (a - sin a) / a^3 loses digits at small angles, where the series is exact.
     third = (angle - np.sin(angle)) / angle**3 if angle > 0.1 else (1.0 - angle**2 / 20.0 + angle**4 / 840.0) / 6.0
     return np.asarray(np.eye(3) + second * k + third * (k @ k))
 
@@ -84,7 +84,7 @@ def rotation_angle(rotation: Mat3) -> FloatArray:
 def unit(v: FloatArray) -> FloatArray:
     """Return `v` (..., k) scaled to length 1; NaN where the length is zero."""
     v = np.asarray(v, dtype=np.float64)
-    # Sums along so short an axis, one number after the other, take numpy several times as long.
+    # np.sum along so short an axis takes several times as long.
     squares = v * v
     length = np.sqrt(sum((squares[..., k] for k in range(1, v.shape[-1])), start=squares[..., 0]))[..., None]
     return np.asarray(v / np.where(length > 0.0, length, np.nan))

@@ -1,4 +1,4 @@
-"""Distance of ray pairs from an epipolar geometry, in pixels, for any central camera.
+"""Sampson distance of ray pairs from an epipolar geometry, in pixels, for any central camera.
 
 With unit rays f, ray Jacobians B = d f / d q (3x2) and E21, the constraint is c = f2^T E f1. Its gradients with respect
 to the two pixels, n1 = B1^T E^T f2 and n2 = B2^T E f1, are the normals of the epipolar curves in pixel units. A pinhole
@@ -42,8 +42,8 @@ def sampson_distances(
 ) -> FloatArray:
     """Return the signed Sampson distance (..., N) of each pair.
 
-    With the sigmas left at 1 it is in px: how far the pair of pixels (as one point in 4D) lies from the epipolar
-    geometry. With the corners' sigmas it is in standard deviations. Zero at the epipoles, where any partner fits.
+    With the default sigmas it is in px: the distance of the pair of pixels, as one point in 4D, from the epipolar
+    geometry. With the corners' sigmas it is in standard deviations. Zero at the epipoles, which fit any partner.
     """
     c, n1, n2 = epipolar_normals(E21, rays1, rays2, jacobians1, jacobians2)
     variance = sigma1_px**2 * np.sum(n1 * n1, axis=-1) + sigma2_px**2 * np.sum(n2 * n2, axis=-1)
@@ -51,6 +51,6 @@ def sampson_distances(
 
 
 def sampson_of_matches(E21: Mat3, m: Matches, *, in_sigmas: bool = False) -> FloatArray:
-    """Return the signed Sampson distance (N,) of each match, in px or in its own standard deviations."""
+    """Return the signed Sampson distance (N,) of each match, in px or in standard deviations."""
     sigmas = (m.sigma1_px, m.sigma2_px) if in_sigmas else (1.0, 1.0)
     return sampson_distances(E21, m.rays1, m.rays2, m.jacobians1, m.jacobians2, *sigmas)

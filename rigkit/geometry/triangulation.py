@@ -1,10 +1,9 @@
-"""Points from two views: optimal correction of the matches, then exact intersection of the rays.
+"""Triangulation from two views: optimal correction of the matches, then exact intersection of the rays.
 
 Pixels of perspective views are corrected by Lindstrom's two iterations (`correct_lindstrom`); rays of any central
-camera, fields of view beyond 180 degrees included, by the angular optimum (`correct_rays`) or, with ray Jacobians, by
-the pixel optimum (`correct_rays_px`). After the correction the two rays meet, so that the intersection is exact
-whatever formula finds it. A point is valid if it lies at a positive range along both rays, which is cheirality for any
-field of view.
+camera, also beyond 180 degrees, by the angular optimum (`correct_rays`) or, with ray Jacobians, by the pixel optimum
+(`correct_rays_px`). After the correction the two rays intersect. A point is valid if its range is positive along both
+rays, which is cheirality for any field of view.
 
 References: Lindstrom, "Triangulation made easy", 2010; Oliensis, "Exact two-image structure from motion", 2002 (the sum
 of squared sines has a closed form).
@@ -53,7 +52,7 @@ def correct_rays(rays1: Rays, rays2: Rays, cam2_from_cam1: Rigid3) -> tuple[Rays
     perpendicular to the baseline.
     """
     a, b = np.asarray(rays1) @ cam2_from_cam1.rotation.T, np.asarray(rays2, dtype=np.float64)
-    # Without a baseline, any two directions: nothing is triangulated with those rays.
+    # Without a baseline any two directions will do: such rays are not triangulated.
     basis = np.linalg.svd(cam2_from_cam1.translation_mm[None, :])[2][1:]
     wa, wb = a @ basis.T, b @ basis.T
     moment = wa[..., :, None] * wa[..., None, :] + wb[..., :, None] * wb[..., None, :]
@@ -74,7 +73,7 @@ def correct_rays_px(
     sigma2_px: FloatArray | float = 1.0,
     iterations: int = 2,
 ) -> tuple[Rays, Rays, FloatArray, FloatArray]:
-    """Return the rays that meet at the least pixel displacement, and the displacements dq1, dq2 (..., N, 2) px.
+    """Return the rays that intersect with the least pixel displacement, and the displacements dq1, dq2 (..., N, 2) px.
 
     Minimises |dq1|^2 / sigma1^2 + |dq2|^2 / sigma2^2 for any central camera. The first iteration is the Sampson
     correction; each further one linearises at the corrected rays f(dq) = unit(f + B dq).
@@ -83,7 +82,7 @@ def correct_rays_px(
     f1, f2 = np.asarray(rays1, dtype=np.float64), np.asarray(rays2, dtype=np.float64)
     dq1, dq2 = np.zeros((*f1.shape[:-1], 2)), np.zeros((*f2.shape[:-1], 2))
     for _ in range(iterations):
-        # The unnormalised ray f + B dq has derivative B everywhere, and the constraint does not mind its length.
+        # The unnormalised ray f + B dq has derivative B everywhere, and the constraint is independent of its length.
         c, n1, n2 = epipolar_normals(E21, f1, f2, jacobians1, jacobians2)
         at_measured = c - np.sum(n1 * dq1, axis=-1) - np.sum(n2 * dq2, axis=-1)
         variance = np.sum(v1 * n1 * n1 + v2 * n2 * n2, axis=-1)
@@ -97,8 +96,7 @@ def correct_rays_px(
 def ray_ranges(rays1: Rays, rays2: Rays, cam2_from_cam1: Rigid3) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Return the ranges (...) along both rays at which they come closest, mm, and where they are defined.
 
-    Signed: a negative range means that the point would lie behind that camera, whatever the field of view. Undefined
-    for parallel rays.
+    Signed: with a negative range the point is behind that camera. Undefined for parallel rays.
     """
     a, b = np.asarray(rays1) @ cam2_from_cam1.rotation.T, np.asarray(rays2, dtype=np.float64)
     t = cam2_from_cam1.translation_mm
@@ -132,7 +130,7 @@ def triangulate_rays(
 ) -> tuple[Points, BoolArray]:
     """Return the points (N, 3) in the frame of camera 1 and where they are valid (positive range along both rays).
 
-    With the ray Jacobians of both images the pixel displacement (in sigmas) is least, otherwise the angle.
+    With the ray Jacobians of both images it minimises the pixel displacements (in sigmas), otherwise the angles.
     """
     if jacobians1 is None or jacobians2 is None:
         near1, near2 = correct_rays(rays1, rays2, cam2_from_cam1)
@@ -170,9 +168,9 @@ def point_uncertainty(
     """Return the covariance (N, 3, 3) of triangulated points from the pixel sigmas, in their unit squared, and their
     derivatives (N, 3, 6) by the pose (left rotation perturbation rad, translation).
 
-    With V and W the point's own and the mixed blocks of the bundle adjustment normal equations these are V^-1 and
-    -V^-1 W^T. A pose estimated from these very matches adds its covariance through the derivatives, because the
-    residuals which fix the pose are orthogonal to those which fix the points. NaN where a point has no triangulation.
+    With V the block of the point and W the coupling block of the bundle adjustment's normal equations these are V^-1
+    and -V^-1 W^T. The covariance of a pose estimated from the same matches is added through the derivatives, because
+    pose and points are determined by orthogonal residuals. NaN where a point has no triangulation.
     """
     in_cam2 = cam2_from_cam1.apply(points)
     d_pixels1_d_point = projection_jacobian(rays1, jacobians1, np.linalg.norm(points, axis=-1))

@@ -1,1 +1,1 @@
-"""Nonlinear least squares and robust scale: how every descent of the package damps its steps and knows when to stop."""
+"""Nonlinear least squares (Levenberg-Marquardt) and robust scale estimates, used by the whole package."""

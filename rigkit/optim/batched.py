@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for many small problems at once, each with a damping of its own."""
+"""Levenberg-Marquardt for many small problems at once, each with its own damping."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rigkit.core.arrays import BoolArray, FloatArray
 from rigkit.optim.damping import Damping, Stop
 
 Values = tuple[FloatArray, ...]
-"""Arrays whose first axis is that of the problems."""
+"""Arrays whose first axis is over the problems."""
 
 
 class BatchedProblem(NamedTuple):
-    """K problems around their states.
+    """K linearised problems.
 
     Attributes
     ----------
@@ -38,16 +38,16 @@ def minimise_each(
     small: Callable[[Values, FloatArray], BoolArray] | None = None,
     until_all: bool = False,
 ) -> tuple[Values, FloatArray]:
-    """Return states each at its own minimum, and their costs (K,).
+    """Return the states, each at its own minimum, and their costs (K,).
 
     Parameters
     ----------
-    moved : gives the states after steps (K, U).
-    damping : `by_gain`, `acceleration` and `refused_floor` are not for a batch.
-    stop : `gain_ratio` and `cost` are not for a batch.
-    small : says which steps (K, U) are too short to matter: their problems are done.
-    until_all : problems that are done go on while others are not, with steps that are computed anyhow; otherwise they
-        stay where they are, and what a problem finds does not depend on the others.
+    moved : returns the states after steps (K, U).
+    damping : `by_gain`, `acceleration` and `refused_floor` are ignored.
+    stop : `gain_ratio` and `cost` are ignored.
+    small : returns which steps (K, U) are negligible: their problems have converged.
+    until_all : whether converged problems take further steps, which are computed anyway, until all have converged. If
+        not, the result of a problem does not depend on the others.
     """
     here = linearise(state)
     level = np.full(len(here.cost), damping.start)

@@ -1,4 +1,4 @@
-"""How a damped descent behaves: the schedule of its damping, when it stops, and how it says so."""
+"""Options of Levenberg-Marquardt: the schedule of the damping, and stopping criteria."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from enum import StrEnum
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Damping:
-    """The damping of a Levenberg-Marquardt descent, as a share of the diagonal of the normal matrix.
+    """The schedule of the damping, relative to the diagonal of the normal matrix.
 
     Attributes
     ----------
-    start : before the first step.
-    shrink : factor after a step that is taken; with `by_gain` the smallest one.
-    growth : factor after a step that is refused.
-    acceleration : factor of `growth` with every further refusal in a row.
-    floor : no smaller after a step that is taken.
-    refused_floor : no smaller after a step that is refused.
-    ceiling : a descent ends where refused steps bring the damping above it.
-    by_gain : shrink by max(shrink, 1 - (2 q - 1)^3) with q the gain over what the quadratic model promised (Nielsen,
-        "Damping parameter in Marquardt's method", 1999, eq. 2.5) instead of by `shrink`.
+    start : initial damping.
+    shrink : factor after an accepted step; with `by_gain` the smallest factor.
+    growth : factor after a rejected step.
+    acceleration : factor on `growth` for every further rejection in a row.
+    floor : smallest damping after an accepted step.
+    refused_floor : smallest damping after a rejected step.
+    ceiling : the iteration ends where rejected steps increase the damping above it.
+    by_gain : whether the factor is max(shrink, 1 - (2 q - 1)^3) with the gain ratio q, the decrease of the cost over
+        that predicted by the quadratic model (Nielsen, "Damping parameter in Marquardt's method", 1999, eq. 2.5).
     """
 
     start: float
@@ -33,26 +33,26 @@ class Damping:
     by_gain: bool = False
 
     def taken(self, damping: float, ratio: float) -> float:
-        """Return the damping after a step that gained `ratio` times what was promised."""
+        """Return the damping after an accepted step with the gain ratio `ratio`."""
         factor = max(self.shrink, 1.0 - (2.0 * ratio - 1.0) ** 3) if self.by_gain else self.shrink
         return max(damping * factor, self.floor)
 
     def refused(self, damping: float, growth: float) -> tuple[float, float]:
-        """Return the damping after a refused step, and the factor for the next refusal."""
+        """Return the damping after a rejected step, and the factor for the next rejection."""
         return max(damping * growth, self.refused_floor), growth * self.acceleration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stop:
-    """When a descent stops.
+    """Stopping criteria.
 
     Attributes
     ----------
-    steps : at most so many are tried.
-    gain : a step that is taken and gains no more than this share of the cost is the last one,
-    gain_ratio : if it gained more than this share of what the quadratic model promised.
-    predicted_gain : a step that promises no more than this share of the cost is not tried.
-    cost : a step that arrives below this cost is the last one: what is left is rounding.
+    steps : maximal number of steps tried.
+    gain : stop after an accepted step with no more than this relative decrease of the cost,
+    gain_ratio : if its gain ratio was above this.
+    predicted_gain : stop before a step with no more than this predicted relative decrease.
+    cost : stop below this cost: the rest is rounding.
     """
 
     steps: int
@@ -63,7 +63,7 @@ class Stop:
 
 
 class StopReason(StrEnum):
-    """Why a descent stopped, in words for reports."""
+    """Why the iteration stopped, in words for reports."""
 
     STATIONARY = "cost stationary"
     NO_SMALLER_COST = "no smaller cost nearby"

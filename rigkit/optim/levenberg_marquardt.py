@@ -1,9 +1,8 @@
-"""Levenberg-Marquardt for one problem: any state, any way to solve for a step.
+"""Levenberg-Marquardt for one problem with any type of state and any linear solver.
 
-A problem linearised around a state gives its cost and damped steps; how it solves for them (dense normal equations,
-Schur complement) is its own business. Costs are sums of squares. References: Marquardt, "An algorithm for least-squares
-estimation of nonlinear parameters" (1963); Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems"
-(2004), algorithm 3.16.
+A problem linearised at a state has a cost (a sum of squares) and computes damped steps, by dense normal equations or a
+Schur complement. References: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters" (1963);
+Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems" (2004), algorithm 3.16.
 """
 
 from __future__ import annotations
@@ -24,26 +23,26 @@ class Step(Protocol):
 
     @property
     def predicted(self) -> float:
-        """The decrease of the cost that the quadratic model promises."""
+        """The decrease of the cost that the quadratic model predicts."""
         ...
 
 
 class LinearisedProblem(ABC):
-    """A least-squares problem around a state."""
+    """A least-squares problem linearised at a state."""
 
     __slots__ = ()
 
     @property
     @abstractmethod
     def cost(self) -> float:
-        """Sum of squared residuals, infinite or NaN where the state has none."""
+        """Sum of squared residuals, infinite or NaN where the state is invalid."""
 
     @abstractmethod
     def step(self, damping: float) -> Step | None:
         """Return the damped step, None where the damped system cannot be solved."""
 
     def decrease(self, there: Self) -> float:
-        """Return by how much the cost is less at another state; a step is taken where this is positive."""
+        """Return the decrease of the cost to another state; a step is accepted if it is positive."""
         return self.cost - there.cost
 
 
@@ -53,7 +52,7 @@ P = TypeVar("P", bound=LinearisedProblem)
 
 @dataclass(frozen=True, slots=True)
 class DenseStep:
-    """A step (U,) in the unknowns and the decrease of the cost that the quadratic model promises for it."""
+    """A step (U,) in the unknowns and the decrease of the cost that the quadratic model predicts."""
 
     change: FloatArray
     predicted: float
@@ -78,7 +77,7 @@ class DenseProblem(LinearisedProblem):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Minimum(Generic[S, P]):
-    """Where a descent ended: the state, the problem around it, how many steps were tried and why it stopped."""
+    """The result: the state, the problem linearised there, the number of steps tried and why the iteration stopped."""
 
     state: S
     problem: P
@@ -87,7 +86,7 @@ class Minimum(Generic[S, P]):
 
     @property
     def converged(self) -> bool:
-        """Whether the state is a minimum, for all that the problem can tell."""
+        """Whether the iteration converged."""
         return self.reason in (StopReason.STATIONARY, StopReason.NO_SMALLER_COST)
 
 
@@ -101,14 +100,14 @@ def minimise(
     here: P | None = None,
     small: Callable[[Any], bool] | None = None,
 ) -> Minimum[S, P]:
-    """Return the state of least cost near `state`; a state that nothing improves is returned as it is.
+    """Return the local minimum near `state`; `state` itself if no step lowers the cost.
 
     Parameters
     ----------
-    linearise : gives the problem around a state.
-    moved : gives the state after one of the problem's steps, None where there is no such state: the step is refused.
-    here : the problem around the start, where it is known.
-    small : says whether a step is too short to matter: it is the last one, taken or not.
+    linearise : returns the problem linearised at a state.
+    moved : returns the state after a step; None for an invalid one: the step is rejected.
+    here : the problem linearised at `state`, if known.
+    small : returns whether a step is negligible: it is the last one, accepted or not.
     """
     here = linearise(state) if here is None else here
     level, growth = damping.start, damping.growth
@@ -140,10 +139,10 @@ def minimise(
 
 
 def damped_step(jacobian: FloatArray, residual: FloatArray, damping: float) -> DenseStep | None:
-    """Return the step (U,) that lessens residuals (M,) with the derivatives (M, U), by the damped normal equations.
+    """Return the step (U,) for residuals (M,) with derivatives (M, U), by the damped normal equations.
 
-    The unknowns are scaled so that the columns have length one: `damping` is the share of the diagonal of J^T J that is
-    added to it (Marquardt). What a column of zeros is of does not move. None where the system is singular all the same.
+    The unknowns are scaled to columns of unit length: `damping` is the part of the diagonal of J^T J that is added to
+    it (Marquardt). Unknowns with a zero column do not change. None where the system is singular.
     """
     normal = jacobian.T @ jacobian
     size = np.maximum(np.sqrt(np.diag(normal)), 1e-300)

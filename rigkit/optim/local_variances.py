@@ -1,8 +1,8 @@
-"""Variances of many small samples, each by its own scatter as far as the samples differ by more than chance.
+"""Empirical Bayes estimates of the variances of many small samples.
 
-A sample's own variance is honest but noisy; what all have in common is sure but may not be its own. How much the
-samples differ says how much of either to take (G. K. Smyth, "Linear Models and Empirical Bayes Methods", Statistical
-Applications in Genetics and Molecular Biology 3, 2004, section 6.2).
+The variance of a small sample is unbiased but noisy; that of all samples is accurate but may be wrong for one of them.
+How much the sample variances differ determines the weights of the two (G. K. Smyth, "Linear Models and Empirical Bayes
+Methods", Statistical Applications in Genetics and Molecular Biology 3, 2004, section 6.2).
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 
 LARGEST_SCATTER = 100.0
-"""Variance up to which `of_redescending` knows what is left of it."""
+"""Largest variance in the table of `of_redescending`."""
 SAMPLED_LENGTHS = 400
-"""Of the integral over distances: variances come out to a thousandth."""
+"""Samples of the integral over distances: variances are accurate to a thousandth."""
 
 
 def shrunk_variances(variances: FloatArray, freedom: FloatArray) -> FloatArray:
-    """Return the variances (N,) of samples of `freedom` (N,) degrees, drawn towards the one they have in common.
+    """Return the variances (N,) of samples with `freedom` (N,) degrees of freedom, shrunk towards a common one.
 
     Notes
     -----
-    With a scaled inverse chi-square distribution of the true ones, of d0 degrees about s0^2, the mean of log s^2 and
-    its variance beyond what `freedom` explains give d0 and s0^2 (Smyth's equations for e_g); each becomes
-    (d0 s0^2 + d s^2) / (d0 + d). Zeros say nothing of themselves; they get what is common.
+    The prior of the true variances is a scaled inverse chi-square distribution with d0 degrees of freedom about s0^2.
+    The mean of log s^2, and its variance less that expected from `freedom`, give d0 and s0^2 (Smyth's equations for
+    e_g); each variance becomes (d0 s0^2 + d s^2) / (d0 + d). Zero variances are not used for the prior.
     """
     from scipy.special import digamma, polygamma
 
@@ -58,10 +58,10 @@ def _inverse_trigamma(value: float) -> float:
 
 
 def of_redescending(scatter: FloatArray, turn: float) -> FloatArray:
-    """Return the variances (...) of which the loss of Geman and McClure leaves such a mean square a component.
+    """Return the variances (...) from mean squares per component weighted by the Geman-McClure loss.
 
-    `scatter` is sum w s^2 / (3 sum w) over distances s of three components, w = 1 / (1 + s^2 / (3 turn^2))^2: what is
-    far off counts little, so that it is less than the variance, and the more so the larger that is.
+    `scatter` is sum w s^2 / (3 sum w) over distances s of three components, w = 1 / (1 + s^2 / (3 turn^2))^2. As large
+    distances have small weights it is less than the variance, and the more so the larger that is.
     """
     left, variances = _table(turn)
     return np.asarray(np.interp(scatter, left, variances))
@@ -69,9 +69,9 @@ def of_redescending(scatter: FloatArray, turn: float) -> FloatArray:
 
 @functools.cache
 def _table(turn: float) -> tuple[FloatArray, FloatArray]:
-    """Return what is left (M,), rising, of variances (M,)."""
+    """Return the weighted mean squares (M,), increasing, of variances (M,)."""
     variances = np.geomspace(1.0 / LARGEST_SCATTER, LARGEST_SCATTER, 200)
-    # Maxwell's distribution, of the length of three Gaussians of variance 1.
+    # The Maxwell distribution, of the length of three Gaussians of variance 1.
     length = np.linspace(0.0, 7.0, SAMPLED_LENGTHS)
     density = length**2 * np.exp(-0.5 * length**2)
     square = variances[:, None] * length**2

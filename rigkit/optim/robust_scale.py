@@ -1,11 +1,11 @@
-"""From medians to standard deviations: the factors that hold for Gaussian noise, in one home."""
+"""Factors between medians and standard deviations of Gaussian noise."""
 
 from __future__ import annotations
 
 MEDIAN_OF_NORMAL = 0.6745
 """Median of |x| of a Gaussian x of standard deviation 1, to four digits."""
 SIGMA_OF_MEDIAN = 1.4826
-"""Standard deviation of a Gaussian whose |x| has the median 1, to five digits: one over the above."""
+"""Standard deviation of a Gaussian x with median |x| = 1, to five digits: the inverse of the above."""
 MEDIAN_OF_RAYLEIGH = 1.17741
 """Median of |r| of a two-dimensional Gaussian of standard deviation 1 per coordinate: sqrt(2 log 2)."""
 MEDIAN_OF_CHI_SQUARE_3 = 2.366
