@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import ClassVar, Self, TypeAlias
 
 import numpy as np
@@ -139,8 +139,8 @@ class Pattern(ABC):
 
     def scaled(self, factor: float) -> Self:
         """Return the pattern printed larger: fields in mm grow with the squares."""
-        lengths = {f.name: getattr(self, f.name) * factor for f in fields(self) if f.name.endswith("_mm")}
-        return type(self)(**{f.name: lengths.get(f.name, getattr(self, f.name)) for f in fields(self)})
+        lengths = {f.name: getattr(self, f.name) for f in fields(self) if f.name.endswith("_mm")}
+        return replace(self, **{name: value * factor for name, value in lengths.items() if value is not None})
 
 
 def filled_modules(black: BoolArray, *, upright: bool = False) -> FloatArray:

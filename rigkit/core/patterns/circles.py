@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -122,6 +122,3 @@ class Circles(Pattern):
         colour = "white on black" if self.inverted else "black on white"
         across = f", diameter {self.diameter_mm:g} mm" if self.diameter_mm is not None else ""
         return f"{columns} x {rows} circles, {self.layout}, distance {x:g} x {y:g} mm{across}, {colour}"
-
-    def scaled(self, factor: float) -> Self:
-        return self if self.diameter_mm is None else replace(self, diameter_mm=self.diameter_mm * factor)
