@@ -1,1 +1,1 @@
-"""Which view of which board belongs to which target and moment, and which were put together wrongly."""
+"""Assignment of views to targets and frames, and detection of mix-ups."""

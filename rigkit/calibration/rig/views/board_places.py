@@ -1,9 +1,8 @@
-"""Boards that are mounted to each other: which is which in every image, and where each roughly sits on their target.
+"""Boards mounted to each other: their identification in every image, and their approximate poses on the target.
 
-Boards that look alike, or that look the same turned, have no name and no first corner of their own; their arrangement
-gives them both. One scene (an image, or a frame of several cameras) that shows most of them is the reference. In every
-other scene all names and orientations of one board are tried. Each fixes the target, and the one that puts the other
-boards of the scene where they are seen wins.
+Boards that look alike, or have rotational symmetry, are identified and oriented by their arrangement. A scene (an
+image) that shows most of them is the reference. In every other scene all ids and orientations of one board are tried.
+Each gives a pose of the target, and the one that predicts the other boards of the scene best is taken.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation
 
 REFERENCES = 5
-"""Scenes tried as the reference: a bad one explains the others badly."""
+"""Number of scenes tried as the reference: a bad one explains the others badly."""
 RIVAL = 3.0
-"""Another naming that fits nearly as well, within this factor, leaves the names of a scene open."""
+"""A scene is ambiguous if another assignment of ids has a misfit within this factor."""
 FITS = 0.1
-"""A board further from its place than this part of its distance from the camera is not where the target has it."""
+"""Largest misfit of a board, as a part of its distance from the camera."""
 FLOOR = 1e-6
-"""Misfits below this part of the distance are rounding."""
+"""Smallest misfit, as a part of the distance: rounding."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Label:
-    """An id and orientation that a board seen may have, with its outer corners there, (4, 3) mm."""
+    """A possible id and orientation of an observed board, with its outer corners in the camera, (4, 3) mm."""
 
     seen: Observation
     corners: FloatArray
@@ -42,7 +41,7 @@ class _Label:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _BoardSeen:
-    """A board of a scene: its camera, its key there, the labels that it may have, and its distance."""
+    """A board of a scene: its camera, its key there, its possible labels, and its distance."""
 
     camera: int
     key: tuple[str, str]
@@ -53,8 +52,8 @@ class _BoardSeen:
 def board_places(
     groups: Sequence[Sequence[str]], views: RigViews, boards: Mapping[str, Board]
 ) -> tuple[RigViews, tuple[Finding, ...]]:
-    """Return the views with the boards of every group identified, oriented alike and given the key of their target and
-    their places on it, and what could not be tied.
+    """Return the views with the boards of every group identified, oriented consistently, and assigned to their target
+    with their poses on it, and findings on ambiguous scenes.
 
     Raises InputError: a board of a group is never seen together with the others, or they cannot be identified.
 
@@ -99,7 +98,7 @@ def board_places(
 
 
 def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Reading | None, target: str) -> None:
-    """Give the boards of one scene, in the observations of their camera, their names and the key of their target."""
+    """Set the ids of the boards of one scene, in the observations of their camera, and the key of their target."""
     old = [own.pop(entry.key) for entry in scene]
     for k, (entry, before) in enumerate(zip(scene, old, strict=True)):
         frame, board_id = before.frame, entry.key[1]
@@ -107,7 +106,7 @@ def _rename(own: FrameObservations, scene: Sequence[_BoardSeen], reading: Readin
         if label is not None:
             own[(frame, label.board_id)] = replace(label, key=(frame, target))
             continue
-        # Its place on the target is not known: it stays a view of a board of its own.
+        # Its pose on the target is unknown: it remains a view of an independent board.
         alone = f"{frame}, camera {entry.camera + 1} alone"
         own[(alone, board_id)] = replace(before, key=(alone, board_id))
 
@@ -118,7 +117,7 @@ def _never_read(
     scenes: Sequence[list[_BoardSeen]],
     readings: Sequence[Reading | None],
 ) -> str | None:
-    """Return a board that was seen, but in no scene that tells its place."""
+    """Return a board that was seen, but in no scene that determines its pose on the target; None if there is none."""
     read: dict[str, bool] = {}
     for scene, reading in zip(scenes, readings, strict=True):
         for k, entry in enumerate(scene):
@@ -141,7 +140,7 @@ def _scenes(seen: Sequence[FrameObservations], members: Sequence[Board]) -> list
 
 
 def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
-    """Return every label that the board may have; the one given comes first."""
+    """Return all possible labels of a board, the given one first."""
     own = entry.view.board
     found = []
     for board in sorted(members, key=lambda b: b.board_id != own.board_id):
@@ -158,14 +157,14 @@ def _labels(entry: Observation, members: Sequence[Board]) -> list[_Label]:
 
 
 Reading = dict[int, Observation]
-"""Number of the board in its scene -> how it is read."""
+"""Index of the board in its scene -> the observation with the id and orientation assigned."""
 
 
 def _best_reference(
     scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Reading | None]] | None:
-    """Return target_from_board of every board found, in the frame of the reference, and how every scene is read; None
-    where no scene has two boards."""
+    """Return target_from_board of every board found, in the frame of the reference, and the reading of every scene;
+    None if no scene has two boards."""
     order = sorted((s for s in scenes if len(s) > 1), key=lambda s: -len(s))
     best = None
     for reference in order[:REFERENCES]:
@@ -178,7 +177,8 @@ def _best_reference(
 def _read(
     reference: list[_BoardSeen], scenes: Sequence[list[_BoardSeen]], members: Sequence[Board]
 ) -> tuple[dict[str, Rigid3], list[Reading | None], float]:
-    """Read all scenes by one of them; the last number is the median misfit, as a part of the distance."""
+    """Return the boards' poses on the target, the readings of all scenes with one of them as the reference, and the
+    median misfit, as a part of the distance."""
     far = {b.board_id: outer_corners(b) for b in members}
     known: dict[str, Rigid3] = {}
     for entry in reference:
@@ -187,7 +187,7 @@ def _read(
             known[label.board_id] = label.cam_from_board
     readings: dict[int, Reading | None] = {}
     residuals: list[float] = []
-    # Scenes that add a board to those known are read before the ones that need it.
+    # Scenes that add a known board are read before the ones that need it.
     waiting = sorted(range(len(scenes)), key=lambda i: -len(scenes[i]))
     for last in (False, True):
         left = []
@@ -207,8 +207,8 @@ def _read(
 def _named(
     scene: list[_BoardSeen], known: dict[str, Rigid3], far: Mapping[str, FloatArray]
 ) -> tuple[Reading | None, float]:
-    """Return how a scene is read, None where nothing tells, and its misfit; boards that were not known are added to
-    `known` where the others fix the target."""
+    """Return the reading of a scene, None if it is ambiguous, and its misfit. Boards that are not in `known` are added
+    to it if the others determine the target's pose."""
     names = list(known)
     ends = np.array([known[name].apply(far[name]) for name in names])
     flat = [(k, w) for k, entry in enumerate(scene) for w in entry.labels]
@@ -237,7 +237,7 @@ def _named(
         return None, np.inf
     most = max(len(chosen) for _, chosen, _ in tried)
     if most < 2 and len(scene) > 1 and len(known) > 1:
-        # Boards of the group that fit no arrangement: they moved, or the scene shows none that is known.
+        # No two boards fit: they moved, or none of them is known yet.
         ambiguous = len({tuple(c.items()) for _, c, _ in tried}) > 1
         if ambiguous:
             return None, np.inf
@@ -257,7 +257,7 @@ def _named(
 
 
 def _middles(readings: Sequence[Reading], known: Mapping[str, Rigid3]) -> dict[str, Rigid3]:
-    """Return the places as most scenes have them, in the frame of the board that is seen most."""
+    """Return the median poses of the boards over the scenes, in the frame of the board that is seen most."""
     by_name = [{s.board_id: s.cam_from_board for s in reading.values()} for reading in readings]
     counts = {name: sum(name in scene for scene in by_name) for name in known}
     anchor = max(known, key=lambda name: counts[name])

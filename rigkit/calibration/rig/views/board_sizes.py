@@ -1,7 +1,7 @@
-"""Whether boards are as large, against each other, as they are said to be: by each, how far apart the cameras are.
+"""Test of the declared sizes of boards against each other, by the distance between cameras that each gives.
 
-One camera cannot tell: a board of half the size at half the distance looks the same. But two cameras see by every board
-how far apart they are themselves, in units of its squares. What the boards say of that must agree.
+One camera cannot test it: a board of half the size at half the distance looks the same. But every board gives the
+distance between two cameras in units of its squares, and these distances must agree.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from rigkit.core.findings import Finding
 from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 MIN_FRAMES_OF_BOARD = 3
-"""With fewer frames of a board nobody knows how far what it says scatters."""
+"""Fewest frames of a board for an estimate of the scatter."""
 MIN_SIZE_DIFFERENCE = 0.01
-"""Printed boards are a few parts in a thousand off; a size that was mistaken for another is off by parts in ten."""
+"""Relative difference that is reported: printed boards have errors of 0.001, exchanged sizes of 0.1."""
 SIZES_ERRORS = 6.0
-"""So many standard errors apart, as the frames of both boards scatter."""
+"""The same in standard errors, from the scatter over the frames of both boards."""
 
 
 def board_size_conflicts(views: RigViews) -> tuple[Finding, ...]:
-    """Return a finding where two boards contradict each other on how far apart two of the cameras are."""
+    """Return a finding where two boards contradict each other about the distance of two cameras."""
     names, seen, places = views.names, views.seen, views.places
     for i, j in combinations(range(len(seen)), 2):
         shared = seen[i].keys() & seen[j].keys()
@@ -45,8 +45,8 @@ def board_size_conflicts(views: RigViews) -> tuple[Finding, ...]:
         for one, other in combinations(sorted(measured, key=lambda name: -len(measured[name])), 2):
             typical = [float(np.median(measured[name])) for name in (one, other)]
             chance = float(np.hypot(_error(measured[one]), _error(measured[other])))
-            separation = abs(typical[1] - typical[0])
-            if min(typical) > 0.0 and separation > max(MIN_SIZE_DIFFERENCE * min(typical), SIZES_ERRORS * chance):
+            difference = abs(typical[1] - typical[0])
+            if min(typical) > 0.0 and difference > max(MIN_SIZE_DIFFERENCE * min(typical), SIZES_ERRORS * chance):
                 return (_finding((names[i], names[j]), (one, other), (typical[0], typical[1])),)
     return ()
 

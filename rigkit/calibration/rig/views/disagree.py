@@ -1,10 +1,10 @@
-"""Targets on which views disagree: what sharing a pose costs, which cost is no chance, and taking such views apart.
+"""Outlier targets of a rig: the cost of sharing a pose, its significance, and separating such views.
 
-The limits rest on rigs of 2 and 3 cameras and 3 to 25 frames: 3000 clean ones with 0.05 to 0.5 px of noise, and 2200
-of boards bumpy by 0.15 mm that count as flat. There the cost of sharing reaches 2.0 times sigma by noise and 3.5 times
-by bumps, the distance before the joint solve 7.8 times the usual. Where a board was moved by 1 mm between two
-exposures, at 0.2 px of noise, sharing costs 4 to 8 times sigma among ten frames; moved by 10 mm it stands more than 22
-times the usual distance apart.
+The limits were set on SIMULATED rigs of 2 and 3 cameras and 3 to 25 frames: 3000 clean ones with 0.05 to 0.5 px of
+noise, and 2200 with boards bumpy by 0.15 mm that count as flat. There the cost of sharing reaches 2.0 times sigma by
+noise and 3.5 times by bumps, the distance before the joint solve 7.8 times the typical one. If a board was moved by
+1 mm between two exposures, at 0.2 px of noise, sharing costs 4 to 8 times sigma with ten frames; moved by 10 mm its
+distance is more than 22 times the typical one.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from rigkit.calibration.solving.solver import Solution
 from rigkit.core.printing import digits
 
 MAX_DISTANCE_RATIO = 12.0
-"""Before the joint solve a board's pose in one image may be off by some pixels in the other: only more than this many
-times the usual distance is a board that moved. Less is left to the joint solve, which sees it better."""
+"""Distance over the typical distance, before the joint solve, from which a board has moved: its pose in one image may
+be wrong by some pixels in the other. Smaller movements are left to the joint solve, which is more accurate."""
 DISAGREES = 3.5
-"""After it, sharing a pose costs a target six numbers for every view but one: on average sigma each. More than this
-many times sigma (or the usual, where lens and board are not quite what the models say) is no chance."""
+"""Cost of sharing, after the joint solve, over sigma (or the typical cost, with errors of lens or board model), from
+which it is not chance. Sharing a pose removes six parameters for every view but one, and costs sigma each on
+average."""
 MIN_PX = 0.02
-"""No corner is better than this: without noise the usual residual is rounding, and many times that is rounding too."""
+"""Smallest standard deviation of a corner: without noise residuals are rounding."""
 FEW = 12
-"""Among so few targets a bad one can hide: it pulls the mounts to itself, and all look bad."""
+"""With no more targets than this an outlier may be masked: it shifts the mounts, and all look bad."""
 
 
 def shared_keys(seen: Sequence[FrameObservations]) -> dict[Key, int]:
-    """Return the targets of which several views share a pose, and how many."""
+    """Return the targets whose pose several views share, and the number of views."""
     count = Counter(entry.key for own in seen for entry in own.values())
     return {key: n for key, n in count.items() if n > 1}
 
@@ -41,8 +42,8 @@ def shared_keys(seen: Sequence[FrameObservations]) -> dict[Key, int]:
 def cost_of_sharing(
     observations: RigObservations, solution: Solution[RigState], seen: Sequence[FrameObservations]
 ) -> dict[Key, float]:
-    """Return what it costs every shared target that its views have one pose, px^2 for each of the six numbers that
-    every view but one gives up. A view that is bad in itself is no reason to distrust the moment."""
+    """Return for every shared target the increase of the cost by sharing one pose, px^2 for each of the six parameters
+    that every view but one gives up. Residuals of a view that is bad by itself do not count."""
     poses = len(observations.keys)
     alone, views = np.zeros(poses), np.zeros(poses)
     for c, own in enumerate(seen):
@@ -56,7 +57,7 @@ def cost_of_sharing(
 
 
 def typical_distance_px(observations: RigObservations, cost: Mapping[Key, float]) -> float:
-    """Return how far apart, rms over corners, views that share a pose usually see them, px, from what sharing costs."""
+    """Return the median distance, rms over corners, between views that share a pose, px, from the cost of sharing."""
     poses = len(observations.keys)
     corners, views = np.zeros(poses), np.zeros(poses)
     for weight, frame in zip(observations.weights, observations.frame, strict=True):
@@ -71,27 +72,27 @@ def typical_distance_px(observations: RigObservations, cost: Mapping[Key, float]
 
 
 def typical_cost(cost: Mapping[Key, float], sigma_px: float, *, mean: bool = False) -> float:
-    """Return the usual cost, px^2: the lower of two in the middle, so that of two targets the worse is the bad one; or
-    the mean, where all are taken for good."""
+    """Return the typical cost, px^2: the lower median, so that of two targets the worse one is the outlier; with `mean`
+    the mean."""
     ordered = sorted(cost.values()) or [0.0]
     typical = float(np.mean(ordered)) if mean else ordered[(len(ordered) - 1) // 2]
     return max(typical, max(sigma_px, MIN_PX) ** 2)
 
 
 def bad_ones(cost: Mapping[Key, float], typical: float) -> list[Key]:
-    """Return the targets that cost more than chance; of several the worst: they may be why the others look bad."""
+    """Return the targets whose cost is not chance, of several only the worst, which may affect the others."""
     worst = max(cost.values(), default=0.0)
     return [key for key in sorted(cost) if cost[key] > max(DISAGREES**2 * typical, 0.25 * worst)]
 
 
 def masked(cost: Mapping[Key, float], sigma_px: float) -> bool:
-    """Say whether one of few targets may be bad although none stands out."""
+    """Return whether one of few targets may be an outlier although none stands out."""
     worst = max(cost.values(), default=0.0)
     return 2 < len(cost) <= FEW and worst > DISAGREES**2 * max(sigma_px, MIN_PX) ** 2
 
 
 def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> list[tuple[str, str, str]]:
-    """Part the targets whose views put them far apart, by `off_px`; return (frame, target, reason)."""
+    """Separate the views of targets with a large distance `off_px`; return (frame, target, reason) of each."""
     shared = shared_keys(seen)
     typical = max(float(np.median([off_px[key] for key in shared])) if shared else 0.0, MIN_PX)
     worst = max((off_px[key] for key in shared), default=0.0)
@@ -105,7 +106,7 @@ def part_far(seen: Sequence[FrameObservations], off_px: Mapping[Key, float]) -> 
 
 
 def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
-    """Return in words why a target is left out."""
+    """Return words for why a target is left out."""
     cameras = [k for k, own in enumerate(seen) if any(e.key == key for e in own.values())]
     if len(cameras) > 1:
         return (
@@ -116,7 +117,7 @@ def why(seen: Sequence[FrameObservations], key: Key, how: str) -> str:
 
 
 def part(seen: Sequence[FrameObservations], key: Key) -> None:
-    """Give every view of the target a pose of its own: they still support their camera's intrinsics."""
+    """Give every view of the target a separate pose: they still constrain their camera's intrinsics."""
     for k, own in enumerate(seen):
         for place, entry in own.items():
             if entry.key == key:

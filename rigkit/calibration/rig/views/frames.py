@@ -1,7 +1,7 @@
-"""Before a rig is solved: which views show the same target at the same moment, and where the cameras roughly sit.
+"""Initial values of a rig: mounts of the cameras and poses of the targets, and the orientation of symmetric boards.
 
-A board that looks the same when turned has no first corner that two cameras agree on, and a frame whose images were not
-taken at one moment fits nothing. Both are settled by the mount that most frames agree on.
+The orientation of a board with rotational symmetry is ambiguous between cameras, and frames that are not synchronous
+are outliers. Both are resolved by the mount that most frames agree on.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import nearest_rotation, rotation_angle
 
 MAX_TRIED = 64
-"""Mounts tried. One of a good target of the right orientation is enough: of boards with four, half of them at another
-moment, 64 tries miss all good ones once in 5000 times."""
+"""Number of mounts tried. One from an inlier target in the right orientation is enough: for boards with four
+orientations and half of the targets outliers, 64 tries miss all of them once in 5000 times."""
 AGREE = 4.0
-"""Frames whose target lies within this many times the typical distance make the first mount."""
+"""Multiple of the typical distance up to which a target is an inlier of the initial mount."""
 RIVAL = 3.0
-"""A mount on which the frames agree nearly as well, within this factor, is a rival where it is another one ..."""
+"""A mount with a typical distance within this factor of the best is a rival if it differs ..."""
 OTHER_RAD = 0.5
-"""... by this angle: a board of the other orientation turns the mount half round or lays it over by twice its tilt."""
+"""... by this angle: the wrong orientation of a board rotates the mount by 180 degrees, or by twice the board's
+tilt."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Target:
-    """A target before a camera: its pose, points on it to compare by, (4, 3) mm, and its possible orientations."""
+    """A target seen by a camera: its pose, points on it for comparison, (4, 3) mm, and its possible orientations."""
 
     rotation: Mat3
     translation_mm: FloatArray
@@ -60,7 +61,7 @@ def places_of(names: Iterable[str], places: Places) -> tuple[Mat3, Points]:
 
 
 def target_poses(entries: Sequence[Observation], places: Places) -> tuple[Mat3, Points]:
-    """Return cam_from_target of every entry, as its board has it, (n, 3, 3) and (n, 3)."""
+    """Return cam_from_target of every entry from its board's pose, (n, 3, 3) and (n, 3)."""
     rotation, shift = _stack([e.cam_from_board for e in entries])
     if places:
         place, lever = places_of((e.board_id for e in entries), places)
@@ -89,7 +90,7 @@ def _targets(own: FrameObservations, places: Places) -> dict[Key, _Target]:
     for (key, entry), rotation, shift in zip(best.items(), *target_poses(list(best.values()), places), strict=True):
         corners, orientations = looks[entry.board_id]
         if entry.board_id in places:
-            # Two cameras may know the target by different boards: its own frame has the same points for both.
+            # Two cameras may see different boards of the target: points in its own frame are common to both.
             out[key] = _Target(rotation, shift, corners.max() * _FRAME, ALONE)
         else:
             out[key] = _Target(rotation, shift, corners, orientations)
@@ -101,10 +102,10 @@ ALONE = (Rigid3.identity(),)
 
 
 def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
-    """Return cam_from_rig of every camera, along a tree of pairs that share the most targets, and what is not sure
-    about them.
+    """Return cam_from_rig of every camera, along a spanning tree of pairs that share the most targets, and findings on
+    ambiguities.
 
-    Raises InputError where a camera shares none.
+    Raises InputError where a camera shares no target.
     """
     names, targets = views.names, [_targets(own, views.places) for own in views.seen]
     mounts: dict[int, Rigid3] = {0: Rigid3.identity()}
@@ -133,8 +134,8 @@ def mounts_of(views: RigViews) -> tuple[list[Rigid3], tuple[Finding, ...]]:
 
 
 def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | None]:
-    """Return cam2_from_cam1: of the motions of the single targets, in all orientations that look the same, the one
-    that most targets agree on, and then the middle of those that do; and another one that they agree on as well."""
+    """Return cam2_from_cam1, and a rival that fits as well or None. Candidates are the motions from single targets in
+    all their orientations; the result is the median over the inliers of the best one."""
     owner = [k for k, (_, b) in enumerate(pairs) for _ in b.orientations]
     orientations, levers = _stack([turn for _, b in pairs for turn in b.orientations])
     r1, r2 = (np.array([pairs[k][i].rotation for k in owner]) for i in (0, 1))
@@ -148,11 +149,11 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
     distance = np.linalg.norm(x2, axis=-1).mean(axis=-1)
     starts = np.flatnonzero(np.diff([-1, *owner]))
     tried = np.arange(0, len(owner), -(-len(owner) // MAX_TRIED))
-    apart_mm = np.einsum("hij,ncj->hnci", rotation[tried], x1) + shift[tried, None, None] - x2
-    offs = np.sqrt(np.einsum("hnci,hnci->hnc", apart_mm, apart_mm)).mean(axis=-1) / distance
+    off_mm = np.einsum("hij,ncj->hnci", rotation[tried], x1) + shift[tried, None, None] - x2
+    offs = np.sqrt(np.einsum("hnci,hnci->hnc", off_mm, off_mm)).mean(axis=-1) / distance
     typical = np.median(np.minimum.reduceat(offs, starts, axis=1), axis=1)
     angle = rotation_angle(rotation[tried])
-    # Of those that fit alike, cameras are more likely mounted alike than turned against each other.
+    # Of those that fit equally well, the one with the smaller rotation between the cameras is more likely.
     best = int(np.argmin(typical))
     alike = np.flatnonzero(typical <= RIVAL * typical[best] + 1e-9)
     turned = rotation_angle(rotation[tried[alike]] @ rotation[tried[best]].T)
@@ -169,7 +170,7 @@ def _motion(pairs: Sequence[tuple[_Target, _Target]]) -> tuple[Rigid3, Rigid3 | 
 
 
 def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
-    """Return the views with every board numbered from the corner that the first camera to see it numbers from."""
+    """Return the views with every board numbered from the same corner as in the first camera that sees it."""
     out: list[FrameObservations] = []
     for k, own in enumerate(views.seen):
         mine: FrameObservations = {}
@@ -189,10 +190,11 @@ def turned_alike(views: RigViews, mounts: Sequence[Rigid3]) -> RigViews:
 
 
 def separation(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
-    """Return how far apart the boards that share a pose put each other, in px: of two cameras the better of the two
-    directions (a board's pose may be bad in one of the images), the worst pair of cameras or of boards."""
+    """Return for each target the distance in px between views that share its pose, by transfer of its corners: for two
+    cameras the smaller of both directions (a board's pose may be inaccurate in one image), for more the worst pair of
+    cameras or of boards."""
     out: dict[Key, float] = {}
-    # A camera that saw nothing is as far from the others as it likes.
+    # A camera without views has no distance.
     some = [k for k, own in enumerate(views.seen) if own]
     best = {k: _most_seen(views.seen[k]) for k in some}
     corners = {k: _CameraCorners.of(views.seen[k]) for k in some}
@@ -211,8 +213,8 @@ def separation(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _CameraCorners:
-    """All corners that a camera saw, entry by entry: the entries, how many corners each has, the corners on their
-    boards (N, 3) mm and in the image (N, 2), and which were kept (N,)."""
+    """All corners of a camera, entry by entry: the entries, the number of corners of each, the corners on their boards
+    (N, 3) mm and in the image (N, 2), and the inliers (N,)."""
 
     entries: list[Observation]
     counts: IntArray
@@ -234,8 +236,8 @@ class _CameraCorners:
 def _transfer_px(
     first: Mapping[Key, Observation], second: _CameraCorners, motion: Rigid3, camera: Camera, places: Places
 ) -> dict[Key, float]:
-    """Return the RMS distance of each target's corners in the second camera from where the first's pose puts them, the
-    worst board where there are several."""
+    """Return the RMS distance of each target's corners in the second camera from their projection with the pose from
+    the first camera; of several boards the worst."""
     chosen = np.array([first.get(e.key, e) is not e for e in second.entries])
     if not chosen.any():
         return {}
@@ -262,7 +264,7 @@ def _transfer_px(
 
 
 def first_frames(keys: Sequence[Key], views: RigViews, mounts: Sequence[Rigid3]) -> tuple[Mat3, Points]:
-    """Return rig_from_target of every key, from the view that has the most of its corners."""
+    """Return rig_from_target of every key, from the view with the most corners."""
     best: dict[Key, tuple[int, int, Observation]] = {}
     for k, own in enumerate(views.seen):
         for key, entry in _most_seen(own).items():

@@ -1,14 +1,14 @@
-"""Frames of a rig that were put together wrongly: one picture twice, left for right, counted one off, turned, mirrored.
+"""Mix-ups of a rig's image files: duplicates, exchanged cameras, frames off by one, rotated or mirrored images.
 
-Cameras that disagree on where a board is have usually not taken their pictures at one moment. Mistakes with files look
-the same, and need no other pictures:
+Cameras that disagree on the pose of a board are usually not synchronous. Mix-ups of files have the same effect, but can
+be corrected without new images:
 
-- the same pictures under the names of two cameras, or the images of a frame under each other's names
-- an image that is missing in one camera, so that all later ones are one frame off
-- images that a program has turned by half a turn
-- one camera whose images are mirrored, which a chessboard does not show
+- the same images under the names of two cameras, or two cameras exchanged in a frame
+- an image that is missing in one camera, so that all later ones are off by one frame
+- images rotated by 180 degrees by a program
+- mirrored images of one camera, which a chessboard does not show
 
-Each is tried, and told where it puts right what disagrees.
+Each is tried, and reported if it resolves the disagreement.
 """
 
 from __future__ import annotations
@@ -31,21 +31,20 @@ from rigkit.core.identifiers import natural_key
 from rigkit.geometry.rigid3 import Rigid3
 
 ONE_PICTURE_PX = 0.1
-"""Corners that two cameras see at the same pixels within this, rms, are those of one picture, perhaps saved again: two
-cameras do not even have the same noise, and those of a rig do not look through one lens."""
+"""RMS difference of corners up to which two images are copies, perhaps compressed again: two cameras have at least
+different noise."""
 PUT_RIGHT = 0.1
-"""A mistake is one where, put right, views lie apart by no more than this part of what they do as they are. As they are
-they lie apart by as much as boards are moved between frames, a hundred pixels and more; put right, by what is wrong
-with lenses that were found from mixtures: 2 to 8 px where images of bouguet-stereo are exchanged."""
+"""Distance between views after correcting a mix-up, over that before, up to which it explains the disagreement. Before,
+it is the movement of the boards between frames, a hundred pixels and more; after, the error of lenses calibrated from
+mixed images: 2 to 8 px for exchanged images of bouguet-stereo (REAL)."""
 STEPS = (1, -1, 2, -2)
-"""So many frames off are tried."""
+"""Numbers of frames that a camera may be off by."""
 MIN_PUT_RIGHT = 3
-"""Fewer frames that agree when they are counted otherwise may do so by chance: a mount of six numbers fits one frame
-exactly."""
+"""Fewest frames that must agree after renumbering: the six parameters of a mount fit one frame exactly."""
 MIN_SHARE_PUT_RIGHT = 0.6
-"""Of the frames that disagree, the part that must agree then: some may be bad for another reason."""
+"""Part of the disagreeing frames that must agree then: some may be bad for another reason."""
 NAMED = 3
-"""So many frames are named."""
+"""Number of frames that a message lists."""
 
 
 def _all(frames: int) -> str:
@@ -53,9 +52,10 @@ def _all(frames: int) -> str:
 
 
 def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[Finding]:
-    """Return a finding for every two cameras that have the same pictures in some frames, of (frame, view) by camera.
+    """Return a finding for every two cameras with copies of one image in some frames; `views` are (frame, view) by
+    camera.
 
-    Raises InputError where two cameras have the same ones in all frames.
+    Raises InputError where they are copies in all frames.
     """
     out = []
     shown = {name: {(frame, view.board.board_id): view for frame, view in own} for name, own in views.items()}
@@ -79,9 +79,8 @@ def same_pictures(views: Mapping[str, Sequence[tuple[str, BoardView]]]) -> list[
 
 
 def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: Iterable[Key]) -> list[Finding]:
-    """Return findings on the frames `left_out` that agree with the `mounts` of the others when two cameras' images are
-    exchanged there, or when those of one camera are counted otherwise. `views` are as they were before anything was
-    left out.
+    """Return findings on the frames `left_out` that agree with the `mounts` of the others after exchanging the images
+    of two cameras, rotating those of one, or renumbering them. `views` include the frames left out.
     """
     frames, names = {frame for frame, _ in left_out}, views.names
     those = views.with_seen([_of_frames(one, frames) for one in views.seen])
@@ -104,11 +103,11 @@ def put_together_wrongly(views: RigViews, mounts: Sequence[Rigid3], left_out: It
 
 
 def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, float]) -> list[Finding]:
-    """Return a finding where frames that are left out, and lie apart `now`, agree with others before or after them."""
+    """Return a finding where frames left out, with distances `now`, agree with frames before or after them."""
     if not now:
         return []
     seen = views.seen
-    # A frame that only one camera has may be where the other one's image belongs.
+    # The image of another camera may belong to a frame that only one camera has.
     agree = {frame for frame, _ in shared_keys(seen)} - now.keys()
     typical = dict.fromkeys(_frames_of(seen), float(np.median(list(now.values()))))
     for k in range(1, len(seen)):
@@ -128,7 +127,8 @@ def _miscounted(views: RigViews, mounts: Sequence[Rigid3], now: Mapping[str, flo
 
 
 def why_nothing_agrees(views: RigViews) -> Finding | None:
-    """Return with which mistake put right the frames agree, where most of them do not; None with none."""
+    """Return a finding on the mix-up whose correction makes the frames agree, if most disagree; None if there is
+    none."""
     names, seen = views.names, views.seen
     limit = PUT_RIGHT * _typical_px(views)
     for k, camera in enumerate(views.cameras):
@@ -161,7 +161,7 @@ def why_nothing_agrees(views: RigViews) -> Finding | None:
 
 
 def _typical_px(views: RigViews) -> float:
-    """Return how far apart views usually are by the mounts that they tell, px; infinite where they tell none."""
+    """Return the median distance between views, px, with the mounts from `mounts_of`; infinite if there are none."""
     try:
         mounts, _ = mounts_of(views)
     except InputError:
@@ -171,7 +171,8 @@ def _typical_px(views: RigViews) -> float:
 
 
 def _as_one_frame_has_it(views: RigViews, k: int, changed: FrameObservations) -> Iterator[set[str]]:
-    """Yield for each frame in which ones what camera k saw agrees better `changed`, by the mount that it tells."""
+    """Yield for each frame, with the mounts that it alone gives, the frames in which camera k agrees better
+    `changed`."""
     trial = views.with_camera(k, changed)
     for frame in _in_order({frame for frame, _ in views.seen[k]}):
         try:
@@ -187,7 +188,7 @@ def _off(views: RigViews, mounts: Sequence[Rigid3]) -> dict[Key, float]:
 
 
 def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:
-    """Return how far apart views are in each frame, the worst board of each."""
+    """Return the distance between views in each frame, of the worst board."""
     out: dict[str, float] = {}
     for (frame, _), value in off_px.items():
         out[frame] = max(out.get(frame, 0.0), value)
@@ -195,7 +196,7 @@ def _by_frame(off_px: Mapping[Key, float]) -> dict[str, float]:
 
 
 def _put_right(now: Mapping[str, float], then: Mapping[str, float]) -> list[str]:
-    """Return the frames in which views that are far apart `now` no longer are."""
+    """Return the frames in which the distance `then` is at most PUT_RIGHT times that `now`."""
     return _in_order(frame for frame, value in then.items() if value <= PUT_RIGHT * now.get(frame, 0.0))
 
 
@@ -208,7 +209,7 @@ def _of_frames(own: FrameObservations, frames: Iterable[str]) -> FrameObservatio
 
 
 def _counted(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObservations:
-    """Return what camera k saw with every image taken for that of so many frames before."""
+    """Return the observations of camera k with every image assigned to the frame `step` frames before."""
     frames = _in_order(_frames_of(seen))
     before = {frames[n]: frames[n - step] for n in range(len(frames)) if 0 <= n - step < len(frames)}
     return {
@@ -219,7 +220,7 @@ def _counted(seen: Sequence[FrameObservations], k: int, step: int) -> FrameObser
 
 
 def _turned(own: FrameObservations, camera: Camera) -> FrameObservations:
-    """Return what a camera saw as it is in images turned by half a turn, about the lens's axis."""
+    """Return a camera's observations in images rotated by 180 degrees about the optical axis."""
     half = Rigid3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     return {
         key: replace(
@@ -232,8 +233,9 @@ def _turned(own: FrameObservations, camera: Camera) -> FrameObservations:
 
 
 def _mirrored(entry: Observation, camera: Camera, axis: int) -> Observation:
-    """Return a board as it is in the mirrored image, left and right of the lens's axis exchanged. It is right-handed as
-    before where columns (`axis` 0) or rows (1) are counted from the other end: which, the colours of its squares say.
+    """Return an observation in the image mirrored left to right at the optical axis. The board is right-handed again
+    with columns (`axis` 0) or rows (1) numbered from the other end; which of both depends on the colours of its
+    squares.
     """
     view, board = entry.view, entry.view.board
     pixels, grid = view.pixels.copy(), view.grid.copy()
@@ -248,7 +250,7 @@ def _mirrored(entry: Observation, camera: Camera, axis: int) -> Observation:
 
 
 def _one_picture(one: BoardView, other: BoardView) -> bool:
-    """Say whether two views have the same corners at the same pixels."""
+    """Return whether two views have the same corners at the same pixels."""
     if one.grid.shape != other.grid.shape or (one.grid != other.grid).any():
         return False
     return bool(np.sqrt(np.mean(np.sum((one.pixels - other.pixels) ** 2, axis=1))) <= ONE_PICTURE_PX)

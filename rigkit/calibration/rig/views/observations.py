@@ -1,4 +1,4 @@
-"""A board as a camera of a rig saw it, and the orientations that a board which looks the same turned can have."""
+"""Observations of boards by the cameras of a rig, and the orientations of boards with rotational symmetry."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from rigkit.core.detections import BoardView, grid_turned
 from rigkit.geometry.rigid3 import Rigid3
 
 Places = Mapping[str, tuple[str, Rigid3]]
-"""Board -> its target and target_from_board, of the boards that are mounted to others."""
+"""Board -> its target and target_from_board, for boards mounted to others."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """A board in an image, as the camera's own calibration left it.
+    """A board in an image, with its result in the camera's own calibration.
 
     Attributes
     ----------
     view, kept, cam_from_board : as in the calibration.
-    squared_px : (N,) squared 2-D residuals of the corners there.
-    frame : everything of this frame was taken at one moment.
-    key : (frame, target), or a name of its own: everything with this key shares one pose.
+    squared_px : (N,) squared 2-D residuals of the corners.
+    frame : images of one frame were taken at one moment.
+    key : (frame, target), or a unique key: views with the same key share one pose.
     """
 
     view: BoardView
@@ -44,8 +44,8 @@ class Observation:
         return self.view.board.board_id
 
     def turned(self, quarter_turns: int, board: Board | None = None) -> Observation:
-        """Return the same with the corners numbered from another corner, as those of `board` where one is given (of the
-        same size, turned likewise)."""
+        """Return the observation with the board numbered from another corner, and as that of `board` if given, which
+        has to have the size after the turn."""
         if quarter_turns == 0 and board is None:
             return self
         old = self.view.board
@@ -58,16 +58,16 @@ class Observation:
 
 
 FrameObservations = dict[tuple[str, str], Observation]
-"""What a camera saw, by (frame, board)."""
+"""Observations of a camera, by (frame, board)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RigViews:
-    """What a rig is solved from.
+    """The input of a rig calibration.
 
     Attributes
     ----------
-    names, seen, single : of every camera what it is called, what it saw, and its calibration alone.
+    names, seen, single : name, observations, and own calibration of every camera.
     places : of the boards that are mounted to others.
     """
 
@@ -78,15 +78,15 @@ class RigViews:
 
     @property
     def cameras(self) -> list[Camera]:
-        """The cameras of points in mm, as each alone has been calibrated."""
+        """The `near` cameras of the single calibrations."""
         return [alone.near for alone in self.single]
 
     def with_seen(self, seen: Sequence[FrameObservations]) -> RigViews:
-        """Return the same where the cameras saw this."""
+        """Return the views with other observations of all cameras."""
         return replace(self, seen=seen)
 
     def with_camera(self, k: int, seen: FrameObservations) -> RigViews:
-        """Return the same where camera `k` saw this."""
+        """Return the views with other observations of camera `k`."""
         return self.with_seen([*self.seen[:k], seen, *self.seen[k + 1 :]])
 
 
@@ -97,13 +97,12 @@ def outer_corners(board: Board) -> Points:
 
 
 def turns_of(board: Board) -> tuple[Rigid3, ...]:
-    """Return numbered_from_old of every orientation that the board can have."""
+    """Return numbered_from_old of every possible orientation of the board."""
     return tuple(board_turn(board, turns) for turns in same_looks(board))
 
 
 def frame_observations(own: Sequence[tuple[str, BoardView]], result: Calibration) -> FrameObservations:
-    """Return the views that the camera's own calibration used, numbered as it numbers them; every board is a target of
-    its own."""
+    """Return the views used in the camera's own calibration, with its numbering; every board is its own target."""
     every = np.nan_to_num((result.corners.residuals_px**2).sum(axis=1))
     each = np.split(every, np.cumsum(result.corners.count)[:-1])
     used = {(v.image, v.board_id): (v, squared) for v, squared in zip(result.views, each, strict=True)}
