@@ -1,1 +1,1 @@
-"""What every part speaks of: errors, arrays, boards, detections, matches, clouds, measured truth, processes."""
+"""Types used by all parts: errors, arrays, boards, detections, matches, clouds, measured truth, processes."""

@@ -1,4 +1,4 @@
-"""Array aliases for signatures, and the one gate by which arrays enter results.
+"""Array aliases for signatures, validation of arrays, and small fast array functions.
 
 All arrays are float64 with points in rows; a leading `...` broadcasts. Jacobians put the dependent variable first.
 """
@@ -15,25 +15,25 @@ from numpy.typing import ArrayLike, NDArray
 from rigkit.core.errors import InputError
 
 BRIGHT_SHARE = 0.999
-"""Of the pixels; the rest may be brighter than the image's bits: hot, or a glint."""
+"""Quantile of the pixels that determines the number of bits; brighter pixels are hot, or a glint."""
 
 NOT_NUMBERS = "bSUmMV"
-"""Kinds of arrays that numpy would turn into numbers, and that are none: truth values, words, dates."""
+"""Kinds of arrays that numpy would convert to numbers: booleans, strings, dates."""
 MAX_ASYMMETRY = 1e-6
-"""Of a covariance, in units of the two sigmas: solving leaves 1e-12 of a well-posed problem."""
+"""Of a covariance, in units of the two sigmas: the solution of a well-posed problem leaves 1e-12."""
 MAX_VARIANCE = 1e36
-"""Of a number of at most 1e15 of which nothing is known; products of much larger ones overflow."""
+"""Variance of a completely unknown number of at most 1e15; products of much larger ones overflow."""
 MIN_EIGENVALUE = -1e-6
-"""Of a correlation matrix, for each row that it has: rounding of an inverse makes a zero slightly negative."""
+"""Of a correlation matrix, times the number of its rows: rounding of an inverse makes zeros slightly negative."""
 
 SORTED_SOONER = 1000
-"""So few numbers are sorted in less time than is needed to say which are wanted."""
+"""Below so many numbers sorting is faster than partitioning."""
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 GreyImage = NDArray[np.uint8] | NDArray[np.float32]
-"""Grey levels 0..255. Those of an 8-bit camera stay bytes: four times the memory costs as much time as the search."""
+"""Grey levels 0..255. Images of an 8-bit camera stay bytes: four times the memory costs as much time as detection."""
 Pixels = Annotated[FloatArray, "(..., 2) px, (u, v), (0, 0) the centre of the top-left pixel"]
 Points = Annotated[FloatArray, "(..., 3) mm"]
 Rays = Annotated[FloatArray, "(..., 3) unit"]
@@ -48,7 +48,8 @@ Projected = Annotated[tuple[FloatArray, FloatArray, BoolArray], "u, v of pixels 
 def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, finite: bool = True) -> FloatArray:
     """Return a read-only float64 copy of `value`, checked against `shape`, in which None stands for any length.
 
-    Raises InputError, which calls it `name`, for another shape, what is no number, or, where `finite`, not finite.
+    Raises InputError, with `name` in the message, for another shape, values that are no numbers or, if `finite`, values
+    that are not finite.
     """
     try:
         raw = np.asarray(value)
@@ -68,7 +69,7 @@ def as_array(value: ArrayLike, shape: tuple[int | None, ...], name: str, *, fini
 def keep_arrays(
     result: object, *, finite: bool = True, optional: bool = False, **shapes: tuple[int | None, ...]
 ) -> None:
-    """Put read-only copies of the fields named in `shapes` into a frozen `result`, checked as by `as_array`.
+    """Replace the fields named in `shapes` of a frozen `result` by read-only copies, checked as by `as_array`.
 
     `optional`: these fields may also be None.
     """
@@ -79,13 +80,13 @@ def keep_arrays(
 
 
 def keep_indices(result: object, **shapes: tuple[int | None, ...]) -> None:
-    """Do the same with fields of whole numbers, checked as by `as_indices`."""
+    """Replace integer fields of a frozen `result` by read-only copies, checked as by `as_indices`."""
     for name, shape in shapes.items():
         object.__setattr__(result, name, as_indices(getattr(result, name), shape, name))
 
 
 def as_floats(value: ArrayLike, tail: tuple[int, ...], name: str) -> FloatArray:
-    """Return `value` as float64, not copied, which has the axes `tail` behind any others; else raises InputError."""
+    """Return `value` as a float64 array, not copied, of shape (..., *tail); raises InputError for any other shape."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -96,7 +97,7 @@ def as_floats(value: ArrayLike, tail: tuple[int, ...], name: str) -> FloatArray:
 
 
 def as_mask(value: ArrayLike, shape: tuple[int, ...], name: str) -> BoolArray:
-    """Return `value`, which has to be an array of truth values of this shape; else raises InputError."""
+    """Return `value`, a boolean array of this shape; raises InputError for anything else."""
     array = np.asarray(value)
     if array.dtype != np.bool_ or array.shape != shape:
         words = "x".join(map(str, shape))
@@ -107,8 +108,8 @@ def as_mask(value: ArrayLike, shape: tuple[int, ...], name: str) -> BoolArray:
 def as_covariance(value: ArrayLike, name: str, size: int) -> FloatArray:
     """Return a read-only copy of a covariance (`size`, `size`).
 
-    Raises InputError: another shape, not finite, not symmetric, all zero, or with a negative variance in some
-    direction: beyond what rounding leaves of the correlations, `MAX_ASYMMETRY` and `MIN_EIGENVALUE`.
+    Raises InputError for another shape, or a matrix that is not finite, not symmetric, zero, or not positive
+    semidefinite, with the tolerances `MAX_ASYMMETRY` and `MIN_EIGENVALUE` for rounding.
     """
     covariance = as_array(value if size else np.zeros((0, 0)), (size, size), name)
     variance = np.diag(covariance)
@@ -151,10 +152,8 @@ def as_indices(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> In
 
 
 def in_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return an image of 8 bits as it is, one of 16 by the upper eight of those bits that its bright pixels need.
-
-    Cameras of 10 and 12 bits fill the lower bits of 16.
-    """
+    """Return an 8-bit image unchanged, and a 16-bit image reduced to the upper eight of the bits that its bright pixels
+    use: cameras of 10 and 12 bits fill the lower bits of 16."""
     if image.dtype == np.uint8:
         return image
     bright = int(np.quantile(image[::8, ::8], BRIGHT_SHARE)) if image.size else 0
@@ -163,7 +162,7 @@ def in_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _check_shape(array: NDArray[Any], shape: tuple[int | None, ...], name: str) -> None:
-    # Written out: this runs for every array of every view.
+    # A loop, for speed: this runs for every array of every view.
     fits = array.ndim == len(shape)
     if fits:
         for want, have in zip(shape, array.shape, strict=True):
@@ -184,25 +183,26 @@ def without_nan(value: Any) -> Any:
 
 
 def known_median(values: FloatArray) -> float:
-    """Return the median of those numbers that are not NaN; NaN where there are none. np.nanmedian takes five times as
+    """Return the median of the numbers that are not NaN; NaN if there are none. np.nanmedian takes five times as
     long."""
     known = values[~np.isnan(values)]
     return median_of(known) if known.size else math.nan
 
 
 def rows_where(values: FloatArray, which: BoolArray) -> FloatArray:
-    """Return the rows (M, K) of `values` (..., K) where `which` (...) holds. values[which] takes five times as long."""
+    """Return the rows (M, K) of `values` (..., K) where `which` (...) is true. values[which] takes five times as
+    long."""
     return values.reshape(-1, values.shape[-1])[which.reshape(-1).nonzero()[0]]
 
 
 def upper_median(values: FloatArray) -> float:
-    """Return the median of N > 0 numbers, the upper one of two; for some fifty np.median takes ten times as long."""
+    """Return the upper median of N > 0 numbers. For fifty numbers np.median takes ten times as long."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 
 
 def quantiles_of(values: FloatArray, shares: Sequence[float]) -> list[float]:
-    """Return the quantiles of N > 0 numbers, interpolated. np.quantile takes several times as long, to ask how."""
+    """Return the linearly interpolated quantiles of N > 0 numbers. np.quantile takes several times as long."""
     ordered, out = np.sort(values), []
     for share in shares:
         below, part = divmod(share * (len(ordered) - 1), 1.0)
@@ -212,8 +212,8 @@ def quantiles_of(values: FloatArray, shares: Sequence[float]) -> list[float]:
 
 
 def symmetric_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
-    """Return the pseudo-inverse of one symmetric matrix (n, n), in which eigenvalues of up to `rcond` of the largest
-    count as zero. Of a small one np.linalg.pinv takes six times as long."""
+    """Return the pseudo-inverse of a symmetric matrix (n, n); eigenvalues up to `rcond` times the largest count as
+    zero. For a small matrix np.linalg.pinv takes six times as long."""
     values, vectors = np.linalg.eigh(matrix)
     size = np.abs(values)
     known = size > rcond * size.max(initial=0.0)
@@ -221,15 +221,15 @@ def symmetric_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
 
 
 def scaled_pinv(matrix: FloatArray, rcond: float = 1e-15) -> FloatArray:
-    """Return the same of a covariance or information (n, n) of unknowns with units of their own: its eigenvalues are
-    compared once its diagonal is one. What has none stays zero."""
+    """Return the pseudo-inverse of a covariance or information (n, n) of unknowns with different units: as
+    `symmetric_pinv` after scaling to a unit diagonal. Rows with a zero diagonal stay zero."""
     diagonal = np.diag(matrix)
     scale = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
     return np.asarray(symmetric_pinv(matrix * scale[:, None] * scale, rcond) * scale[:, None] * scale)
 
 
 def median_of(values: FloatArray) -> float:
-    """Return the median of N > 0 numbers, which are reordered. np.median takes four times as long, to look for NaN."""
+    """Return the median of N > 0 numbers, which are reordered in place. np.median takes four times as long."""
     low, high = (values.size - 1) // 2, values.size // 2
     if values.size < SORTED_SOONER:
         values.sort()

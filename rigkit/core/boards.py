@@ -1,4 +1,4 @@
-"""Boards as a person measured them, and where their points lie: chessboards, and whatever else `core.patterns` has."""
+"""Calibration boards as declared by a person, with the positions of their points."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rigkit.core.patterns.chessboard import Chessboard
 class Board:
     """A board of `columns` x `rows` points: the INNER corners of a chessboard, the corners of tags, centres of circles.
 
-    Frame: origin at the first point, x along the columns, y along the rows, z into the board (so a camera that looks at
-    the board's face sees x, y, z right-handed like its own axes).
+    Frame: origin at the first point, x along the columns, y along the rows, z into the board, so that the axes of a
+    camera in front of the board are parallel to the board's.
 
     Attributes
     ----------
@@ -75,22 +75,22 @@ class Board:
 
     @property
     def corner_count(self) -> int:
-        """Places of the index grid; a pattern may leave some of them empty."""
+        """Number of places of the index grid, of which a pattern may leave some empty."""
         return self.columns * self.rows
 
     @property
     def identified(self) -> bool:
-        """Whether marks in the image tell which board and which point it is."""
+        """Whether markers identify the board and its points in an image."""
         return self.pattern.identified
 
     @property
     def turns(self) -> tuple[int, ...]:
-        """The quarter turns, of 1, 2 and 3, after which the board looks as before: no single image can tell them."""
+        """The rotational symmetries of the board, as quarter turns of 1, 2 and 3."""
         return self.pattern.turns(self.columns, self.rows, self.square_x_mm == self.square_y_mm)
 
     @property
     def looks_same_turned(self) -> bool:
-        """Whether the board looks the same turned by 180 degrees: then no single image can tell its first corner."""
+        """Whether the board is symmetric under a rotation by 180 degrees, so that its first corner is ambiguous."""
         return 2 in self.turns
 
     def grid(self) -> IntArray:
@@ -99,11 +99,11 @@ class Board:
         return np.stack([column, row], axis=-1)
 
     def exists(self) -> BoolArray:
-        """Say of `grid()` where there is a point, (columns * rows,)."""
+        """Return which places of `grid()` have a point, (columns * rows,)."""
         return self.pattern.exists(self.columns, self.rows).ravel()
 
     def index(self, grid: IntArray) -> IntArray:
-        """Return the places of points `grid` (N, 2) in `grid()` and `points()`, (N,)."""
+        """Return the indices (N,) of points `grid` (N, 2) in `grid()` and `points()`."""
         return np.asarray(grid[:, 1] * self.columns + grid[:, 0], dtype=np.int64)
 
     def points(self, grid: IntArray | None = None) -> Points:
@@ -112,7 +112,7 @@ class Board:
         return np.concatenate([chosen * np.array(self.squares_mm), np.zeros((len(chosen), 1))], axis=1)
 
     def ink(self, *, upright: bool = False) -> Ink:
-        """Return what is printed on the board, as `Pattern.ink`; raises InputError where its pattern cannot be."""
+        """Return what is printed on the board, as `Pattern.ink`; raises InputError where the pattern is impossible."""
         try:
             return self.pattern.ink(self.columns, self.rows, self.squares_mm, upright=upright)
         except InputError as error:
@@ -123,6 +123,6 @@ class Board:
         return self.pattern.describe(self.columns, self.rows, self.squares_mm)
 
     def with_squares(self, x_mm: float, y_mm: float) -> Board:
-        """Return the board with squares of another size, and a pattern that grew with them."""
+        """Return the board with squares of another size, and the pattern scaled with them."""
         growth = (x_mm / self.square_x_mm + y_mm / self.square_y_mm) / 2.0
         return replace(self, square_x_mm=x_mm, square_y_mm=y_mm, pattern=self.pattern.scaled(growth))

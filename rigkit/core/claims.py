@@ -1,4 +1,4 @@
-"""Statements that one number is below another, and how far a set of comparisons bears them out."""
+"""Claims that one number is below another, evaluated over a set of comparisons."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What a claim says of two numbers of one unit: that `smaller` is below `larger`.
+    """An instance of a claim: that `smaller` is below `larger`.
 
     Attributes
     ----------
     smaller, larger : the numbers.
-    smaller_name, larger_name : what they are, in words.
+    smaller_name, larger_name : their names, in words.
     unit : of both.
-    or_equal : whether the claim holds where they are the same, as for a limit.
+    or_equal : whether the claim holds for equal numbers, as for a limit.
     """
 
     smaller: float
@@ -29,13 +29,13 @@ class Comparison:
 
     @property
     def holds(self) -> bool:
-        """Whether it is so; a number that is not known never bears a claim out."""
+        """Whether the claim holds; with NaN it does not."""
         return self.smaller < self.larger or (self.or_equal and self.smaller == self.larger)
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """In how many of all comparisons a claim holds, and the worst one that contradicts it."""
+    """Number of comparisons in which a claim holds, and the worst counterexample."""
 
     text: str
     holds_in: int
@@ -44,7 +44,7 @@ class Verdict:
 
     @property
     def holds(self) -> bool:
-        """Whether every comparison bears the claim out."""
+        """Whether the claim holds in every comparison."""
         return self.holds_in == self.comparisons > 0
 
     @property
@@ -57,7 +57,7 @@ class Verdict:
 
 
 def evaluate_claim(text: str, comparisons: Iterable[Comparison]) -> Verdict | None:
-    """Return the verdict on a claim; None where there is nothing to compare, which bears nothing out."""
+    """Return the verdict on a claim; None without comparisons."""
     holds, total, against, excess = 0, 0, "", -np.inf
     for c in comparisons:
         total += 1

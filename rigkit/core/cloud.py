@@ -26,9 +26,9 @@ class OrientedCloud:
     sigma_mm : (N,) predicted standard deviation of the point (root of the covariance's largest eigenvalue).
     normal_sigma_rad : (N,) predicted rms angle of the normal.
     board_ids : names of the boards.
-    calibration_in_sigmas : whether the sigmas include the uncertainty of the cameras' calibrations; else the cameras
-        count as exact, and the corners' noise and the relative pose are all that is in them.
-    from_origin : whether all points were seen from the origin, as those of one pair: the way to them is empty.
+    calibration_in_sigmas : whether the sigmas include the uncertainty of the cameras' calibrations, besides that of the
+        corners and the relative pose.
+    from_origin : whether all points were seen from the origin, as those of one pair: the lines to them are free space.
     """
 
     points_mm: Points

@@ -1,4 +1,4 @@
-"""What was seen of a board in an image."""
+"""Detected corners of boards in images."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from rigkit.core.printing import brief
 
 
 def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> IntArray:
-    """Return (column, row) (N, 2) of corners numbered from the corner that lies `quarter_turns` x 90 degrees further.
-
-    One turn makes (column, row) into (rows - 1 - row, column), right-handed as before. `size` : (columns, rows) of the
-    grid before the turn.
+    """Return (column, row) (N, 2) of corners after numbering the grid from another corner, by `quarter_turns` x 90
+    degrees. One turn maps (column, row) to (rows - 1 - row, column), which keeps the grid right-handed. `size` is
+    (columns, rows) before the turn.
 
     >>> grid_turned(np.array([[0, 0], [2, 1]]), (3, 2), 1).tolist()
     [[1, 0], [0, 2]]
@@ -32,7 +31,7 @@ def grid_turned(grid: IntArray, size: tuple[int, int], quarter_turns: int) -> In
 
 
 def _check_corners(seen: BoardDetection | BoardView) -> None:
-    """Make grid, pixels and sigmas arrays of one length; raises InputError where they are not."""
+    """Replace grid, pixels and sigmas by read-only arrays; raises InputError unless they have one length."""
     keep_indices(seen, grid=(None, 2))
     n = len(seen.grid)
     keep_arrays(seen, pixels=(n, 2), sigma_px=(n,))
@@ -44,10 +43,10 @@ class BoardDetection:
 
     Attributes
     ----------
-    board_id : the board's name; None while unknown (several boards of one size, or no size given).
-    columns, rows : size of the grid found (of the board, where that is known).
+    board_id : the board's name; None if unknown (several boards of one size, or no size given).
+    columns, rows : size of the grid found, or of the board if that is known.
     grid : (N, 2) int, (column, row) of each corner, right-handed (x right, y down, z away from the viewer), sorted row
-        by row. Need not be complete.
+        by row. Corners may be missing.
     pixels : (N, 2)
     sigma_px : (N,) predicted standard deviation per axis.
     """
@@ -83,7 +82,7 @@ class BoardDetection:
         return BoardDetection(self.board_id, columns, rows, grid[order], self.pixels[order], self.sigma_px[order])
 
     def named(self, board_id: str) -> BoardDetection:
-        # Its corners were looked at when it was made, and do not change.
+        # Without checks: the corners were checked before, and do not change.
         out = object.__new__(BoardDetection)
         for name in self.__slots__:
             object.__setattr__(out, name, board_id if name == "board_id" else getattr(self, name))
@@ -122,7 +121,7 @@ class BoardView:
 
     @classmethod
     def from_detection(cls, image: str, detection: BoardDetection, boards: Sequence[Board]) -> BoardView:
-        """Attach the board that the detection names; raises InputError where it names none of `boards`."""
+        """Return the view of a detection with its board, by name; raises InputError if none of `boards` has it."""
         for board in boards:
             if board.board_id == detection.board_id:
                 return cls(image, board, detection.grid, detection.pixels, detection.sigma_px)

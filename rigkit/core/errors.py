@@ -1,4 +1,4 @@
-"""The errors that a person sees. Each message says what is wrong, where, and what to do about it."""
+"""Errors for the user. Each message says what is wrong, where, and what to do about it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """What the command line returns."""
+    """Exit codes of the command line."""
 
     WELL = 0
     CHECK_FAILED = 1
@@ -23,7 +23,7 @@ class RigkitError(Exception):
     exit_code: ExitCode = ExitCode.BAD_INPUT
 
     def __str__(self) -> str:
-        """One line, whatever characters the name of a file or a value in it has."""
+        """Return the message as one line, with unprintable characters escaped."""
         return printable(super().__str__())
 
 
@@ -34,13 +34,13 @@ class CheckFailed(RigkitError):
 
 
 class InputError(RigkitError):
-    """What was handed in cannot be used: a file, an option, an array."""
+    """Invalid input: a file, an option, an array."""
 
     exit_code = ExitCode.BAD_INPUT
 
 
 class InstallationError(RigkitError):
-    """A part of rigkit itself is missing or does not fit: the message says what to type."""
+    """A part of rigkit itself is missing or out of date: the message says what to type."""
 
     exit_code = ExitCode.BAD_INPUT
 
@@ -52,20 +52,20 @@ class DegenerateError(RigkitError):
 
 
 class InternalError(RigkitError):
-    """A fault of rigkit itself in one part of the work, where the rest of the work goes on."""
+    """A bug of rigkit in one part of the work, while the rest of the work continues."""
 
     exit_code = ExitCode.BUG
 
     def __str__(self) -> str:
-        """With the lines that say where it happened."""
+        """Return the message with its traceback lines."""
         return Exception.__str__(self)
 
 
 def interruption(error: BaseException) -> KeyboardInterrupt | None:
-    """Return the interruption that `error` came of; None where it came of something else. Libraries that are
-    interrupted while they are loaded say that they could not be."""
+    """Return the KeyboardInterrupt among the causes of `error`, or None: libraries that are interrupted while they are
+    imported raise an ImportError."""
     cause: BaseException | None = error
-    # An error that is raised again from one that came of it is among its own causes.
+    # An error raised again from one of its consequences is among its own causes.
     seen: set[int] = set()
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         seen.add(id(cause))
@@ -75,5 +75,5 @@ def interruption(error: BaseException) -> KeyboardInterrupt | None:
 
 
 def printable(text: str) -> str:
-    """Return the text with escapes in place of line ends, codes for terminals and characters that no file can hold."""
+    """Return the text with line ends, terminal codes and other unprintable characters escaped."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -1,4 +1,4 @@
-"""What a person should know about a result: how grave it is, what is the matter, where, and what to do."""
+"""Findings about a result: severity, message, image, and remedy."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Severity(StrEnum):
-    """How grave a finding is."""
+    """Severity of a finding."""
 
     GOOD = "good"
     LOOK = "look"
@@ -17,14 +17,14 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that a person should know about a result.
+    """One finding about a result.
 
     Attributes
     ----------
-    severity : whether the result can be used (GOOD), deserves a look (LOOK) or must not be trusted (BAD).
-    message : what is the matter and how one can tell, without a full stop.
-    image : the image that it is about, if it is about one.
-    remedy : what to do, if something can be done.
+    severity : whether the result can be used (GOOD), should be looked at (LOOK) or must not be trusted (BAD).
+    message : what is wrong and what shows it, without a full stop.
+    image : the image concerned, if it is a single one.
+    remedy : what to do, if anything.
 
     >>> str(Finding.look("5 images only", "take at least 8"))
     'look: 5 images only; take at least 8'
@@ -57,12 +57,12 @@ class Finding:
 
 
 def most_severe_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return `findings` in the order of their severity, the gravest first; equally grave ones keep theirs."""
+    """Return `findings` in the order of their severity, the worst first (stable)."""
     order = list(Severity)
     return tuple(sorted(findings, key=lambda finding: -order.index(finding.severity)))
 
 
 def worst(findings: Iterable[Finding]) -> Severity:
-    """Return the gravest severity among `findings`; GOOD where there are none."""
+    """Return the worst severity of `findings`; GOOD if there are none."""
     order = list(Severity)
     return max((finding.severity for finding in findings), key=order.index, default=Severity.GOOD)

@@ -26,7 +26,7 @@ from rigkit.core.printing import brief
 
 
 class CentralCamera(Protocol):
-    """What geometry asks of a camera (`rigkit.cameras.base.Camera` in full)."""
+    """The part of `rigkit.cameras.base.Camera` that two-view geometry needs."""
 
     def unproject(self, pixels: Pixels) -> tuple[Rays, BoolArray]:
         """Return unit rays and which of them exist."""
@@ -41,11 +41,11 @@ class DirectionPairs:
 
     Attributes
     ----------
-    image1, image2 : (N, K, 2) px; direction k of point n in either image. Lengths are meaningful where `scaled`.
-    valid : (N, K) bool; invalid directions are ignored by every estimator.
+    image1, image2 : (N, K, 2) px; direction k of point n in either image. Lengths are meaningful if `scaled`.
+    valid : (N, K) bool; every estimator ignores invalid directions.
     scaled : whether |image2| / |image1| is the true local stretch (harmonic lengths on a chessboard).
-    kinds : K names, here ("horizontal", "vertical", "diagonal").
-    pixels1, pixels2 : (N, 2) where the directions are, or None.
+    kinds : names of the K directions.
+    pixels1, pixels2 : (N, 2) positions of the points, or None.
     """
 
     image1: FloatArray
@@ -79,7 +79,7 @@ class DirectionPairs:
                 object.__setattr__(self, name, as_array(getattr(self, name), (n, 2), f"directions' {name}"))
 
     def select(self, which: BoolArray | IntArray) -> DirectionPairs:
-        """Return those at the points picked by a mask or by indices, without the pixels."""
+        """Return the directions at points selected by a mask or indices, without their pixels."""
         return replace(
             self,
             image1=self.image1[which],
@@ -92,7 +92,7 @@ class DirectionPairs:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class Matches:
-    """N corresponding points of two images, with all that the geometry needs to know of the two cameras there.
+    """N corresponding points of two images, with the local geometry of both cameras.
 
     Attributes
     ----------
@@ -100,10 +100,10 @@ class Matches:
     rays1, rays2 : (N, 3) unit rays of those pixels in their camera's frame.
     jacobians1, jacobians2 : (N, 3, 2) d ray / d pixel.
     sigma1_px, sigma2_px : (N,) corner standard deviation per axis.
-    board_index : (N,) int, which board; -1 where none.
+    board_index : (N,) int, index of the board; -1 for none.
     grid : (N, 2) int, (column, row) on that board.
-    K1, K2 : (3, 3) pinhole matrices where the pixels are those of perspective views, else None (raw fisheye).
-    A21 : (N, 2, 2) affinity from image 1 to image 2 in these pixels, or None; NaN where there is none.
+    K1, K2 : (3, 3) camera matrices of perspective views, else None (raw fisheye).
+    A21 : (N, 2, 2) affinity from image 1 to image 2 in these pixels, or None; NaN for points without one.
     sigma_A : (N,) standard deviation of an entry of A21, or None.
     """
 
@@ -150,9 +150,9 @@ class Matches:
         A21: Affines | None = None,
         sigma_A: FloatArray | None = None,
     ) -> Matches:
-        """Fill rays and Jacobians from the cameras. K1 and K2 are set where a camera is a plain pinhole.
+        """Return matches with rays and Jacobians computed from the cameras. K1 and K2 are set for pinhole cameras.
 
-        Raises InputError where a pixel has no ray in its camera, or where pixels are no arrays (N, 2) of as many.
+        Raises InputError where a pixel has no ray in its camera, or the pixels are not two arrays (N, 2).
         """
         n = len(as_array(pixels1, (None, 2), "matches' pixels1"))
         as_array(pixels2, (n, 2), "matches' pixels2")
@@ -180,7 +180,7 @@ class Matches:
         )
 
     def through(self, camera1: CentralCamera, camera2: CentralCamera) -> Matches:
-        """Return the same pixels as other cameras see them, without affinities."""
+        """Return the matches of the same pixels in other cameras, without affinities."""
         return Matches.from_cameras(
             camera1,
             camera2,
@@ -193,11 +193,11 @@ class Matches:
         )
 
     def with_affinities(self, A21: Affines, sigma_A: FloatArray | None = None) -> Matches:
-        """Return the same matches with affinities."""
+        """Return the matches with affinities."""
         return replace(self, A21=A21, sigma_A=sigma_A)
 
     def select(self, which: BoolArray | IntArray) -> Matches:
-        """Return the matches picked by a mask or by indices."""
+        """Return the matches selected by a mask or indices."""
         index: NDArray[Any] = np.asarray(which)
         n = len(self)
         mask = index.dtype == np.bool_ and index.shape == (n,)

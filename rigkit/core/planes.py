@@ -1,9 +1,9 @@
-"""What is known of the points of a board, for everything that is built on its plane."""
+"""Prior knowledge about the positions of a board's points."""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
 
 Planes = Literal["free", "coplanar", "lattice"]
-"""Nothing; that they share a plane; where on it each of them is."""
+"""None; that the points are coplanar; that they are a known lattice in a plane."""
 PLANE_CHOICES: tuple[Planes, ...] = get_args(Planes)

@@ -1,4 +1,4 @@
-"""How the two cameras of a pair stand to each other."""
+"""Types of the relative pose of a pair of cameras."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from rigkit.core.errors import InputError
 
 
 class PoseType(StrEnum):
-    """The relative pose that a person declares for a pair.
+    """Type of the relative pose, as declared for a pair.
 
-    GENERAL: anything. PLANAR: rotation about the vertical camera axis, translation in the horizontal plane.
+    GENERAL: any. PLANAR: rotation about the vertical camera axis, translation in the horizontal plane.
     STANDARD: no rotation, translation along x. FORWARD: no rotation, translation along z.
-    AUTO: let the data decide.
+    AUTO: chosen from the data.
     """
 
     GENERAL = "general"
@@ -27,5 +27,5 @@ class PoseType(StrEnum):
 
 
 def axis_of(kind: str) -> int | None:
-    """Return along which camera axis a pose type without rotation moves, 0 for x and 2 for z; None for any other."""
+    """Return the camera axis of the translation of a pose type without rotation, 0 for x and 2 for z; else None."""
     return {"standard": 0, "forward": 2}.get(kind)

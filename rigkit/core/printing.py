@@ -1,4 +1,4 @@
-"""How results print: what they are and hold, in a few lines, never their arrays."""
+"""Short printed representations of results, without their arrays, and numbers as text."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 NOTEBOOK = "rigkit.report.notebook"
-"""What draws results; it knows them, they know only its name, and a notebook alone asks for it."""
+"""Module that draws results as HTML, imported by name because it is in a higher layer."""
 
 MAX_LENGTH = 60
-"""Letters of one value; of more the first are shown."""
+"""Characters of one value; longer ones are cut."""
 MAX_TOGETHER = 440
-"""Letters of all values: under five lines of a hundred."""
+"""Characters of all values: less than five lines of a hundred."""
 MAX_LISTED = 3
-"""A collection of more is counted."""
+"""Largest collection whose entries are listed; others are counted."""
 MAX_DECIMALS = 6
 """Of a value with its sigma, and of lengths: nanometres."""
 
 
 def brief(self: Any) -> str:
-    """Return a dataclass with its values as far as they are short; arrays by their shape, collections by their size.
+    """Return the representation of a dataclass with short values, shapes of arrays and sizes of collections.
 
-    Classes take it as their `__repr__`.
+    Classes use it as their `__repr__`.
     """
     values = [f"{field.name}={_value(getattr(self, field.name))}" for field in fields(self)]
     words = ", ".join(values)
@@ -35,7 +35,7 @@ def brief(self: Any) -> str:
 
 
 def drawn(self: Any) -> str:
-    """Return a result as HTML with a small picture. Classes that a notebook shows take it as their `_repr_html_`."""
+    """Return a result as HTML with a small picture. Classes use it as their `_repr_html_`."""
     return str(importlib.import_module(NOTEBOOK).html_of(self))
 
 
@@ -57,13 +57,13 @@ def _value(value: Any) -> str:
 
 
 def digits(value: float) -> str:
-    """Return a number with two digits that count, and no exponent where it is large: 520, 5.2, 0.052."""
+    """Return a number with two significant digits, and without an exponent if it is large: 520, 5.2, 0.052."""
     return f"{float(f'{value:.2g}'):.12g}"
 
 
 def length_words(*mm: float, decimals: int) -> str:
-    """Return lengths with so many decimals, or more (nanometres at most) where these would leave the largest fewer than
-    two digits that count: rigs under a microscope are small.
+    """Return lengths with so many decimals, or more (nanometres at most) if the largest length would have fewer than
+    two significant digits: rigs under a microscope are small.
 
     >>> length_words(99.934, -0.00412, decimals=2), length_words(0.00412, decimals=2), length_words(0.0, decimals=2)
     ('99.93, -0.00', '0.0041', '0.00')

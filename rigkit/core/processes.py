@@ -1,5 +1,5 @@
-"""Work on all cores: in threads where it is mostly in C, else in processes, none of which outlives the program; or on a
-Dask cluster through joblib."""
+"""Parallel work: in threads if it is mostly C code, else in processes, none of which outlives the program; or on a Dask
+cluster through joblib."""
 
 from __future__ import annotations
 
@@ -33,25 +33,25 @@ Result = TypeVar("Result")
 
 
 def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-    """Yield what `work` returns of each item, in order, done on all cores at once.
+    """Yield the result of `work` for each item, in order, computed in threads on all cores.
 
-    For work that is mostly kernels, OpenCV and files, which leave the interpreter to others meanwhile: threads start at
-    once, processes after a second of imports. What it raises is raised here, and what has not begun is left.
+    For work that is mostly kernels, OpenCV and files, which release the interpreter lock: threads start at once,
+    processes after a second of imports. Exceptions of `work` are raised here, and end items that have not begun.
     """
     with ThreadPoolExecutor(available_cores()) as pool:
         yield from pool.map(work, items)
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use: a container or `taskset` may leave it fewer than there are."""
+    """Return the number of cores that this process may use, which a container or `taskset` may limit."""
     allowed = getattr(os, "sched_getaffinity", None)
     return len(allowed(0)) if allowed else os.cpu_count() or 1
 
 
 def process_count(jobs: int | None) -> int:
-    """Return how many processes `jobs` are: as many, or None: one a core. Raises InputError for fewer than one.
+    """Return the number of processes for `jobs`; None means one for each core. Raises InputError for fewer than one.
 
-    In a worker of the caller's (of multiprocessing.Pool, of Dask), which may start none, it is one: this one.
+    In a daemonic worker (of multiprocessing.Pool, of Dask), which cannot start processes, it is one.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs {jobs}: at least one process is needed")
@@ -59,7 +59,7 @@ def process_count(jobs: int | None) -> int:
 
 
 class Here(Executor):
-    """Does work at once, and by itself, as it is submitted."""
+    """An executor that runs work in `submit`, in this process."""
 
     def submit(
         self, fn: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
@@ -74,10 +74,8 @@ class Here(Executor):
 
 @contextmanager
 def _terminal_silent() -> Iterator[None]:
-    """Let processes that start here leave Ctrl-C and a closed terminal to their parent: all of a group are told.
-
-    They inherit the mask; handlers of their own would come after a second of imports.
-    """
+    """Block SIGINT and SIGHUP in processes that start here: the terminal sends them to the whole process group, and the
+    parent handles them. Children inherit the mask; their own handlers would be set after a second of imports."""
     if not hasattr(signal, "pthread_sigmask"):
         # Windows has neither signal masks nor a signal for a closed terminal.
         yield
@@ -91,8 +89,8 @@ def _terminal_silent() -> Iterator[None]:
 
 @contextmanager
 def _script_left_alone() -> Iterator[None]:
-    """Let processes that start here not import the caller's script: without `if __name__ == "__main__"` it would begin
-    again in each of them. So it is in notebooks, which have no file."""
+    """Prevent processes that start here from importing the caller's script: without `if __name__ == "__main__"` it
+    would run again in each of them."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -102,7 +100,7 @@ def _script_left_alone() -> Iterator[None]:
 
 
 def _is_of_script(*work: Any) -> bool:
-    """Return whether `work` has something of the caller's script in it, such as its functions, or cannot be sent."""
+    """Return whether `work` refers to the caller's script, such as its functions, or cannot be pickled."""
     try:
         return b"__main__" in bytes(ForkingPickler.dumps(work))
     except Exception:
@@ -110,12 +108,12 @@ def _is_of_script(*work: Any) -> bool:
 
 
 class _Pool(ProcessPoolExecutor):
-    """A pool that starts its processes silently, all where the first work is submitted.
+    """A process pool that starts all its processes when the first work is submitted, with signals blocked.
 
-    They import the caller's script only where that work has something of it: ours has not.
+    They import the caller's script only if that work refers to it.
 
-    Started one by one, as work comes, a process that begins while another is found dead is neither ended nor fed, and
-    waited for for ever (CPython: `terminate_broken` does not know of it).
+    If they were started one by one, a process that starts while another is found dead would neither be terminated nor
+    get work, and the pool would wait for it forever (CPython: `terminate_broken` does not know of it).
     """
 
     def __init__(self, count: int, initializer: Callable[[], None]) -> None:
@@ -131,12 +129,12 @@ class _Pool(ProcessPoolExecutor):
             self._of_script = _is_of_script(fn, args, kwargs)
         with _terminal_silent():
             future = super().submit(fn, *args, **kwargs)
-        # What waits is cancelled before the workers end; the pool would then stumble, loudly, over telling it so.
+        # Pending futures are cancelled before the workers end; setting an exception on them would print a traceback.
         future.set_exception = functools.partial(_set_exception, future)  # type: ignore[method-assign]
         return future
 
     def _launch_processes(self) -> None:
-        # Before the pool has a thread that would miss the script, too.
+        # Before the pool starts a thread, which would miss the script, too.
         with nullcontext() if self._of_script else _script_left_alone():
             super()._launch_processes()  # type: ignore[misc]
 
@@ -148,10 +146,10 @@ def _set_exception(future: Future[Any], error: BaseException | None) -> None:
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Give a pool of `count` fresh processes for the length of a `with` block.
+    """Context manager of a pool of `count` new processes.
 
-    An exception in the block, an interrupt among them, ends work under way instead of waiting for it. If this process
-    is killed, its workers notice and end. If a worker is killed, InputError says so.
+    An exception in the block, also an interrupt, terminates running work. If this process is killed, its workers exit.
+    Raises InputError if a worker is killed.
     """
     others = set(multiprocessing.active_children())
     with _terminal_silent():
@@ -166,7 +164,7 @@ def worker_pool(count: int) -> Iterator[ProcessPoolExecutor]:
     except BaseException:
         for process in set(multiprocessing.active_children()) - others:
             process.terminate()
-        # Until its thread has ended: Python, at its own end, would write to what that thread is closing.
+        # Waits for the pool's thread: at exit Python would write to the pipe that this thread closes.
         pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
@@ -178,7 +176,7 @@ def _end_with_parent() -> None:
 
     def watch() -> None:
         parent.join()
-        # A worker that waits for its next task holds both ends of the queue: nothing else would wake it.
+        # A worker that waits for its next task holds both ends of the queue, and would never wake up.
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -187,9 +185,9 @@ def _end_with_parent() -> None:
 def over_items(
     function: Callable[[Item], Result], items: Sequence[Item], *, jobs: int = 1, cluster: str | None = None
 ) -> Iterator[tuple[int, Result]]:
-    """Yield (place, function(item)) of every item, in any order.
+    """Yield (index, function(item)) of every item, in any order.
 
-    Raises InputError: a cluster is asked for but joblib or distributed are not installed, or it cannot be reached.
+    Raises InputError if `cluster` is given and joblib or distributed are not installed, or it cannot be reached.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Progress as the core sees it: something that is told how far the work is. The command line draws it on stderr."""
+"""The interface of progress callbacks. The command line draws progress on stderr."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Told `done` of `total` steps of the stage called `what`."""
+    """Called with the number of steps `done` of `total` in the stage `what`."""
 
     def __call__(self, what: str, done: int, total: int) -> None: ...
 
 
 def silent(what: str, done: int, total: int) -> None:
-    """Say nothing."""
+    """Ignore progress."""

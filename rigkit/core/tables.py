@@ -1,7 +1,4 @@
-"""Tables as plain data: columns with units, cells with a value, its sigma and marks.
-
-How a table looks as text is the business of `rigkit.report.tables`.
-"""
+"""Tables as plain data: columns with units, cells with value, sigma and marks. `rigkit.report.tables` writes them."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ COLUMN_HEAD = re.compile(r"(?P<label>.*?)(?: \[(?P<unit>.*)\])?(?: \.(?P<decimal
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Head of a column: label, unit and how many decimals its numbers show."""
+    """Head of a column: label, unit and number of decimals."""
 
     label: str
     unit: str = ""
@@ -28,10 +25,10 @@ class Cell:
 
     Attributes
     ----------
-    value : number, text, or None for nothing known.
-    paper : what the paper printed there, with the digits it has, or None.
+    value : number, text, or None if unknown.
+    paper : the entry printed in the paper, with its digits, or None.
     sigma : standard deviation of the value, or None.
-    best, failed : how it is marked.
+    best, failed : marks.
     """
 
     value: float | str | None
@@ -43,7 +40,8 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: every row has one cell a column; the first column names the row. It cannot be built without rows."""
+    """A table: every row has one cell for each column; the first column names the row. Raises InputError without
+    rows."""
 
     key: str
     title: str
@@ -60,17 +58,17 @@ class Table:
 
 
 def columns(heads: str) -> tuple[Column, ...]:
-    """Return the columns of their heads, such as "pair | points .0 | angle error [deg] | baseline [mm] .2": label, unit
-    and decimals. Labels that a person chose are no part of such words: they make a `Column`."""
+    """Return columns from text such as "pair | points .0 | angle error [deg] | baseline [mm] .2": label, unit and
+    decimals. For labels that a user chose, make a `Column`."""
     found = [COLUMN_HEAD.fullmatch(head.strip()) for head in heads.split("|")]
     return tuple(Column(m["label"], m["unit"] or "", int(m["decimals"] or 3)) for m in found if m is not None)
 
 
 def cells(*values: float | str | Cell | None) -> tuple[Cell, ...]:
-    """Return bare values as cells; those that are cells already stay."""
+    """Return values as cells; cells are returned unchanged."""
     return tuple(v if isinstance(v, Cell) else Cell(v if v is None or isinstance(v, str) else float(v)) for v in values)
 
 
 def verdict_cell(passed: bool, otherwise: str = "FAIL") -> Cell:
-    """Return "pass", or what is said `otherwise`, marked as failed."""
+    """Return "pass", or `otherwise` marked as failed."""
     return Cell("pass" if passed else otherwise, failed=not passed)

@@ -1,4 +1,4 @@
-"""What a person measured of a pair with a rule, a square or a level, and how sure they were."""
+"""Ground truth that a person measured with a rule, a square or a level, with standard deviations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FEATURE = re.compile(r"^(?P<board>.+?)(?:\[\s*(?P<column>\d+)\s*,\s*(?P<row>\d+)
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """Something on a board that a rule can be laid against.
+    """A point or plane of a board that measurements refer to.
 
     Written "plane1[0,5]" for the corner in column 0 and row 5, "plane1.centre" for the middle of the corner grid, and
     "plane1" for the board's whole plane.
@@ -32,7 +32,7 @@ class Feature:
 
     @classmethod
     def parse(cls, text: str) -> Feature:
-        """Read the written form; raises InputError where it is none."""
+        """Return the feature written as `text`; raises InputError for invalid text."""
         match = FEATURE.match(text.strip())
         if match is None:
             raise InputError(f"'{text}' names nothing on a board; write plane1[0,5], plane1.centre or plane1")
@@ -63,7 +63,7 @@ class MeasuredLength:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredAngle:
-    """The angle between boards `a` and `b` as a protractor laid across the two faces shows it, 0 to 180 degrees.
+    """The angle between the faces of boards `a` and `b` as a protractor measures it, 0 to 180 degrees.
 
     It is 180 degrees minus the angle between the normals that face the camera: a corner of a room that opens wider than
     a right angle is more than 90 degrees.
@@ -111,7 +111,7 @@ class MeasuredDistance:
 
 @dataclass(frozen=True, slots=True)
 class PairTruth:
-    """What a person measured of one pair, each thing once by one means; empty where nothing was measured."""
+    """All measurements of one pair, each quantity once by one means; empty if nothing was measured."""
 
     baseline: MeasuredLength | None = None
     angles: tuple[MeasuredAngle, ...] = ()
@@ -120,7 +120,7 @@ class PairTruth:
     __repr__ = brief
 
     def __post_init__(self) -> None:
-        # Of a copied row one measurement would count as two facts that hold.
+        # A copied row would count as two independent checks.
         known: set[object] = set()
         measured: tuple[MeasuredAngle | MeasuredDistance, ...] = (*self.angles, *self.distances)
         for one in measured:
@@ -131,7 +131,7 @@ class PairTruth:
 
     @property
     def count(self) -> int:
-        """How many measurements there are."""
+        """Number of measurements."""
         return (self.baseline is not None) + len(self.angles) + len(self.distances)
 
 
@@ -143,7 +143,7 @@ def _check(what: str, value: float, sigma: float, unit: str, *, near_zero: bool 
             f"{what}: sigma must be positive, got {sigma} {unit}; say how far off the measurement may well be"
         )
     if sigma >= value and not near_zero:
-        # Any result would agree with it: a check that cannot fail. Angles across faces are never near 0.
+        # Every result would agree with it: the check could not fail. Angles between faces are never near 0.
         raise InputError(
             f"{what}: {value:g} {unit} with a sigma of {sigma:g} {unit} is no measurement; give the value, then "
             "its sigma, in one unit: were both exchanged?"

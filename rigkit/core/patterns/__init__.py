@@ -1,1 +1,1 @@
-"""What is printed on a board: chessboards, ChArUco boards, AprilGrids; one file a pattern, one registry."""
+"""Patterns of boards: chessboards, ChArUco boards, AprilGrids, circle grids; one file for each, and a registry."""

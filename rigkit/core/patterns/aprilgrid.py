@@ -1,4 +1,4 @@
-"""AprilGrids: grids of AprilTags with small black squares between them, as Kalibr prints them, or without."""
+"""AprilGrids: grids of AprilTags, with small black squares between them as in Kalibr, or without."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ TAG_FAMILIES: dict[str, str] = {
     "tag25h9": "DICT_APRILTAG_25h9",
     "tag16h5": "DICT_APRILTAG_16h5",
 }
-"""Names of families, and of the same in OpenCV."""
+"""Names of tag families, and their names in OpenCV."""
 
 NUMBERINGS = ("kalibr", "opencv")
 """Kalibr counts the rows of tags from the bottom, OpenCV's GridBoard from the top; both from the left."""
 
 MAX_BORDER = 2
-"""Modules of the widest black border that is in use: Kalibr's; AprilTag's own and OpenCV's is 1."""
+"""Widest black border in use, in modules: that of Kalibr; AprilTag and OpenCV use 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class AprilGrid(Pattern):
-    """Upright tags in columns and rows. The points are their corners: four a tag, so two columns a tag and two rows.
+    """Upright tags in columns and rows. The points are their four corners, so that each tag has two columns and rows.
 
     Attributes
     ----------
-    family : such as "tag36h11"; any dictionary of OpenCV's will do.
-    spacing : from tag to tag, in sides of a tag.
-    border : modules of the black border of a tag.
-    first_tag : number of the first tag; boards in one image need different ones.
+    family : such as "tag36h11", or any dictionary of OpenCV.
+    spacing : gap between tags, in sides of a tag.
+    border : width of a tag's black border in modules.
+    first_tag : number of the first tag; boards in one image need different tags.
     numbering : "kalibr" or "opencv".
-    corner_squares : small black squares fill the corners between tags, and touch them.
-    inverted : black and white are exchanged.
+    corner_squares : whether small black squares fill the corners between tags.
+    inverted : whether black and white are exchanged.
     """
 
     type: ClassVar[str] = "aprilgrid"
@@ -98,7 +98,7 @@ class AprilGrid(Pattern):
         return False
 
     def positions(self, grid: FloatArray) -> FloatArray:
-        # Between whole points straight on, so that halves lie in the middle of tags and gaps.
+        # Linear between whole points, so that halves are in the middle of tags and gaps.
         tag, within = np.divmod(np.asarray(grid, dtype=np.float64), 2.0)
         return np.asarray(
             tag * (1.0 + self.spacing) + np.minimum(within, 1.0) + np.maximum(within - 1.0, 0.0) * self.spacing
@@ -110,10 +110,8 @@ class AprilGrid(Pattern):
         return self.first_tag + (own[::-1] if self.numbering == "kalibr" else own)
 
     def modules(self) -> BoolArray:
-        """Return which modules of the family's tags are black, with the border, as they stand on the board: (N, S, S).
-
-        OpenCV draws AprilTags turned by 180 degrees against the AprilTag project, and so against Kalibr.
-        """
+        """Return which modules of the family's tags are black, with the border, in their orientation on the board:
+        (N, S, S). OpenCV draws AprilTags rotated by 180 degrees compared with the AprilTag project and Kalibr."""
         own = dictionary_modules(self.dictionary)
         own = own[:, ::-1, ::-1] if self.numbering == "kalibr" else own
         wide = ((0, 0), (self.border, self.border), (self.border, self.border))

@@ -10,7 +10,7 @@ from rigkit.core.arrays import BoolArray
 from rigkit.core.errors import InputError
 
 SIZES = (50, 100, 250, 1000)
-"""Markers of OpenCV's dictionaries of a kind; the smaller ones are the beginnings of the largest."""
+"""Numbers of markers of OpenCV's dictionaries of a kind; the smaller ones are the first markers of the largest."""
 
 
 @functools.cache
@@ -39,12 +39,12 @@ def dictionary_modules(name: str) -> BoolArray:
 
 
 def marker_count(name: str) -> int:
-    """Return how many markers a dictionary has; raises InputError like `dictionary_modules`."""
+    """Return the number of markers of a dictionary; raises InputError like `dictionary_modules`."""
     return len(dictionary_modules(name))
 
 
 def smallest_dictionary(name: str, count: int) -> str:
-    """Return the smallest dictionary of the kind of `name` with so many markers; `name` where there is one only."""
+    """Return the smallest dictionary of the kind of `name` with so many markers; `name` if the kind has only one."""
     kind, _, size = name.rpartition("_")
     if not kind or size != str(SIZES[-1]):
         return name

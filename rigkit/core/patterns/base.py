@@ -1,8 +1,8 @@
-"""The contract of every pattern: where its points lie, what is black, how files write it, what it looks like turned.
+"""The interface of every pattern: positions of points, print, keys in board files, symmetries.
 
 A board has columns x rows points on an index grid and a measured length, its "square": the side of a square or of a
-tag, the distance of two circles. A pattern says the rest. Adding one is a file and a line in `registry`, and, for how
-images are searched for it, a file and a line in `rigkit.detection.targets`.
+tag, the distance of two circles. A pattern defines the rest. Adding one is a file and a line in `registry` and, for its
+detection, a file and a line in `rigkit.detection.targets`.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ Value: TypeAlias = str | int | float | bool
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key that a board file has for one pattern.
+    """A key in board files for one pattern.
 
     Attributes
     ----------
     name : in the file, such as "marker_mm".
-    field : of the pattern that it sets.
-    kind : str, int, float or bool; numbers are positive, whole numbers at least 0.
-    hint : as the file writes it, for errors: "marker_mm = 22.0 (with the black border)".
-    required : otherwise the field's own default holds.
+    field : the field of the pattern that it sets.
+    kind : str, int, float or bool; floats are positive, integers at least 0.
+    hint : example for error messages: "marker_mm = 22.0 (with the black border)".
+    required : whether it has to be given; otherwise the field has a default.
     """
 
     name: str
@@ -46,11 +46,11 @@ class Ink:
 
     Attributes
     ----------
-    rectangles : (M, 4) x, y, width, height. They touch, but do not overlap.
+    rectangles : (M, 4) x, y, width, height; they may touch, but do not overlap.
     circles : (K, 3) x and y of the centre, radius.
-    first_black : of boards with (columns + 1) x (rows + 1) squares, which are not among the rectangles, whether the one
-        before the first point is black; None for boards without squares.
-    inverted : what is listed is white on a black ground.
+    first_black : for boards with (columns + 1) x (rows + 1) squares, which are not among the rectangles: whether the
+        square before the first point is black; None for boards without squares.
+    inverted : whether all this is white on black.
     """
 
     rectangles: FloatArray = field(default_factory=lambda: np.zeros((0, 4)))
@@ -61,31 +61,31 @@ class Ink:
 
 @dataclass(frozen=True, slots=True)
 class Pattern(ABC):
-    """What is printed on a board, but for how many points it has and how long a square is.
+    """What is printed on a board, apart from the number of points and the length of a square.
 
-    Two patterns are equal where nothing but the counts and the size tells boards with them apart.
+    Boards with equal patterns differ at most in counts and size.
     """
 
     type: ClassVar[str]
     """Name in the registry and in board files."""
     size_word: ClassVar[str] = "square"
-    """The measured length in a word: board files write it as `<word>_mm`."""
+    """Name of the measured length, in board files `<word>_mm`."""
     size_meaning: ClassVar[str] = "the side of a square"
-    """The measured length in words."""
+    """Definition of the measured length."""
     point_word: ClassVar[str] = "inner corners"
-    """What a board's points are called."""
+    """Name of the points."""
     count_word: ClassVar[str] = "inner corners"
     """What columns and rows count in board files."""
     unambiguous: ClassVar[str] = "one with an odd and an even number of corners"
-    """A board of this pattern that looks otherwise when it is turned by 180 degrees."""
+    """A board of this pattern without symmetry under a rotation by 180 degrees."""
     identified: ClassVar[bool] = False
-    """Marks in the image tell which board and which point it is: detections come named and on the board's own grid."""
+    """Whether markers identify board and points in an image, so that detections have the board's name and grid."""
     keys: ClassVar[tuple[Key, ...]] = ()
-    """Keys of board files beside columns, rows and the measured length."""
+    """Keys of board files besides columns, rows and the measured length."""
 
     @classmethod
     def from_keys(cls, values: Mapping[str, Value]) -> Self:
-        """Return the pattern of the keys (by name) that a file has; raises InputError for values that make none."""
+        """Return the pattern from the values of a file's keys, by name; raises InputError for invalid values."""
         return cls(**{key.field: values[key.name] for key in cls.keys if key.name in values})
 
     def key_values(self) -> dict[str, Value]:
@@ -94,41 +94,42 @@ class Pattern(ABC):
 
     @property
     def points_per_count(self) -> int:
-        """Points along a column or row for each that a person counts: two a tag."""
+        """Number of points along a row for each column counted in board files: two for a tag."""
         return 1
 
     def check(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> None:
-        """Raise InputError where no board of so many points and such squares can have this pattern."""
+        """Raise InputError if a board with so many points and such squares cannot have this pattern."""
         return
 
     @property
     def even_steps(self) -> bool:
-        """Whether `positions` is the grid itself: straight rows and columns, one square apart."""
+        """Whether `positions` is the identity: straight rows and columns, one square apart."""
         return True
 
     def positions(self, grid: FloatArray) -> FloatArray:
-        """Return where points (column, row) (N, 2), also between whole ones, lie in squares from the first (N, 2)."""
+        """Return the positions (N, 2) of points (column, row) (N, 2), also fractional ones, in squares from the
+        first."""
         return np.asarray(grid, dtype=np.float64)
 
     def exists(self, columns: int, rows: int) -> BoolArray:
-        """Say of the index grid (rows, columns) where there is a point."""
+        """Return which places of the index grid (rows, columns) have a point."""
         return np.ones((rows, columns), dtype=bool)
 
     def turns(self, columns: int, rows: int, even: bool) -> tuple[int, ...]:
-        """Return after how many quarter turns, of 1, 2 and 3, a board looks as before; `even`: squares are square."""
+        """Return the rotational symmetries as quarter turns of 1, 2 and 3; `even`: both sides of a square are equal."""
         return ()
 
     def outline(self, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
-        """Return the lower and the upper end along x and y of what is printed, in squares from the first point."""
+        """Return the bounding box of the print, lower and upper (x, y), in squares from the first point."""
         return np.array([-1.0, -1.0]), np.array([columns, rows], dtype=np.float64)
 
     @abstractmethod
     def ink(self, columns: int, rows: int, squares_mm: tuple[float, float], *, upright: bool = False) -> Ink:
-        """Return what is printed on a board of so many points with squares of such sides.
+        """Return what is printed on a board of so many points with such squares.
 
-        `upright` : of modules, touching ones of a column are one rectangle, else those of a row.
+        `upright` : whether touching modules of a column make one rectangle, instead of those of a row.
 
-        Raises InputError where the pattern cannot be.
+        Raises InputError where the pattern is impossible.
         """
 
     def describe(self, columns: int, rows: int, squares_mm: tuple[float, float]) -> str:
@@ -138,7 +139,7 @@ class Pattern(ABC):
         return f"{columns // per} x {rows // per} {self.count_word}, {self.size_word}s {x:g} x {y:g} mm"
 
     def scaled(self, factor: float) -> Self:
-        """Return the pattern printed larger: fields in mm grow with the squares."""
+        """Return the pattern with all fields in mm scaled."""
         lengths = {f.name: getattr(self, f.name) for f in fields(self) if f.name.endswith("_mm")}
         return replace(self, **{name: value * factor for name, value in lengths.items() if value is not None})
 
@@ -146,7 +147,7 @@ class Pattern(ABC):
 def filled_modules(black: BoolArray, *, upright: bool = False) -> FloatArray:
     """Return the black modules (R, C) as rectangles (M, 4): x, y, width, height in modules.
 
-    Touching modules of a row are one rectangle, or those of a column (`upright`): either way all is covered once.
+    Touching modules of a row, or of a column (`upright`), make one rectangle; rectangles do not overlap.
     """
     change = np.diff(np.pad(black.T if upright else black, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     (line, start), (_, end) = np.nonzero(change == 1), np.nonzero(change == -1)
@@ -157,6 +158,6 @@ def filled_modules(black: BoolArray, *, upright: bool = False) -> FloatArray:
 
 
 def positive(value: float, what: str) -> None:
-    """Raise InputError unless `value`, of `what`, is a positive number."""
+    """Raise InputError, with `what` in the message, unless `value` is a positive number."""
     if not (np.isfinite(value) and value > 0.0):
         raise InputError(f"{what} must be positive, got {value}")

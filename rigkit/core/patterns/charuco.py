@@ -21,9 +21,9 @@ class Charuco(Pattern):
     ----------
     dictionary : name in OpenCV, such as "DICT_5X5_100".
     marker_mm : side of a marker with its black border.
-    first_marker : number of the first marker; boards in one image need different ones, or different dictionaries.
-    legacy : as OpenCV drew boards before 4.6: with an even number of rows of squares the first one is white.
-    inverted : black and white are exchanged.
+    first_marker : number of the first marker; boards in one image need different markers or dictionaries.
+    legacy : layout of OpenCV before 4.6: with an even number of rows of squares the first square is white.
+    inverted : whether black and white are exchanged.
     """
 
     type: ClassVar[str] = "charuco"
@@ -43,7 +43,7 @@ class Charuco(Pattern):
     inverted: bool = False
 
     def first_black(self, rows: int) -> bool:
-        """Say whether the square before the first inner corner is black, on a board of `rows` of inner corners."""
+        """Return whether the square before the first inner corner is black, on a board with `rows` of inner corners."""
         return not self.legacy or rows % 2 == 0
 
     def places(self, columns: int, rows: int) -> IntArray:

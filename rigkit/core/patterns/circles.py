@@ -1,4 +1,4 @@
-"""Circle grids: the centres of circles in rows, one below the other, or every second row moved by half a step."""
+"""Circle grids: the centres of circles in regular or staggered rows."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from rigkit.core.patterns.base import Ink, Key, Pattern, Value
 ROW_STEPS = {"regular": 1.0, "asymmetric": 0.5, "hexagonal": float(np.sqrt(0.75))}
 """Distance of two rows, in distances of two circles of a row."""
 NEIGHBOUR_DISTANCES = {"regular": 1.0, "asymmetric": float(np.sqrt(0.5)), "hexagonal": 1.0}
-"""Distance of two neighbours, likewise."""
+"""Distance of nearest neighbours, in the same unit."""
 STAGGERS = ("right", "left")
 TYPICAL_DIAMETER = 0.6
-"""Of a board to print that does not say, in distances of neighbours."""
+"""Default diameter for printing, in distances of nearest neighbours."""
 
 
 @dataclass(frozen=True, slots=True)
 class Circles(Pattern):
-    """Columns x rows of circles; where rows are staggered every second one, from the second, lies half a step aside.
+    """Columns x rows of circles; in staggered layouts every second row, from the second, is shifted by half a step.
 
-    The measured length is the distance of two circles in a row. A grid of OpenCV's that is asymmetric, of 4 x 11 with
-    `squareSize` s, has columns 4, rows 11 and a distance of 2 s.
+    The measured length is the distance of two circles in a row. OpenCV's asymmetric grid of 4 x 11 with `squareSize` s
+    has columns 4, rows 11 and a distance of 2 s.
 
     Attributes
     ----------
-    layout : "regular"; "asymmetric", staggered with rows half a distance apart, a square lattice that stands on its
-        corner; or "hexagonal", staggered with six neighbours at one distance.
-    diameter_mm : of the circles; images are read without it.
-    stagger : whether every second row, from the second, lies half a step to the "right" or to the "left".
-    inverted : white circles on black.
+    layout : "regular"; "asymmetric", staggered with rows half a distance apart, a square lattice rotated by 45 degrees;
+        or "hexagonal", staggered with six equidistant neighbours.
+    diameter_mm : of the circles; not needed for detection.
+    stagger : whether every second row, from the second, is shifted to the "right" or to the "left".
+    inverted : whether circles are white on black.
     """
 
     type: ClassVar[str] = "circles"
@@ -97,9 +97,9 @@ class Circles(Pattern):
         return (1, 2, 3) if even and columns == rows else (2,)
 
     def outline(self, columns: int, rows: int) -> tuple[FloatArray, FloatArray]:
-        # Black ground goes on round the circles as paper would.
+        # Black ground needs a margin around the circles, as paper has.
         half = (1.0 if self.inverted else 0.5) * NEIGHBOUR_DISTANCES[self.layout]
-        # The first two rows have the ends along x, the last one that along y.
+        # The extreme points are in the first two rows along x, in the last row along y.
         ends = self.positions(np.array([[0, 0], [0, 1], [columns - 1, 0], [columns - 1, 1], [0, rows - 1]]))
         return ends.min(axis=0) - half, ends.max(axis=0) + half
 
@@ -110,7 +110,7 @@ class Circles(Pattern):
         return Ink(circles=np.concatenate([centres, radius], axis=1), inverted=self.inverted)
 
     def printed_diameter_mm(self, squares_mm: tuple[float, float]) -> float:
-        """Return the diameter of the circles, the usual one where it is not given."""
+        """Return the diameter of the circles, the default if it is not given."""
         return TYPICAL_DIAMETER * self.nearest_mm(squares_mm) if self.diameter_mm is None else self.diameter_mm
 
     def nearest_mm(self, squares_mm: tuple[float, float]) -> float:
