@@ -1,4 +1,4 @@
-"""The largest upright rectangle of rectified images of which every pixel is seen, and maps into it."""
+"""Cropping of rectified images to a large axis-aligned rectangle without unseen pixels."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from rigkit.core.errors import DegenerateError
 from rigkit.rectification.rectify import RectifyMap
 
 COARSE = 300
-"""The rectangle is found on so many cells a side that are seen as a whole, then grown by pixels."""
+"""Cells along the longer side of the coarse grid on which the rectangle is found before it grows by single pixels."""
 
 
 def cropped(maps: Sequence[RectifyMap]) -> tuple[RectifyMap, ...]:
-    """Return maps into one target, as all of `maps` have it, cut to what every camera sees: the principal point moves
-    with the corner cut off, nothing else.
+    """Return `maps`, which share one target, with that target cropped to what every camera sees.
 
-    Raises DegenerateError where there is nothing that all see.
+    Only the target's size and principal point change. Raises DegenerateError if no pixel is seen by all cameras.
     """
     seen = np.logical_and.reduce([one.coverage() for one in maps])
     left, top, right, bottom = largest_rectangle(seen)
@@ -33,8 +32,10 @@ def cropped(maps: Sequence[RectifyMap]) -> tuple[RectifyMap, ...]:
 
 
 def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
-    """Return (left, top, right, bottom), ends excluded, of a large upright rectangle of True: the largest one of coarse
-    cells, grown until no side has room. Empty where nothing is True."""
+    """Return (left, top, right, bottom), ends excluded, of a large rectangle of True; empty where nothing is True.
+
+    It is the largest one of coarse cells, grown by single rows and columns as far as possible.
+    """
     step = max(-(-max(seen.shape) // COARSE), 1)
     rows, columns = (size // step for size in seen.shape)
     cells = seen[: rows * step, : columns * step].reshape(rows, step, columns, step)
@@ -56,7 +57,7 @@ def largest_rectangle(seen: BoolArray) -> tuple[int, int, int, int]:
 
 
 def _of_cells(whole: BoolArray) -> tuple[int, int, int, int]:
-    """Return the largest rectangle of True cells: under each row's histogram of heights, by a stack."""
+    """Return the largest rectangle of True cells: the largest one in each row's histogram of heights, by a stack."""
     best, found = 0, (0, 0, 0, 0)
     height = np.zeros(whole.shape[1], dtype=np.int64)
     for row, cells in enumerate(whole):

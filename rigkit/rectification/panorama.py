@@ -1,4 +1,4 @@
-"""Cylindrical and equirectangular images: targets of rectification for fields of view beyond a perspective image.
+"""Cylindrical and equirectangular targets of rectification, for fields of view too wide for a perspective image.
 
 A panorama has an axis: the vertical (y) one for viewing, the horizontal (x) one for stereo pairs, where all planes
 through the baseline become rows. Across the axis the image is linear in the angle; along it, in the tangent of the
@@ -19,10 +19,10 @@ from rigkit.core.arrays import BoolArray, Coordinates, FloatArray, Projected
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Panorama(Camera):
-    """With the vertical axis: u = fx atan2(x, z) + cx, v = fy w(y, hypot(x, z)) + cy; else x with y, u with v swapped.
+    """u = fx atan2(x, z) + cx, v = fy w(y, hypot(x, z)) + cy; with a horizontal axis x, y and u, v are swapped.
 
-    Parameters are fx, fy in px per radian (per unit of the tangent along a cylinder), cx, cy in px. Not to be
-    calibrated: no lens makes such images.
+    Parameters are fx, fy in px per radian (per unit of the tangent along a cylinder), cx, cy in px. Such a camera is
+    not calibrated: no lens makes such images.
     """
 
     horizontal_axis: ClassVar[bool] = False
@@ -70,16 +70,9 @@ class Panorama(Camera):
         h = np.sqrt(a * a + z * z)
         _, by_b, by_h = self._rise(b, h)
         across, along = self.parameters[i], self.parameters[j]
-        d_pixels_d_point[i, i], d_pixels_d_point[i, j], d_pixels_d_point[i, 2] = (
-            across * z / (h * h),
-            0.0,
-            -across * a / (h * h),
-        )
-        d_pixels_d_point[j, i], d_pixels_d_point[j, j], d_pixels_d_point[j, 2] = (
-            along * by_h * a / h,
-            along * by_b,
-            along * by_h * z / h,
-        )
+        d_pixels_d_point[i, i], d_pixels_d_point[i, 2] = across * z / (h * h), -across * a / (h * h)
+        d_pixels_d_point[i, j], d_pixels_d_point[j, j] = 0.0, along * by_b
+        d_pixels_d_point[j, i], d_pixels_d_point[j, 2] = along * by_h * a / h, along * by_h * z / h
         u, v, valid = self._project(x, y, z)
         if d_pixels_d_parameters is not None:
             fx, fy, cx, cy = self.parameters.tolist()
@@ -90,7 +83,7 @@ class Panorama(Camera):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Cylindrical(Panorama):
-    """v = fy y / hypot(x, z) + cy: vertical lines stay straight; no end upwards and downwards, so never the poles."""
+    """v = fy y / hypot(x, z) + cy: vertical lines stay straight; the poles are at infinity."""
 
     model: ClassVar[str] = "cylindrical"
 

@@ -1,4 +1,4 @@
-"""From the image of any camera to the image of any other with the same centre: pixels exactly, images by resampling."""
+"""Maps from the image of one camera to that of another with the same centre: pixels exactly, images by resampling."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from rigkit.geometry.rotation import nearest_rotation
 Interpolation = Literal["spline", "lanczos", "linear", "nearest"]
 
 ROTATION_INPUT_TOLERANCE = 1e-6
-"""A matrix further than this from orthonormal is a mistake, not rounding."""
+"""A matrix whose entries differ more than this from the nearest rotation is a mistake, not rounding."""
 CHUNK_PIXELS = 1 << 18
 """Pixels resampled at a time: bounds the memory of large targets."""
 MAX_KEPT_SAMPLES = 8_000_000
-"""Of a map that is used for several images: 24 bytes each."""
-_Band = tuple[NDArray[np.int64], list[tuple[Pixels, BoolArray]]]
-"""Rows of the target, and for each sample of its pixels where the seen ones come from, and which are seen."""
+"""Samples of a map that are kept for several images: 24 bytes each."""
+_Band = tuple[slice, list[tuple[Pixels, BoolArray]]]
+"""Rows of the target, and for each sample of their pixels: source pixels of the valid ones, and which are valid."""
 SCALE_SAMPLES = 41
-"""Along each side of a target: there it is asked how much smaller the target shows the source."""
+"""Points along each side of a target at which the scale between target and source is evaluated."""
 MAX_SUPERSAMPLING = 8
-"""Samples a pixel and axis at the most, where a target shows the source much smaller."""
+"""Samples per pixel and axis at the most."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RectifyMap:
-    """The map from images of `camera` to images of `target`, which has the same centre and is turned against it.
+    """The map from images of `camera` to images of `target`, a camera with the same centre and another orientation.
 
     Attributes
     ----------
@@ -46,28 +46,28 @@ class RectifyMap:
     target_from_cam: Mat3
 
     def pixels(self, pixels: Pixels) -> tuple[Pixels, BoolArray]:
-        """Return where pixels (..., 2) of the camera come to lie in the target, and where they do."""
+        """Return the pixels of the target (..., 2) that show pixels (..., 2) of the camera, and which are valid."""
         rays, seen = self.camera.unproject(pixels)
         out, valid = self.target.project(rays @ self.target_from_cam.T)
         return out, valid & seen
 
     def source_pixels(self, pixels: Pixels) -> tuple[Pixels, BoolArray]:
-        """Return where pixels (..., 2) of the target come from in the camera, and where they do."""
+        """Return the pixels of the camera (..., 2) that pixels (..., 2) of the target show, and which are valid."""
         rays, seen = self.target.unproject(pixels)
         out, valid = self.camera.project(rays @ self.target_from_cam)
         return out, valid & seen
 
     def jacobians(self, pixels: Pixels) -> FloatArray:
-        """Return d target pixel / d camera pixel (..., 2, 2) at pixels (..., 2) of the camera; NaN where there is none.
+        """Return d target pixel / d camera pixel (..., 2, 2) at pixels (..., 2) of the camera; NaN where invalid.
 
-        An affinity between raw images becomes J2 A21 J1^-1 between the rectified ones; a corner's covariance J C J^T.
+        An affinity A21 of raw images becomes J2 A21 J1^-1 in rectified ones, a covariance C becomes J C J^T.
         """
         rays, _ = self.camera.unproject(pixels)
         _, _, d_pixels_d_point, _ = self.target.project_with_jacobians(rays @ self.target_from_cam.T)
         return np.asarray(d_pixels_d_point @ self.target_from_cam @ self.camera.ray_jacobian(pixels))
 
     def scale(self, pixels: Pixels) -> FloatArray:
-        """Return target pixels per camera pixel (...,), the root of the ratio of areas: `sigma_px` grows by it."""
+        """Return target pixels per camera pixel (...,), the root of the ratio of areas; `sigma_px` scales with it."""
         return np.asarray(np.sqrt(np.abs(np.linalg.det(self.jacobians(pixels)))))
 
     def image(
@@ -79,9 +79,8 @@ class RectifyMap:
         ----------
         interpolation : "spline" is the cubic B-spline that passes through the samples: it keeps positions exactly,
             which OpenCV's cubic and Lanczos kernels do to some hundredths of a pixel only.
-        antialias : where the target shows the source smaller, average several samples a pixel instead of skipping
-            source pixels.
-        fill : value where the camera does not see, or has no pixel.
+        antialias : average several samples per pixel where the target has a lower resolution than the source.
+        fill : value of the pixels outside the camera's image.
 
         Raises InputError for an image of another size than the camera's.
         """
@@ -89,7 +88,7 @@ class RectifyMap:
         return self._resampled(np.asarray(image), interpolation, bands, fill)
 
     def resampler(self, interpolation: Interpolation) -> Callable[[NDArray[Any]], NDArray[Any]]:
-        """Return a function that does what `image` does; where it fits in memory, the map is computed once for all."""
+        """Return a function that does what `image` does; a map of at most MAX_KEPT_SAMPLES is computed only once."""
         samples = self._supersampling()
         keeps = samples * samples * self.target.size_px[0] * self.target.size_px[1] <= MAX_KEPT_SAMPLES
         kept = list(self._sampled_bands(samples)) if keeps else None
@@ -101,21 +100,21 @@ class RectifyMap:
         return resample
 
     def maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the columns and rows (h, w) of the camera's image that the target's pixels come from, as cv2.remap
-        takes them; -1 where the camera does not see."""
+        """Return the source columns and rows (h, w) of the target's pixels for cv2.remap; -1 outside the source."""
         columns, rows = self.target.size_px
         u, v = np.full((2, rows, columns), -1.0, dtype=np.float32)
         for band, ((source, seen),) in self._sampled_bands(1):
-            part = slice(band[0], band[-1] + 1)
-            u[part][seen], v[part][seen] = source.T
+            u[band][seen], v[band][seen] = source.T
         return u, v
 
     def _sampled_bands(self, samples: int) -> Iterator[_Band]:
-        """Yield the rows of each band of the target, and for each of its samples where they come from."""
+        """Yield bands of rows, of at most about CHUNK_PIXELS pixels, with the source pixels of `samples`^2 samples."""
         columns, rows = self.target.size_px
         shifts = (np.arange(samples) + 0.5) / samples - 0.5
-        for band in _bands(rows, columns):
-            grid = np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), band.astype(np.float64)), axis=-1)
+        step = max(1, CHUNK_PIXELS // columns)
+        for first in range(0, rows, step):
+            band = slice(first, min(first + step, rows))
+            grid = np.stack(np.meshgrid(np.arange(float(columns)), np.arange(float(first), band.stop)), axis=-1)
             found = []
             for dv in shifts:
                 for du in shifts:
@@ -136,22 +135,20 @@ class RectifyMap:
             )
         sampler = _Sampler(image, interpolation)
         columns, rows = self.target.size_px
-        out = np.empty((rows, columns, *image.shape[2:]), dtype=image.dtype)
+        out = np.full((rows, columns, *image.shape[2:]), _as_dtype(np.asarray(fill, dtype=np.float64), image.dtype))
         for band, found in bands:
-            total = np.zeros((len(band), columns, *image.shape[2:]))
-            weight = np.zeros((len(band), columns))
+            total, weight = np.zeros(out[band].shape), np.zeros(out[band].shape[:2])
             for source, valid in found:
                 total[valid] += sampler(source)
                 weight += valid
-            # Half of the samples decide whether the pixel is seen: the border neither grows nor frays.
+            # A pixel counts as seen if at least half of its samples are.
             seen = weight >= 0.5 * len(found)
             mean = total[seen] / weight[seen].reshape(-1, *(1,) * (image.ndim - 2))
-            out[band] = _as_dtype(np.asarray(fill, dtype=np.float64), image.dtype)
-            out[band[0] : band[-1] + 1][seen] = _as_dtype(mean, image.dtype)
+            out[band][seen] = _as_dtype(mean, image.dtype)
         return out
 
     def coverage(self) -> BoolArray:
-        """Say which pixels (h, w) of the target the camera sees."""
+        """Return which pixels (h, w) of the target the camera sees."""
         columns, rows = self.target.size_px
         out = np.empty((rows, columns), dtype=bool)
         for band, ((_, valid),) in self._sampled_bands(1):
@@ -159,7 +156,7 @@ class RectifyMap:
         return out
 
     def _supersampling(self) -> int:
-        """Samples a pixel and axis: source pixels per target pixel, where it is large (90 % quantile)."""
+        """Return the samples per pixel and axis: the 90 % quantile of source pixels per target pixel, rounded."""
         source, valid = self.source_pixels(grid_pixels(self.target.size_px, (SCALE_SAMPLES, SCALE_SAMPLES)))
         source = source[valid & self.camera.on_image(source)]
         scale = self.scale(source) if source.size else np.ones(1)
@@ -176,7 +173,7 @@ def rectify_map(camera: Camera, target: Camera, *, target_from_cam: ArrayLike | 
 
     Parameters
     ----------
-    target_from_cam : (3, 3) rotation, by default none: x_in_target = target_from_cam @ x_in_cam.
+    target_from_cam : (3, 3) rotation, x_in_target = target_from_cam @ x_in_cam; None: the identity.
     """
     matrix = as_array(np.eye(3) if target_from_cam is None else target_from_cam, (3, 3), "target_from_cam")
     rotation = nearest_rotation(matrix)
@@ -200,7 +197,7 @@ def rotation_from_view_angles(yaw_rad: float, pitch_rad: float, roll_rad: float 
 
 
 class _Sampler:
-    """Values of an image between its pixels; at the border the outermost pixels are continued."""
+    """Interpolates an image; beyond its border the outermost pixels are repeated."""
 
     def __init__(self, image: NDArray[Any], interpolation: Interpolation) -> None:
         self._shape = image.shape[2:]
@@ -245,15 +242,8 @@ class _Sampler:
         return np.stack(values, axis=-1).astype(np.float64).reshape(len(pixels), *self._shape)
 
 
-def _bands(rows: int, columns: int) -> Iterator[NDArray[np.int64]]:
-    """Yield the row numbers of bands of at most CHUNK_PIXELS pixels."""
-    step = max(1, CHUNK_PIXELS // columns)
-    for first in range(0, rows, step):
-        yield np.arange(first, min(first + step, rows))
-
-
 def _as_dtype(image: FloatArray, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Round and clip to an integer dtype, or cast."""
+    """Return the image rounded and clipped to an integer dtype, or cast to another one."""
     if np.issubdtype(dtype, np.integer):
         info = np.iinfo(dtype)
         return np.clip(np.rint(image), info.min, info.max).astype(dtype)

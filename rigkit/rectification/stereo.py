@@ -1,8 +1,8 @@
-"""Stereo-rectified pairs of any two cameras: corresponding points come to lie in the same row.
+"""Stereo rectification of any two cameras: corresponding points have the same row.
 
 Every plane through the baseline becomes a row of the perspective image, and of the panoramas around the baseline
-(S. Abraham, W. Foerstner, "Fish-eye-stereo calibration and epipolar rectification", ISPRS 2005): these also serve
-fields of view beyond 180 degrees and a camera that moves forward.
+(S. Abraham, W. Foerstner, "Fish-eye-stereo calibration and epipolar rectification", ISPRS 2005). The panoramas also
+work for fields of view beyond 180 degrees and for forward motion.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ _REACH = {
     "cylindrical": (np.tan(np.radians(60.0)), np.pi),
     "equirectangular": (np.radians(85.0), np.pi),
 }
-"""Half extents (along, across the baseline) in the target's own units: beyond them the image is stretched too much."""
+"""Largest half extents of a target along and across the baseline, over its focal length: they limit the stretching."""
 MIN_ANGLE_RAD = np.radians(15.0)
-"""Baseline and viewing direction nearer than this: a perspective image perpendicular to the baseline shows neither."""
+"""Smallest angle between baseline and viewing direction for a perspective target, whose axis is across the baseline."""
 EXTENT_SAMPLES = 41
-"""Pixels a side of each image from which the extent of the targets is found."""
+"""Sampled pixels per side of each image from which the extent of the target follows."""
 MAX_ENLARGEMENT = 3.0
-"""Width or height of the target against the larger source at the most."""
+"""Largest side of the target over the largest side of the sources."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class StereoRectification:
-    """Two maps into images of one camera model and size, whose rows correspond.
+    """Two maps into one target camera, in whose images corresponding points have the same row.
 
     Attributes
     ----------
-    map1, map2 : the maps of the two cameras; `map1.target` and `map2.target` are one.
-    rect2_from_rect1 : no rotation; translation (-baseline, 0, 0) with camera 2 to the right, (baseline, 0, 0) else.
+    map1, map2 : the maps of the two cameras; `map1.target` and `map2.target` are the same.
+    rect2_from_rect1 : no rotation; translation (-baseline, 0, 0) if camera 2 is on the right, else (baseline, 0, 0).
     """
 
     map1: RectifyMap
@@ -67,16 +67,16 @@ def rectify_pair(
 ) -> StereoRectification:
     """Return the rectification of a pair of cameras of any models.
 
-    Raises InputError: `projection` is unknown; DegenerateError: no baseline, or one along the view in a perspective
-    rectification, or no common field of view.
+    Raises InputError: `projection` is unknown; DegenerateError: no baseline, a baseline along the viewing direction
+    with a perspective projection, or no common field of view.
 
     Parameters
     ----------
     projection : "perspective" for ordinary lenses and side-by-side cameras; "cylindrical" and "equirectangular" around
         the baseline for wide ones, the latter for every direction of the baseline.
 
-    The target covers the rows that both cameras see, and all columns that either sees, out to the reach of the
-    projection, at the sources' resolution in the median.
+    The target covers the rows that both cameras see and all columns that either sees, within the extent that the
+    projection allows, at the median resolution of the sources.
     """
     if projection not in _TARGETS:
         raise InputError(f"projection '{projection}' is unknown; known: {', '.join(_TARGETS)}")
@@ -101,7 +101,7 @@ def rectify_pair(
 
 
 def _common_rotation(cam2_from_cam1: Rigid3, projection: str) -> Mat3:
-    """Return rect_from_cam1: x along the baseline, to the right; z as near as can be to both viewing directions."""
+    """Return rect_from_cam1: x along the baseline, to the right; z as close as possible to both viewing directions."""
     centre2 = cam2_from_cam1.inverse().translation_mm
     x = unit(centre2)
     if not np.isfinite(x).all():
@@ -118,13 +118,13 @@ def _common_rotation(cam2_from_cam1: Rigid3, projection: str) -> Mat3:
             "take the projection 'equirectangular'"
         )
     across = np.cross(forward, x)
-    # A baseline along the view leaves the turn about it open: then the cameras' down stays down.
+    # A baseline along the view does not determine the rotation about it: keep the cameras' vertical.
     y = unit(across) if np.linalg.norm(across) > 1e-3 else unit(right[:, 1] - (right[:, 1] @ x) * x)
     return np.stack([x, y, np.cross(x, y)])
 
 
 def _extent(maps: list[RectifyMap], reach: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Return low and high corner of the target in units of its focal length, and target per source scale (median)."""
+    """Return the lower and upper corner of the target over its focal length, and the median scale of the maps."""
     lows, highs, scales = [], [], []
     for remap in maps:
         grid = grid_pixels(remap.camera.size_px, (EXTENT_SAMPLES, EXTENT_SAMPLES))

@@ -1,4 +1,4 @@
-"""The camera of a rectified image, from a field of view and a size that a person gives, or that suit the source."""
+"""The camera of a rectified image, for a given field of view and size, or for those of the source."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROJECTIONS: dict[Projection, type[Camera]] = {
 
 WIDEST_RAD = {"perspective": np.radians(170.0), "cylindrical": 2.0 * np.pi, "equirectangular": 2.0 * np.pi}
 DEFAULT_RAD = {"perspective": np.radians(100.0), "cylindrical": np.pi, "equirectangular": 2.0 * np.pi}
-"""Taken where the source sees as much; else what it sees."""
+"""Default field of view across the image; smaller where the source sees less."""
 
 
 def target_camera(
@@ -34,11 +34,12 @@ def target_camera(
 
     Parameters
     ----------
-    camera : the source; gives what is not given. By default the field of view is the source's own, up to 100 degrees
-        (perspective), 180 (cylindrical) or 360 (equirectangular), and the size keeps its pixels per radian at the
-        centre.
-    size_px : (width, height); by default the height is the width times the source's aspect (perspective), shows 45
-        degrees up and down (cylindrical), or as much as the width, at most 180 degrees (equirectangular).
+    camera : the source.
+    hfov_rad : None: the source's own field of view, at most 100 degrees (perspective), 180 (cylindrical) or 360
+        (equirectangular).
+    size_px : (width, height). None: the width keeps the source's pixels per radian at the centre; the height follows
+        from the source's aspect ratio (perspective), 45 degrees up and down (cylindrical), or the same angle as the
+        width, at most 180 degrees (equirectangular).
 
     Raises InputError for an unknown projection, or a field of view that it cannot show.
     """
@@ -68,7 +69,7 @@ def target_camera(
 
 
 def field_across(camera: Camera) -> float:
-    """Return the angle, rad, between the rays at the left and the right edge of the image, on the row of the axis."""
+    """Return the angle, rad, between the rays at the left and right image edges in the row of the optical axis."""
     u = np.linspace(-0.5, camera.size_px[0] - 0.5, 201)
     rays, valid = camera.unproject(np.stack([u, np.full_like(u, camera.axis_px[1])], axis=-1))
     across = np.arctan2(rays[valid, 0], rays[valid, 2])
