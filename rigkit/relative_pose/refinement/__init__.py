@@ -1,1 +1,1 @@
-"""The pose of maximum likelihood, and which type of pose the points speak for."""
+"""Maximum likelihood refinement of the relative pose, and selection of the pose type."""

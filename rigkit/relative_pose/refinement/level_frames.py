@@ -1,4 +1,4 @@
-"""Cameras that are not level themselves but know how they are mounted: on a vehicle, or with an accelerometer."""
+"""Level frames of tilted cameras whose vertical direction is known, from a vehicle mount or an accelerometer."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rigkit.geometry.rigid3 import Rigid3
 from rigkit.geometry.rotation import exp_so3
 
 UPSIDE_DOWN = 1e-6
-"""Sine of the angle below which a camera hangs upside down, and any axis turns it upright."""
+"""Smaller sines of the angle between `down` and the y axis count as zero: then any horizontal rotation axis will do."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LevelFrames:
-    """Rotations into frames whose y axis points down; planar motion is planar there.
+    """Rotations into frames whose y axis points down, in which planar motion is planar.
 
     Attributes
     ----------
@@ -31,16 +31,16 @@ class LevelFrames:
 
     @classmethod
     def from_down(cls, down1: Sequence[float] | FloatArray, down2: Sequence[float] | FloatArray) -> LevelFrames:
-        """Return the frames of cameras in which these directions (3,) point down, turned no more than needed.
+        """Return the frames that differ by the smallest rotations from cameras in which `down` (3,) is vertical.
 
         Raises InputError for a direction of length zero.
         """
         return cls(_upright(down1), _upright(down2))
 
     def matches(self, matches: Matches) -> Matches:
-        """Return the matches as level cameras would see them.
+        """Return the matches with rays and ray Jacobians in the level frames, without camera matrices.
 
-        Pixels, and with them affinities and sigmas, stay: only the rays turn, and no longer belong to a pinhole.
+        Pixels, affinities and sigmas do not change.
         """
         first, second = self.level1_from_cam1, self.level2_from_cam2
         return replace(
@@ -73,11 +73,11 @@ class LevelFrames:
 
 
 def _upright(down: Sequence[float] | FloatArray) -> Mat3:
-    """Return the smallest rotation that takes `down` to the y axis."""
+    """Return the smallest rotation that maps `down` to the y axis."""
     vector = as_array(down, (3,), "down")
     length = float(np.linalg.norm(vector))
     if length == 0.0:
-        raise InputError("down: a direction of length zero; give which way is down in the camera's frame")
+        raise InputError("down: a direction of length zero; give the direction that is down in the camera's frame")
     x, y, z = vector / length
     sine = float(np.hypot(x, z))
     axis = np.array([-z, 0.0, x]) / sine if sine > UPSIDE_DOWN else np.array([0.0, 0.0, 1.0])

@@ -1,7 +1,7 @@
-"""Quality and weight of a residual where the noise level is not known: no threshold between inlier and outlier.
+"""Quality and weight of a residual marginalised over an unknown noise level, without an inlier threshold.
 
 The quality of a residual r, in sigmas, is the mean of max(0, 1 - (r / (k s))^2) over the noise levels s between 1 and
-`max_noise`, k the 99 % quantile. Reference: Barath, Noskova, Matas ("MAGSAC++").
+`max_noise`, with k the 99 % quantile. Reference: Barath, Noskova, Matas ("MAGSAC++").
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from rigkit.core.arrays import FloatArray
 
 QUANTILE = 2.576
-"""Of |r| for a normal r: 99 %. As in kernels/pose.c."""
+"""99 % quantile of |r| for a standard normal r. As in kernels/pose.c."""
 
 
 def marginal_quality(r: FloatArray, max_noise: FloatArray | float) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The minimisation behind `refine_pose`: Levenberg-Marquardt on the pose, matches weighted anew after every step."""
+"""The minimisation of `refine_pose`: Levenberg-Marquardt on the pose with iteratively reweighted matches."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ STEP_TOLERANCE = 1e-10
 DAMPING_OF_POSE = Damping(start=1e-6, ceiling=1e8, floor=1e-12)
 ROUNDING_OF_COST = 1e-14
 CAUCHY_SCALE = 2.385
-"""In standard deviations: 95 % efficient for Gaussian noise."""
+"""Scale of the Cauchy loss in standard deviations: 95 % efficient for Gaussian noise."""
 
 RobustWeights = Callable[[FloatArray], FloatArray]
-"""From residuals in sigmas (N,) to factors of their squares (N,)."""
+"""Maps residuals in sigmas (N,) to the weights of their squares (N,)."""
 
 
 def cauchy_weights(residuals: FloatArray) -> FloatArray:
@@ -38,13 +38,13 @@ def cauchy_weights(residuals: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class PoseMinimum:
-    """Where the minimisation ended.
+    """Result of the minimisation.
 
     Attributes
     ----------
     R, t : rotation (3, 3) and unit translation (3,) of cam2_from_cam1.
-    residuals, jacobian, weights : (M,), (M, 5), (M,): points, then two for each affinity, then `priors` of the level.
-        Residuals are in sigmas and, like the Jacobian by (w, b), without the weights of their squares.
+    residuals, jacobian, weights : (M,), (M, 5), (M,): of the points, two of each affinity, `priors` of the level.
+        Residuals (in sigmas) and Jacobian (by (w, b)) are not multiplied by the weights of the squared residuals.
     iterations : of the minimisation; `converged` says whether its last step was small.
     """
 
@@ -60,7 +60,7 @@ class PoseMinimum:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _WeightedRows(LinearisedProblem):
-    """Residuals (M,) around a pose with their derivatives (M, 5), their weights and matches (M,), and what may move."""
+    """Residuals (M,) at a pose, their Jacobian (M, 5), weights (M,) and matches (M,), and the free parameters."""
 
     residuals: FloatArray
     jacobian: FloatArray
@@ -74,7 +74,7 @@ class _WeightedRows(LinearisedProblem):
         return float(np.sum(self.weights * self.residuals**2))
 
     def step(self, damping: float) -> DenseStep | None:
-        """Return the damped step, (5,), zero where nothing may move."""
+        """Return the damped step (5,), zero in fixed parameters; None if the system is singular."""
         J, w = self.jacobian[:, self.free], self.weights
         gram, gradient = (J.T * w) @ J, (J.T * w) @ self.residuals
         scale = np.diag(gram) + 1e-12 * np.trace(gram) + 1e-300
@@ -87,9 +87,9 @@ class _WeightedRows(LinearisedProblem):
         return DenseStep(change, float(move @ (damping * scale * move - gradient)))
 
     def decrease(self, there: _WeightedRows) -> float:
-        """Return by how much the cost is less there, both under the weights here; equal within rounding is less.
+        """Return the decrease of the cost under the present weights; equal costs within rounding are a decrease.
 
-        A step that lowers this sum lowers the robust loss as well.
+        A step that lowers this sum also lowers the robust loss.
         """
         return self.cost * (1.0 + ROUNDING_OF_COST) - float(np.sum(self.weights * there.residuals**2))
 
@@ -105,7 +105,7 @@ def _small(step: DenseStep) -> bool:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PoseProblem:
-    """What a pose is refined on; the attributes are the arguments of `refine_pose`."""
+    """The arguments of `refine_pose`, as a least squares problem."""
 
     matches: Matches
     kind: str
@@ -114,11 +114,11 @@ class PoseProblem:
     point_weights: FloatArray | None
 
     def free(self) -> IntArray:
-        """Return which of (w, b), the first of b horizontal, may move."""
+        """Return the indices of the free parameters among (w, b)."""
         return free_directions(PoseType.GENERAL if self.level_sigma_rad is not None else self.kind)
 
     def minimum(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
-        """Return the minimum near a pose; raises InputError where the residuals are too few."""
+        """Return the minimum near a pose; raises InputError if there are fewer residuals than degrees of freedom."""
         loss = self._loss()
         if self.level_sigma_rad is None and loss is not None:
             affine, which = whitened_affinities(self.matches)
@@ -139,7 +139,7 @@ class PoseProblem:
         return self._descend(R, t)
 
     def _descend(self, R: FloatArray, t: FloatArray) -> PoseMinimum:
-        """Return the minimum near a pose with a level's prior, which the kernel does not take."""
+        """Return the minimum near a pose for a level prior or another loss, which the kernel does not support."""
         start = self._linearise((R, t))
         self._require(len(start.residuals))
         iterations, converged, state, here = 0, True, (R, t), start
@@ -169,7 +169,7 @@ class PoseProblem:
             )
 
     def _loss(self) -> tuple[int, float] | None:
-        """Return what the kernel calls the loss, and its scale; None if it does not know it."""
+        """Return the kernel's number of the loss, and its scale; None if the kernel does not support it."""
         if self.robust is None:
             return 0, 1.0
         if self.robust is cauchy_weights:
@@ -177,7 +177,7 @@ class PoseProblem:
         return (2, self.robust.max_noise) if isinstance(self.robust, MarginalLoss) else None
 
     def _residuals(self, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return residuals (M,), Jacobian (M, 5) and the match of each (M,), -1 for the prior; no weights yet."""
+        """Return unweighted residuals (M,), Jacobian (M, 5) and the match of each residual (M,), -1 for the prior."""
         basis = translation_basis(t)
         r, jacobian = point_terms(self.matches, R, t, basis)
         ra, ja, which = affinity_terms(self.matches, R, t, basis)
@@ -199,10 +199,10 @@ class PoseProblem:
         n, data = len(self.matches), of >= 0
         out = np.where(data, self._own_weights()[np.maximum(of, 0)], 1.0)
         if self.robust is not None:
-            # A match is doubted by its point and by its affinity, each per degree of freedom.
-            doubt = self.robust(r[:n])
-            pair = r[n : n + 2 * int((data.sum() - n) // 2)].reshape(-1, 2)
-            of_pair = self.robust(np.sqrt(0.5 * np.sum(pair**2, axis=1)))
-            out[:n] *= doubt
-            out[n : n + pair.size] *= np.repeat(of_pair, 2) * doubt[of[n : n + pair.size]]
+            # An affinity's weight is the product of that of its point and its own, from residuals per component.
+            by_point = self.robust(r[:n])
+            pair = r[n : data.sum()].reshape(-1, 2)
+            by_affinity = self.robust(np.sqrt(0.5 * np.sum(pair**2, axis=1)))
+            out[:n] *= by_point
+            out[n : data.sum()] *= np.repeat(by_affinity, 2) * by_point[of[n : data.sum()]]
         return out

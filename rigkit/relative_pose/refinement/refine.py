@@ -1,8 +1,8 @@
 """Maximum likelihood pose from points and affinities, with the pose type as a constraint or as a soft prior.
 
-Levenberg-Marquardt on the five degrees of freedom of the relative pose. The pose type is either exact (planar two
-degrees of freedom, standard and forward none) or, with `level_sigma_rad`, a Gaussian prior on the deviations from it: a
-spirit level that holds to 0.2 degrees is neither ignored nor believed exactly.
+Levenberg-Marquardt on the five degrees of freedom of the relative pose. The pose type is either exact (planar motion
+has two degrees of freedom, standard and forward none) or, with `level_sigma_rad`, a Gaussian prior on the deviations
+from it, such as those of cameras set up with a spirit level.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rigkit.relative_pose.solvers.registry import fundamental_for
 from rigkit.relative_pose.solvers.weights import MIN_SIGMA_A, WeightRule, estimate_sigma_A, usable_affinities
 
 SIGNIFICANT = 3.0
-"""Standard deviations by which a pose must explain the matches worse than another one to be ruled out."""
+"""Smallest difference of two poses' costs, in standard deviations, that rules out the worse pose."""
 
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
@@ -39,12 +39,12 @@ class RefinedPose:
     Attributes
     ----------
     cam2_from_cam1 : pose with |translation| = 1.
-    covariance : (6, 6) of (left rotation perturbation rad, translation); rank five, and less under a constraint. It
-        follows from the sigmas of the matches; multiply it by `variance_factor` where those are not trusted.
+    covariance : (6, 6) of (left rotation perturbation rad, translation); rank five, lower under a constraint. It
+        assumes the sigmas of the matches; multiply it by `variance_factor` if those are not reliable.
     sampson_rms_px : root mean square of the Sampson distances of all points.
-    cost : sum of squared residuals in sigmas, with the prior's.
-    variance_factor : cost of the data over the number of residuals less degrees of freedom; 1 if the sigmas are right.
-    weights : (N,) factors of the squared residuals in the last iteration; 1 unless robust.
+    cost : sum of squared residuals in sigmas, including the prior.
+    variance_factor : cost of the data over the redundancy (residuals minus degrees of freedom); 1 for correct sigmas.
+    weights : (N,) weights of the squared residuals in the last iteration; 1 unless robust.
     iterations : of the minimisation; `converged` says whether its last step was small.
     """
 
@@ -77,14 +77,14 @@ def refine_pose(
 
     Parameters
     ----------
-    matches : affinities take part where they have a sigma_A: leave it out for affinities that were computed from the
-        epipolar geometry or from the very same corners.
-    start : its translation's length does not matter.
-    pose_type : exact constraint, unless `level_sigma_rad` makes it a prior.
+    matches : affinities with a sigma_A are used. Leave sigma_A out for affinities that were computed from the epipolar
+        geometry or from the same corners.
+    start : initial pose; the length of its translation is ignored.
+    pose_type : exact constraint; a prior with `level_sigma_rad`.
     level_sigma_rad : standard deviation of each deviation from the pose type.
-    robust : weight function for contaminated matches, `cauchy_weights` for example.
-    point_weights : (N,) fixed factors of the squared residuals of each match.
-    level_frames : in which the pose type is meant to hold; None: those of the cameras.
+    robust : weight function for matches with outliers, for example `cauchy_weights`.
+    point_weights : (N,) fixed weights of the squared residuals of each match.
+    level_frames : frames to which the pose type refers; None: those of the cameras.
     """
     if str(pose_type) not in ("general", "planar", "standard", "forward"):
         raise InputError(
@@ -111,10 +111,10 @@ def estimate_pose(
     *,
     weights: WeightRule | None = None,
 ) -> RefinedPose:
-    """Return the refined pose from scratch: linear solution, cheirality, maximum likelihood.
+    """Return the pose without an initial one: linear solution, cheirality, maximum likelihood.
 
-    With a soft level the minimisation starts from the exact pose type and from the general solution, and the better
-    end is kept. With the rule "auto" sigma_A is estimated from the data and set in the matches.
+    With a prior the minimisation starts from the solution of the exact pose type and from the general one, and the
+    better result is returned. The rule "auto" estimates sigma_A from the data.
     """
     if str(pose_type) == PoseType.GENERAL:
         level_sigma_rad = None
@@ -145,7 +145,7 @@ def estimate_pose(
 
 
 def _visible_cost(matches: Matches, end: RefinedPose) -> float:
-    """Return the cost with what it takes to bring the points that are behind a camera to infinity."""
+    """Return the cost plus that of moving the points behind a camera to infinity."""
     return end.cost + float(np.sum(end.weights * cheirality_margin(matches, end.cam2_from_cam1) ** 2))
 
 
@@ -161,17 +161,18 @@ def _refuse_ambiguity(matches: Matches, best: RefinedPose, ends: list[RefinedPos
 
 
 def rules_out(matches: Matches, better: RefinedPose, worse: RefinedPose) -> bool:
-    """Return whether `matches` are explained so much better by the one pose that the other is wrong."""
+    """Return whether the cost of the worse pose is significantly higher than that of the better one."""
     chance = _chance_difference(matches, better.cam2_from_cam1, worse.cam2_from_cam1)
     difference = _visible_cost(matches, worse) - _visible_cost(matches, better)
     return difference >= SIGNIFICANT * max(better.variance_factor, 1.0) * chance
 
 
 def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float:
-    """Return the standard deviation of the difference of two poses' costs where both are true, for all the matches say.
+    """Return the standard deviation of the difference of two poses' costs that noise alone would cause.
 
-    A residual is the noise across an epipolar line, and another pose has other lines: of two normal residuals with the
-    correlation c the squares differ by 4 (1 - c^2) in the mean square. Along with SIGNIFICANT itself, for the pose.
+    A residual is the noise across an epipolar line, whose direction depends on the pose. For two standard normal
+    residuals with correlation c the mean square difference of their squares is 4 (1 - c^2). SIGNIFICANT^2 is added for
+    the error of the pose itself.
     """
     m, which = matches, whitened_affinities(matches)[1]
     lines1, lines2 = [], []
@@ -184,7 +185,7 @@ def _chance_difference(matches: Matches, first: Rigid3, second: Rigid3) -> float
 
 
 def project_to_type(pose: Rigid3, pose_type: PoseType | str) -> tuple[FloatArray, FloatArray]:
-    """Return rotation (3, 3) and unit translation (3,) of the pose of that type nearest to `pose`."""
+    """Return rotation (3, 3) and unit translation (3,) of the pose of type `pose_type` nearest to `pose`."""
     R, t = _split(pose)
     kind = str(pose_type)
     if kind == PoseType.PLANAR:
@@ -204,7 +205,7 @@ def _split(pose: Rigid3) -> tuple[FloatArray, FloatArray]:
 
 
 def _with_sigma(matches: Matches, starts: Sequence[Rigid3], weights: WeightRule | None) -> Matches:
-    """Return the matches with the sigma_A that the weight rule stands for: one for all starts, of the best of them."""
+    """Return the matches with the sigma_A of the weight rule; "auto" takes the smallest estimate over all starts."""
     if weights == "points" or (weights == "auto" and not usable_affinities(matches).any()):
         return replace(matches, A21=None, sigma_A=None)
     if weights == "auto" and starts:
@@ -229,8 +230,7 @@ def _result(problem: PoseProblem, end: PoseMinimum) -> RefinedPose:
     covariance = spread @ np.linalg.inv(gram) @ spread.T if freedom else np.zeros((6, 6))
     data, n = r[: len(r) - end.priors], len(matches)
     pose = Rigid3(end.R, end.t)
-    E21 = essential_from_pose(pose)
-    px = sampson_of_matches(E21, matches)
+    px = sampson_of_matches(essential_from_pose(pose), matches)
     return RefinedPose(
         cam2_from_cam1=pose,
         covariance=covariance,

@@ -1,12 +1,11 @@
-"""Residuals of a relative pose in standard deviations, with their derivatives: what the refinement minimises.
+"""Residuals of a relative pose in standard deviations, with their derivatives, for the refinement.
 
 The pose is (R, t), |t| = 1, perturbed by R <- exp(w) R and t <- t + b1 T1 + b2 T2 with T1, T2 perpendicular to t.
 
-Points: the reprojection error itself, not its first-order approximation. For each pair of pixels the nearest pair that
-satisfies the epipolar geometry is found (two linearisations); the residual is the signed length of that displacement
-in sigmas, and by the envelope theorem its derivative is that of the constraint at the corrected rays over its standard
-deviation. Affinities: A^T n2 + n1 over the root of its variance, sigma_A^2 |n2|^2 and what the pixels' noise adds to it
-(weights.pixel_share).
+Points: the reprojection error, not its first-order (Sampson) approximation. The nearest pair of pixels that satisfies
+the epipolar geometry is found by two linearisations. The residual is the signed length of the displacement in sigmas.
+By the envelope theorem its derivative is that of the constraint at the corrected rays over its standard deviation.
+Affinities: A^T n2 + n1 over its standard deviation, from sigma_A^2 |n2|^2 and the pixels' noise (weights.pixel_share).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArra
     f1, f2, dq1, dq2 = correct_rays_px(
         matches.rays1, matches.rays2, E21, b1, b2, sigma1_px=s1, sigma2_px=s2, iterations=1
     )
-    # The Jacobians are those of the measured pixels: across a displacement of a pixel they do not change visibly.
+    # The ray Jacobians of the measured pixels are used: displacements of a pixel change them negligibly.
     c, n1, n2 = epipolar_normals(E21, f1, f2, b1, b2)
     at_measured = c - np.sum(n1 * dq1, axis=-1) - np.sum(n2 * dq2, axis=-1)
     sigma = np.sqrt(s1**2 * np.sum(n1 * n1, axis=-1) + s2**2 * np.sum(n2 * n2, axis=-1))
@@ -44,10 +43,7 @@ def point_terms(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArra
 def affinity_terms(
     matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return affinity residuals (K, 2) in sigmas, their Jacobian (K, 2, 5) and which matches (K,) they belong to.
-
-    Affinities without a sigma_A take no part.
-    """
+    """Return residuals (K, 2) in sigmas of the affinities with a sigma_A, their Jacobian (K, 2, 5) and matches (K,)."""
     which = _chosen(matches)
     if not len(which):
         return np.zeros((0, 2)), np.zeros((0, 2, 5)), which
@@ -74,7 +70,7 @@ def affinity_terms(
 
 
 def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return half the derivative (K, 5) of `pixel_share`: a sum of squares, of M = B2^T E B1."""
+    """Return half the derivative (K, 5) of `pixel_share`, which is a sum of squares of M = B2^T E B1 and A^T M."""
     m = matches
     assert m.A21 is not None
     C = R @ m.jacobians1
@@ -86,10 +82,10 @@ def _half_slope(matches: Matches, R: FloatArray, t: FloatArray, basis: FloatArra
 
 
 def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
-    """Return what `affinity_terms` takes from the matches, for its kernel: 25 rows (25, K), and which matches (K,).
+    """Return the input of `affinity_terms` in the memory layout of its kernel, (25, K), and which matches (K,).
 
-    Rays of both images, columns of their ray Jacobians by pixel coordinate, the entries of A21, the variances of its
-    entries and of the pixels of both images.
+    The rows are the rays of both images, the columns of their ray Jacobians, the entries of A21, and the variances of
+    an entry of A21 and of the pixels of both images.
     """
     which = _chosen(matches)
     if not len(which):
@@ -103,7 +99,7 @@ def whitened_affinities(matches: Matches) -> tuple[FloatArray, IntArray]:
 
 
 def _chosen(matches: Matches) -> IntArray:
-    """Return which matches (K,) have an affinity of known uncertainty."""
+    """Return the indices (K,) of the matches with an affinity and its sigma_A."""
     if matches.sigma_A is None:
         return np.zeros(0, dtype=np.int64)
     known = np.isfinite(matches.sigma_A) & (matches.sigma_A > 0.0)
@@ -113,10 +109,10 @@ def _chosen(matches: Matches) -> IntArray:
 def level_terms(
     pose_type: PoseType | str, R: FloatArray, t: FloatArray, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the deviations (K,) in radians of a pose from its type, and their Jacobian (K, 5).
+    """Return the deviations (K,), rad, of a pose from its type, and their Jacobian (K, 5).
 
-    Planar: the x and z components of the image of the vertical axis, and t_y. Standard and forward: the rotation vector
-    and the two components of t across x or z. General: nothing.
+    Planar: the x and z components of the rotated vertical axis, and t_y. Standard and forward: the rotation vector and
+    the two components of t perpendicular to x or z. General: none.
     """
     kind = str(pose_type)
     if kind == PoseType.PLANAR:
@@ -128,7 +124,7 @@ def level_terms(
     if (along := axis_of(kind)) is not None:
         across = np.delete(np.arange(3), along)
         jacobian = np.zeros((5, 5))
-        # The rotation is small where this prior has a say: d log(exp(w) R) = dw.
+        # d log(exp(w) R) = dw for small rotations, the only ones for which this prior matters.
         jacobian[:3, :3] = np.eye(3)
         jacobian[3:, 3:] = basis[:, across].T
         return np.concatenate([log_so3(R), t[across]]), jacobian

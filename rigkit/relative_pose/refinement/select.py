@@ -1,10 +1,10 @@
-"""Which pose type do the matches speak for, and does the declared one hold?
+"""Selection of the pose type of matches, and a test of the declared type.
 
-Each type has the marginal likelihood of the points (Laplace's approximation) under "the pose is of this type up to the
-spirit level's sigma". A type is preferred over a more general one if its deviations are no larger than noise and level
-allow, because it spends no probability on poses that were not taken. The noise is that of the matches' sigmas,
-corrected by what the general fit leaves over. A declared type is contradicted if the deviations of the general fit from
-it cannot come from noise and level together.
+The evidence of a type is the marginal likelihood of the points (Laplace's approximation) under the hypothesis that the
+pose is of this type up to the sigma of a spirit level. A type is preferred over a more general one if its deviations
+are consistent with noise and level, since its prior is more concentrated. The noise is that of the matches' sigmas,
+scaled by the variance factor of the general fit. A declared type is contradicted if the deviations of the general fit
+from it are not consistent with noise and level.
 """
 
 from __future__ import annotations
@@ -25,25 +25,24 @@ from rigkit.relative_pose.refinement.residuals import level_terms
 from rigkit.relative_pose.solvers.pose import translation_basis
 
 DEFAULT_LEVEL_RAD = float(np.radians(0.2))
-"""What a carefully set spirit level on a tripod holds to, where nobody says."""
+"""Default sigma of the level: that of a carefully set spirit level on a tripod."""
 
 CONTRADICTION_P = 1e-3
-"""Chance with which a true declaration would be called contradicted."""
+"""Significance level of the test of a declared type: its false alarm rate."""
 
 SELECTED_TYPES = (PoseType.GENERAL, PoseType.PLANAR, PoseType.STANDARD, PoseType.FORWARD)
 
 
-@dataclass(frozen=True, eq=False, slots=True, kw_only=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class TypeEvidence:
-    """What the matches say about one pose type.
+    """Evidence of the matches for one pose type.
 
     Attributes
     ----------
-    pose_type : which.
-    log_evidence : log marginal likelihood, relative to the best type (so 0 for the best, negative for the others).
-    probability : posterior probability if all four types were equally likely beforehand.
-    deviation_rad : largest angle of the general fit off the type, see `type_deviation_rad`. Zero for the general type.
-    p_value : chance of deviations at least this large from noise and level, if the type were true.
+    log_evidence : log marginal likelihood relative to that of the best type, whose value is 0.
+    probability : posterior probability for equal prior probabilities of the four types.
+    deviation_rad : deviation of the general fit from the type, see `type_deviation_rad`. Zero for the general type.
+    p_value : probability of deviations at least this large, due to noise and level, under the type.
     """
 
     pose_type: PoseType
@@ -59,8 +58,8 @@ class PoseTypeEvidence:
 
     Attributes
     ----------
-    types : one entry a type, by falling evidence.
-    level_sigma_rad : the level that was assumed.
+    types : one entry per type, by decreasing evidence.
+    level_sigma_rad : the assumed sigma of the level.
     """
 
     types: tuple[TypeEvidence, ...]
@@ -72,11 +71,11 @@ class PoseTypeEvidence:
         return self.types[0].pose_type
 
     def of(self, pose_type: PoseType | str) -> TypeEvidence | None:
-        """Return the evidence for one type; None where it could not be fitted."""
+        """Return the evidence for one type; None if it could not be fitted."""
         return next((entry for entry in self.types if entry.pose_type == str(pose_type)), None)
 
     def contradiction(self, declared: PoseType | str) -> str | None:
-        """Return a sentence with the figures if the matches contradict the declared type, else None."""
+        """Return a sentence with deviation and p-value if the matches contradict the declared type, else None."""
         if str(declared) in (PoseType.AUTO, PoseType.GENERAL):
             return None
         entry = self.of(declared)
@@ -97,8 +96,7 @@ class PoseTypeEvidence:
 def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -> PoseTypeEvidence:
     """Return the evidence of the points of `matches` for general, planar, standard and forward.
 
-    Affinities are not used: what matters here is far better known from the points. `level_sigma_rad` None stands for
-    DEFAULT_LEVEL_RAD.
+    Affinities are not used, being far less accurate than points. `level_sigma_rad` None is DEFAULT_LEVEL_RAD.
 
     Raises DegenerateError, InputError: no type can be fitted (no baseline, too few matches).
     """
@@ -112,24 +110,15 @@ def pose_type_evidence(matches: Matches, level_sigma_rad: float | None = None) -
     top = max(raw.values())
     total = sum(np.exp(value - top) for value in raw.values())
     entries = []
-    for kind in fits:
+    for kind, value in sorted(raw.items(), key=lambda item: -item[1]):
         deviation, p = _deviation(general, kind, level, noise2)
-        probability = float(np.exp(raw[kind] - top) / total)
-        entries.append(
-            TypeEvidence(
-                pose_type=kind,
-                log_evidence=raw[kind] - top,
-                probability=probability,
-                deviation_rad=deviation,
-                p_value=p,
-            )
-        )
-    entries.sort(key=lambda entry: -entry.log_evidence)
+        probability = float(np.exp(value - top) / total)
+        entries.append(TypeEvidence(kind, value - top, probability, deviation_rad=deviation, p_value=p))
     return PoseTypeEvidence(tuple(entries), level)
 
 
 def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
-    """Return the soft fit of every type that has one."""
+    """Return the fit of each pose type, with the level as a prior; types that cannot be fitted are left out."""
     fits: dict[PoseType, RefinedPose] = {}
     failure: RigkitError | None = None
     for kind in reversed(SELECTED_TYPES):
@@ -140,7 +129,7 @@ def _fits(matches: Matches, level: float) -> dict[PoseType, RefinedPose]:
             failure = error
     if not fits:
         raise failure or DegenerateError("no pose type fits the matches")
-    # The general optimum is no worse than any other type's: where it is, it was a local one.
+    # A general fit that is worse than that of another type is a local optimum.
     for kind, fit in list(fits.items()):
         best = fits.get(PoseType.GENERAL)
         if best is None or fit.cost - _prior_cost(fit, kind, level) < best.cost:
@@ -162,27 +151,25 @@ def _level_parts(fit: RefinedPose, kind: PoseType) -> tuple[FloatArray, FloatArr
 
 
 def _prior_cost(fit: RefinedPose, kind: PoseType, level: float) -> float:
-    values, _, _ = _level_parts(fit, kind)
-    return float(np.sum((values / level) ** 2))
+    return float(np.sum((_level_parts(fit, kind)[0] / level) ** 2))
 
 
 def _log_evidence(fit: RefinedPose, kind: PoseType, level: float, noise2: float) -> float:
-    """Return the log marginal likelihood by Laplace's approximation, up to what all types share."""
+    """Return the log marginal likelihood by Laplace's approximation, up to a constant that all types share."""
     values, jacobian, covariance = _level_parts(fit, kind)
-    prior = jacobian.T @ jacobian / level**2
-    # The refinement took the stated sigmas; the noise level corrects the data's share only.
-    data = (np.linalg.inv(covariance) - prior) / noise2
-    curvature = data + prior
-    log = -0.5 * (fit.cost - np.sum((values / level) ** 2)) / noise2 - 0.5 * np.sum((values / level) ** 2)
+    prior, prior_cost = jacobian.T @ jacobian / level**2, np.sum((values / level) ** 2)
+    # The refinement assumed the stated sigmas; the variance factor scales the data's part of the curvature only.
+    curvature = (np.linalg.inv(covariance) - prior) / noise2 + prior
+    log = -0.5 * (fit.cost - prior_cost) / noise2 - 0.5 * prior_cost
     log += 2.5 * np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(curvature)[1]
-    # Prior density: uniform over what the type leaves free (rotations 8 pi^2, directions 4 pi, each angle 2 pi, the
-    # sign of a fixed direction 2), Gaussian in what it fixes.
+    # Prior density: uniform in the free parameters of the type (rotations 8 pi^2, directions 4 pi, each angle 2 pi, the
+    # sign of a fixed direction 2), Gaussian in the deviations.
     free = {PoseType.GENERAL: np.log(32.0 * np.pi**3), PoseType.PLANAR: np.log(4.0 * np.pi**2)}.get(kind, np.log(2.0))
     return float(log - free - len(values) * 0.5 * np.log(2.0 * np.pi * level**2))
 
 
 def _deviation(general: RefinedPose | None, kind: PoseType, level: float, noise2: float) -> tuple[float, float]:
-    """Return the largest deviation of the general fit from the type, rad, and its chance under the type."""
+    """Return the deviation of the general fit from the type, rad, and its p-value under the type."""
     from scipy.special import gammaincc
 
     if general is None or kind == PoseType.GENERAL:
@@ -194,10 +181,10 @@ def _deviation(general: RefinedPose | None, kind: PoseType, level: float, noise2
 
 
 def type_deviation_rad(pose: Rigid3, kind: PoseType) -> float:
-    """Return the largest angle by which a pose is off its type, rad; zero for the general type.
+    """Return the largest angle (rad) between a pose and its type; zero for the general type.
 
-    Planar: the tilt of the vertical axis, and of the translation out of the horizontal plane. Standard and forward: the
-    rotation, and the translation against the x or the z axis, either way along it.
+    Planar: the tilt of the vertical axis, and the elevation of the translation. Standard and forward: the rotation, and
+    the angle of the translation to the x or z axis, regardless of sign.
     """
     R, t = pose.rotation, unit(pose.translation_mm)
     if kind == PoseType.PLANAR:

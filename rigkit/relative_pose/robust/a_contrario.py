@@ -1,4 +1,4 @@
-"""Is an agreement of matches with a pose more than chance? Boards and facades agree with many poses in part."""
+"""A-contrario test: do more matches fit a pose than by chance? Boards and facades partly fit many poses."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from rigkit.geometry.sampson import sampson_of_matches
 from rigkit.relative_pose.solvers.pose import essential_from_pose
 
 SHIFTS = 40
-"""Wrong partners tried for every point: the chance of a fit becomes known to a few per cent."""
+"""Random wrong partners tried per point, so that the probability of a chance fit is known to a few per cent."""
 
 
 def log_false_alarms(
     matches: Matches, pose: Rigid3, inliers: BoolArray, affinity_fits: BoolArray, freedom: int, gate: float
 ) -> float:
-    """Return the log of how many poses would be expected to do as well if all matches were wrong.
+    """Return the log number of false alarms: the expected number of poses with as many inliers among wrong matches.
 
-    Infinite for fewer matches than a pose can always be made to fit.
+    Infinite if there are fewer inliers than degrees of freedom.
 
     Parameters
     ----------
-    matches : all of them.
-    pose : found by a search through minimal samples; its length does not matter.
-    inliers : (N,) matches that agree with it, by point and by affinity.
-    affinity_fits : (N,) whether the affinity passes its test; True where there is none.
+    matches : all N.
+    pose : found by sampling; the length of its translation is ignored.
+    inliers : (N,) matches that fit it, by point and by affinity.
+    affinity_fits : (N,) whether the affinity fits; True without an affinity.
     freedom : degrees of freedom of the pose.
-    gate : points fit within this many sigmas.
+    gate : largest Sampson distance of a point that fits, in sigmas.
 
     Notes
     -----
     N C(N, k) C(k, freedom) p^(k - freedom) with k inliers (Moisan and Stival, "A probabilistic criterion to detect
-    rigid point matches between two images and estimate the fundamental matrix"). How often (p) a wrong match fits is
-    seen from the points themselves, partnered wrongly on purpose, and from the affinities of those that do not fit.
+    rigid point matches between two images and estimate the fundamental matrix"). The probability p that a wrong match
+    fits is estimated from the points with wrong partners, and from the affinities of the points that do not fit.
     """
     n, k = len(matches), int(inliers.sum())
     if k < freedom:

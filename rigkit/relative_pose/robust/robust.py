@@ -1,10 +1,9 @@
-"""Robust relative pose from contaminated matches: minimal samples, a marginalised threshold, local optimisation.
+"""Robust relative pose from matches with outliers: minimal samples, a marginalised threshold, local optimisation.
 
-No threshold between inlier and outlier is set: hypotheses are ranked, improved and refined under the marginalised loss
-(marginal.py), whose weights the maximum likelihood refinement takes as well. Several local optima are kept until the
-noise of the matches is known, counting only what lies in front of both cameras. Deterministic under a seeded
-generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova, Matas
-("MAGSAC++").
+There is no inlier threshold: hypotheses are ranked, optimised and refined under the marginalised loss (marginal.py).
+Several local optima, ranked with cheirality, are kept until the noise of the matches is estimated. Deterministic for a
+seeded generator. References: Fischler and Bolles; Chum, Matas, Kittler ("Locally optimized RANSAC"); Barath, Noskova,
+Matas ("MAGSAC++").
 """
 
 from __future__ import annotations
@@ -32,8 +31,7 @@ from rigkit.relative_pose.solvers.rows import PLANAR_ENTRIES, affinity_rows, ess
 from rigkit.relative_pose.solvers.weights import affinity_distances, usable_affinities
 
 Sample = Literal["points", "affine"]
-"""What minimal samples consist of: points, or affine correspondences. Of these two are enough instead of five, one
-instead of two."""
+"""Type of the minimal samples: points or affine correspondences."""
 SAMPLE_SIZES: dict[tuple[str, Sample], int] = {
     ("general", "points"): 5,
     ("general", "affine"): 2,
@@ -41,7 +39,7 @@ SAMPLE_SIZES: dict[tuple[str, Sample], int] = {
     ("planar", "affine"): 1,
 }
 CONFIDENCE = 0.999
-"""Of having drawn a sample without outliers, given the share of inliers found so far."""
+"""Probability of at least one sample without outliers, given the share of inliers found so far."""
 MAX_TRIALS = 4000
 
 NO_POSE = (
@@ -49,33 +47,34 @@ NO_POSE = (
     "those of the images, and the order of the images"
 )
 BATCH = 96
-"""Samples at a time: a little more than 40 % of wrong matches ask for."""
+"""Samples per batch: slightly more than 40 % of outliers require."""
 WIDE = 4.0
-"""Factor of the highest noise level at which minimal samples, noisy themselves, are ranked and improved first."""
+"""Factor of the highest noise level at which minimal samples, being noisy, are ranked and first optimised."""
 LOCAL_TRIES = 8
+"""Hypotheses of a batch that are optimised locally at the most."""
 PROMISING = 0.6
-"""Of a batch the best few are improved, if they rank as high as this share of the best so far."""
+"""Smallest quality of a hypothesis to be optimised locally, over the best quality so far."""
 FINALISTS = 4
 """Local optima kept at each of the two noise levels."""
 SAME_QUALITY = 1e-3
-"""In matches: optima that differ by less are one, to the precision of the local optimisation."""
+"""Optima whose qualities (in matches) differ by less count as one, given the precision of the local optimisation."""
 MIN_NOISE = 1.5
-"""Noise level over the noise that the matches show: the loss still sees the tails, and few wrong matches."""
+"""Final noise level over the estimated noise of the inliers, and its lower bound in sigmas."""
 NOISE_ROUNDS = 3
-"""Each leaves out what the noise of the round before does not explain."""
+"""Iterations of the noise estimate, each over the inliers at the noise level of the one before."""
 GOOD_AFFINE = 0.1
-"""Share of clean samples with an affinity that lead to the optimum (measured: a third at 0.05 noise of A)."""
+"""Share of outlier-free samples with an affinity that lead to the optimum (measured: a third for sigma_A = 0.05)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RobustPose:
-    """A pose found among contaminated matches.
+    """A pose estimated robustly.
 
     Attributes
     ----------
     refined : the pose, refined on the weighted matches.
-    inliers : (N,) bool, matches that fit at one and a half times the noise that the fitting ones show, lie in front of
-        both cameras (by more than noise) and, where there are affinities with sigmas, agree by them.
+    inliers : (N,) bool, matches within the 99 % quantile at MIN_NOISE times the estimated noise, not clearly behind
+        a camera, and with a fitting affinity where it has a sigma.
     """
 
     refined: RefinedPose
@@ -90,16 +89,15 @@ def robust_pose(
     sample: Sample = "points",
     max_noise: float = 6.0,
 ) -> RobustPose:
-    """Return the pose that most matches agree with.
+    """Return the pose with the highest quality, refined.
 
-    Raises InputError: too few matches or affinities for a sample, or a noise level that is not above the sigmas;
-    DegenerateError: no sample gave a pose, or the matches that fit leave another one open, all on one plane, or have no
-    baseline.
+    Raises InputError: too few matches or affinities for a sample, or max_noise is not above 1; DegenerateError: no
+    sample gave a pose, or the inliers are coplanar and fit two poses, or they have no baseline.
 
     Parameters
     ----------
-    matches : contaminated; their sigmas are the smallest noise expected.
-    pose_type : general or planar are sampled; standard and forward have nothing to sample and are only refined.
+    matches : with outliers; their sigmas are the smallest noise expected.
+    pose_type : general and planar poses are sampled; standard and forward poses need no sample.
     max_noise : highest noise level considered, in sigmas of the matches.
     """
     if not (np.isfinite(max_noise) and max_noise > 1.0):
@@ -138,10 +136,7 @@ def robust_pose(
 def _finalists(
     matches: Matches, rows: SampsonRows, rng: np.random.Generator, kind: str, sample: Sample, max_noise: float
 ) -> tuple[Mat3, int]:
-    """Return the best essential matrices (H, 3, 3) of the samples, and how many were drawn; options of `robust_pose`.
-
-    Raises DegenerateError where there are none.
-    """
+    """Return the best essential matrices (H, 3, 3) and the number of samples; raises DegenerateError without any."""
     if axis_of(kind) is not None:
         return fundamental_for(kind).solve(matches, "points").E21[None], 0
     size = _sample_size(matches, kind, sample)
@@ -152,9 +147,9 @@ def _finalists(
 
 
 def _shown_noise(rows: SampsonRows, finalists: Mat3, max_noise: float) -> float:
-    """Return the noise, in sigmas, that the matches show which fit the best of the finalists.
+    """Return the noise level, in sigmas, from the median residual of the inliers of the best of the finalists.
 
-    The search allowed for much noise; at the level that there is the local optima, nearly equal before, part company.
+    At this level, lower than that of the search, the qualities of different local optima differ clearly.
     """
     noise = max_noise
     for _ in range(NOISE_ROUNDS):
@@ -172,9 +167,9 @@ def _pose(found: RobustPose) -> Rigid3:
 def _preferred(
     first: tuple[RobustPose, FloatArray], second: tuple[RobustPose, FloatArray]
 ) -> tuple[RobustPose, FloatArray]:
-    """Return the better one of two poses of a plane, each with the qualities of all matches.
+    """Return the better of the two poses of a plane, each given with the qualities (N,) of all matches.
 
-    Raises DegenerateError if neither is: noise, and wrong matches that fit one of them by chance, prefer either alike.
+    Raises DegenerateError if their difference is not significant against noise and outliers that fit by chance.
     """
     difference = first[1] - second[1]
     total, chance = float(difference.sum()), float(np.linalg.norm(difference))
@@ -190,18 +185,18 @@ def _preferred(
 def _poses(
     matches: Matches, rows: SampsonRows, E21: Mat3, kind: str, noise: float, max_noise: float
 ) -> list[tuple[Rigid3, BoolArray]]:
-    """Return the best poses of `E21` (H, 3, 3), best first, and which matches each may be true for (N,).
+    """Return the best poses of `E21` (H, 3, 3), best first, each with its plausible matches (N,).
 
-    Epipolar lines alone do not tell a plane's two poses apart, and have twice the wrong matches on them by chance.
+    Cheirality is part of the quality: it distinguishes the two poses of a plane and halves the chance of outliers.
     """
     found: list[tuple[float, Rigid3, BoolArray]] = []
     total, best = rows.quality(E21, noise), 0.0
     for k in _different(total):
-        # What is plausible is a part of all.
+        # The quality of the plausible matches is at most that of all.
         if total[k] <= best:
             break
         r = np.abs(rows.residuals(E21[k : k + 1])[0])
-        # Cheirality by the matches that fit best: those that only might fit are half in front by chance.
+        # Cheirality by the matches with the smallest residuals: half of the outliers are in front by chance.
         near = r <= max(QUANTILE, float(np.sort(r)[min(10, len(r)) - 1]))
         try:
             pose = choose_pose(E21[k], matches.rays1[near], matches.rays2[near], kind)
@@ -215,17 +210,13 @@ def _poses(
 
 
 def _different(quality: FloatArray) -> IntArray:
-    """Return the indices of different optima, best first: many starts lead to the same one."""
+    """Return the indices of distinct optima, best first."""
     order = np.argsort(-quality, kind="stable")
     return np.asarray(order[np.append(True, -np.diff(quality[order]) > SAME_QUALITY)])
 
 
 def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
-    """Return which matches (N,) are not certainly wrong, wherever they lie on their epipolar lines.
-
-    Certainly wrong: behind a camera by a parallax that is no noise, or with an affinity that is off by more than the
-    highest noise level.
-    """
+    """Return which matches (N,) are neither significantly behind a camera nor have an affinity off by too much."""
     sigmas = QUANTILE * max_noise
     seen = cheirality_margin(matches, pose) <= sigmas
     if matches.sigma_A is None:
@@ -236,7 +227,7 @@ def _plausible(matches: Matches, pose: Rigid3, max_noise: float) -> BoolArray:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _ConsensusSearch:
-    """Sampling with local optimisation of promising hypotheses."""
+    """RANSAC with local optimisation of promising hypotheses."""
 
     matches: Matches
     rows: SampsonRows
@@ -257,7 +248,7 @@ class _ConsensusSearch:
             candidates = _hypotheses(self.matches, index, self.kind, self.sample)
             if not len(candidates):
                 continue
-            # A sample's own noise can hide a good hypothesis at the final noise level: rank at a wider one.
+            # The noise of a minimal sample can hide a good hypothesis at the final noise level: rank at a wider one.
             rank = self.rows.quality(candidates, WIDE * self.max_noise)
             tried = np.argsort(-rank, kind="stable")[:LOCAL_TRIES]
             tried = tried[rank[tried] >= PROMISING * best_rank]
@@ -265,30 +256,29 @@ class _ConsensusSearch:
                 best = self.best(np.concatenate([best, self.improved(candidates[tried])]))
                 best_rank = float(self.rows.quality(best[:1], WIDE * self.max_noise)[0])
             share = float(np.mean(np.abs(self.rows.residuals(best[:1])[0]) < QUANTILE * self.max_noise))
-            # Affinities are noisy: of the samples without outliers only some are good enough to start from.
+            # Affinities are noisy: only some of the samples without outliers converge to the optimum.
             hit = share**self.size * (1.0 if self.sample == "points" else GOOD_AFFINE)
             needed = min(MAX_TRIALS, float(np.log(1.0 - CONFIDENCE) / np.log1p(-np.clip(hit, 1e-12, 1 - 1e-12))))
         return best, trials
 
     def improved(self, E21: Mat3) -> Mat3:
-        """Return what `E21` (H, 3, 3) lead to, (4 H, 3, 3), at the highest noise level and on to the least.
+        """Return the local optima (4 H, 3, 3) from `E21` (H, 3, 3) at the highest and the lowest noise level.
 
-        Widely first, which forgives a poor start; and at once, which an outlier with leverage cannot lure.
+        One series starts at a wide noise level, which tolerates poor starts; one at the highest noise level, which
+        is less sensitive to outliers with leverage.
         """
         widely = self.rows.improved(E21, self.kind, WIDE * self.max_noise, self.max_noise, MIN_NOISE)[1:]
         at_once = self.rows.improved(E21, self.kind, self.max_noise, MIN_NOISE)
         return np.concatenate([*widely, *at_once])
 
     def best(self, E21: Mat3) -> Mat3:
-        """Return the best few of `E21` (H, 3, 3) at the highest noise level, the best first, and then at the least."""
-        kept = []
-        for quality in self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, MIN_NOISE):
-            kept.append(_different(quality)[:FINALISTS])
-        return np.asarray(E21[np.concatenate(kept)])
+        """Return the best few of `E21` (H, 3, 3) at the highest noise level, best first, then those at the lowest."""
+        qualities = self.rows.quality_ahead(E21, QUANTILE * self.max_noise, self.max_noise, MIN_NOISE)
+        return np.asarray(E21[np.concatenate([_different(quality)[:FINALISTS] for quality in qualities])])
 
 
 def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
-    """Return how many matches a sample holds; raises InputError where the matches cannot provide it."""
+    """Return the number of matches per sample; raises InputError if there are too few matches or affinities."""
     size = SAMPLE_SIZES.get((kind, sample))
     if size is None:
         raise InputError(f"robust estimation knows no samples of kind '{sample}' for pose type '{kind}'")
@@ -302,11 +292,11 @@ def _sample_size(matches: Matches, kind: str, sample: Sample) -> int:
 
 
 def _draw(rng: np.random.Generator, among: IntArray, size: int) -> IntArray:
-    """Return indices (BATCH, size) of `among`, without repetition in a row."""
+    """Return BATCH samples (BATCH, size) of elements of `among`, each without repetition."""
     taken = np.zeros((BATCH, 0), dtype=np.int64)
     while taken.shape[1] < size:
         fresh = rng.integers(0, len(among) - taken.shape[1], BATCH)
-        # The fresh-th of the numbers not taken yet.
+        # Convert ranks among the positions not taken yet into positions.
         for passed in np.sort(taken, axis=1).T:
             fresh += fresh >= passed
         taken = np.concatenate([taken, fresh[:, None]], axis=1)

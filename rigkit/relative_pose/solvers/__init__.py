@@ -1,1 +1,1 @@
-"""Linear and minimal solvers of the epipolar geometry, one file a pose type, and the pose in an essential matrix."""
+"""Linear and minimal solvers of the epipolar geometry, one module per pose type; poses from essential matrices."""

@@ -1,7 +1,7 @@
 """The normalised linear solution: eight points, three affine correspondences, or more of both.
 
-Normalisation is by the second moment of the rays: T_i = (mean f f^T)^(-1/2), which for a narrow field of view is what
-Hartley's translation and scaling do to pixels and serves the widest fisheye alike.
+Rays are normalised by their second moment, T_i = (mean f f^T)^(-1/2). For a narrow field of view this is equivalent to
+Hartley's translation and scaling of pixels; it also works for the widest fisheye.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rigkit.relative_pose.solvers.weights import RowWeights
 def linear_epipolar(rows: LinearRows, weights: RowWeights) -> Mat3:
     """Return the rank-two matrix (3, 3) in the rows' coordinates that minimises the weighted algebraic error.
 
-    Raises DegenerateError where a second solution fits exactly too (all points on one plane, or no baseline).
+    Raises DegenerateError if a second solution fits exactly too (all points on one plane, or no baseline).
     """
     s, vt = right_singular(rows.weighted(weights))
     if s[7] < 1e-9 * s[0]:
@@ -48,6 +48,6 @@ def essential_nearest(matrix: FloatArray) -> Mat3:
 def _whitening(rays: FloatArray) -> Mat3:
     moment = rays.T @ rays / len(rays)
     values, vectors = np.linalg.eigh(moment)
-    # Coplanar rays have a zero moment across their plane: leave that direction as small as it is.
+    # Coplanar rays have a zero moment across their plane: that direction is not scaled up without limit.
     values = np.maximum(values, 1e-12 * values[-1])
     return np.asarray((vectors / np.sqrt(values)) @ vectors.T)

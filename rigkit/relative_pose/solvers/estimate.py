@@ -1,4 +1,4 @@
-"""What every solver of the epipolar geometry returns, and the loop they share."""
+"""The result type of the epipolar solvers, their common reweighting loop and their common checks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rigkit.relative_pose.solvers.weights import (
 REWEIGHTINGS = 3
 """The weights depend on the geometry only weakly: the third repetition changes E by less than 1e-3 of its error."""
 ROTATION_SIGMAS = 4.0
-"""A rotation whose chi square is no more than this many standard deviations too large explains the matches."""
+"""A rotation explains the matches if its chi square exceeds the expected one by fewer standard deviations than this."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -41,7 +41,7 @@ class EpipolarEstimate:
     F21 : (3, 3) fundamental matrix of the pixels, unit Frobenius norm; None unless both images are perspective. The
         general solver's F21 is the unconstrained one (seven degrees of freedom), E21 its projection.
     residuals_px : (N,) signed Sampson distances of the pixels from E21.
-    weights : of the rows, as used last.
+    weights : row weights of the last iteration.
     """
 
     E21: Mat3
@@ -51,11 +51,11 @@ class EpipolarEstimate:
 
 
 class FundamentalSolver(Protocol):
-    """One solver a file, one signature."""
+    """A solver of the epipolar geometry under one pose type."""
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Of the set of epipolar geometries that the solver chooses from."""
+        """Degrees of freedom of the epipolar geometry under that pose type."""
         ...
 
     def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
@@ -66,10 +66,10 @@ class FundamentalSolver(Protocol):
 def reweighted(
     matches: Matches, rule: WeightRule | None, solve: Callable[[RowWeights], FloatArray]
 ) -> tuple[FloatArray, RowWeights]:
-    """Return E21 (3, 3) of `solve(row weights)`, repeated with the weights that its own result implies.
+    """Return E21 (3, 3) and row weights after iterating `solve(row weights)` and the weights at its solution.
 
-    The rule "equal" is used once. With the rule "auto" sigma_A starts from the geometry of the points alone where they
-    suffice, and is estimated again with every repetition. None is the rule "noise".
+    The rule "equal" needs no iteration. The rule "auto" estimates sigma_A anew in every iteration. None is the rule
+    "noise".
     """
     rule = "noise" if rule is None else rule
     if not isinstance(rule, str):
@@ -89,7 +89,7 @@ def reweighted(
 
 
 def finish(matches: Matches, E21: Mat3, F_rays: Mat3, weights: RowWeights) -> EpipolarEstimate:
-    """Return the estimate with unit norms, F21 in pixels where there are camera matrices, and residuals."""
+    """Return the estimate with unit norms, residuals, and F21 in pixels if both camera matrices are known."""
     E21 = E21 / np.linalg.norm(E21)
     F21 = None
     if matches.K1 is not None and matches.K2 is not None:
@@ -99,7 +99,7 @@ def finish(matches: Matches, E21: Mat3, F_rays: Mat3, weights: RowWeights) -> Ep
 
 
 def check_count(matches: Matches, weights: RowWeights, minimum: int, what: str) -> None:
-    """Raise InputError unless the weighted rows are at least `minimum`."""
+    """Raise InputError if fewer than `minimum` rows have a weight."""
     rows = int((weights.points > 0.0).sum() + 2 * (weights.affinities > 0.0).sum())
     if rows < minimum:
         raise InputError(
@@ -109,10 +109,10 @@ def check_count(matches: Matches, weights: RowWeights, minimum: int, what: str) 
 
 
 def check_baseline(matches: Matches) -> None:
-    """Raise DegenerateError if a rotation alone explains the matches: no baseline, no epipolar geometry.
+    """Raise DegenerateError if a rotation alone explains the matches: without a baseline E is not determined.
 
-    The test is on the sum of squared residuals, in the sigmas of the matches, of the best rotation f2 = R f1. Without
-    any matches InputError.
+    This is a chi square test of the best rotation f2 = R f1 with the sigmas of the matches. Raises InputError if there
+    are no matches.
     """
     n = len(matches)
     if n == 0:
@@ -131,7 +131,7 @@ def check_baseline(matches: Matches) -> None:
 
 
 def transfer_error(matches: Matches, H21: Mat3) -> FloatArray:
-    """Return by how many px of image 2 (N, 2) the second ray is off the first one mapped by `H21` (f2 ~ H f1)."""
+    """Return the transfer errors (N, 2), px of image 2, of the homography of rays f2 ~ `H21` f1."""
     difference = matches.rays2 - unit(matches.rays1 @ H21.T)
     B = matches.jacobians2
     gram = np.swapaxes(B, -1, -2) @ B

@@ -1,9 +1,9 @@
-"""Motions whose essential matrices form a linear family: least squares over its coefficients by the singular vector.
+"""Motions whose essential matrices form a linear family: least squares over its coefficients by a singular vector.
 
-Pure translation: E = [t]x, linear in t. Standard stereo and forward motion, t along x or z: a family of one, nothing
-is left to estimate but the sign of t, which cheirality gives. Forward motion along the optical axis with a rotation by
-psi about it, the roll: E = [[a, b, 0], [-b, a, 0], [0, 0, 0]] with a = -sin psi and b = -cos psi. Standard stereo with
-unknown vertical intrinsics is `standard.RowsSolver`.
+Pure translation: E = [t]x, linear in t. Standard stereo and forward motion, t along x or z: E is fixed up to the sign
+of t, which cheirality determines. Forward motion along the optical axis with a rotation by psi about it, the roll:
+E = [[a, b, 0], [-b, a, 0], [0, 0, 0]] with a = -sin psi and b = -cos psi. Standard stereo with unknown vertical
+intrinsics is `standard.RowsSolver`.
 
 Reference: L. Hajder, "Affine Correspondences in Stereo Vision": forward motion, F = [e]x with the epipole e in the
 principal point. The rows are those of `rows`.
@@ -24,7 +24,7 @@ from rigkit.relative_pose.solvers.rows import LinearRows, right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
 UNDETERMINED = 1e-12
-"""Of the largest weight of a row, rays being of unit length: a smaller singular value is rounding."""
+"""Smallest singular value over the largest row weight that is not rounding, for unit rays."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,9 +33,9 @@ class FamilySolver:
 
     Attributes
     ----------
-    motion : in words.
+    motion : name of the motion, for messages.
     family : (K, 9), vec(E) = x family, row-major.
-    undetermined : what is wrong where more than one member of the family fits, and what to do.
+    undetermined : message of the DegenerateError raised if more than one member of the family fits.
     """
 
     motion: str
@@ -47,7 +47,7 @@ class FamilySolver:
         return len(self.family) - 1
 
     def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
-        """Return E21 of the family; see FundamentalSolver. Raises DegenerateError where it is not determined."""
+        """Return E21 of the family; see FundamentalSolver. Raises DegenerateError if it is not determined."""
         rows = LinearRows.of(matches, self.family)
 
         def best(row_weights: RowWeights) -> Mat3:

@@ -1,7 +1,7 @@
 """General motion: F by the normalised eight-point method on points and noise-weighted affinities, E by projection.
 
 Reference: R. Hartley, "In defense of the eight-point algorithm" (1997); L. Hajder, "Affine Correspondences in Stereo
-Vision", F from points and affinities: one row a point, two an affinity.
+Vision", F from points and affinities: one row per point, two per affinity.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class GeneralSolver:
     def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return F21 (rank two) and the nearest E21; see FundamentalSolver.
 
-        Raises DegenerateError where one plane explains the matches to within their noise.
+        Raises DegenerateError if one plane explains the matches to within their noise.
         """
         check_baseline(matches)
         rows, T1, T2 = normalised(matches)

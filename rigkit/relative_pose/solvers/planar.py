@@ -1,4 +1,4 @@
-"""Planar motion: rotation about the vertical axis, translation in the horizontal plane; the global optimum.
+"""Planar motion (rotation about the vertical axis, horizontal translation): the global least squares optimum.
 
 E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]] with e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi), that is
 e1^2 + e4^2 = e2^2 + e3^2 = 1. Rows in normalised coordinates are [x2 y1, y2 x1, y2, y1] of a point and [a1 y1,
@@ -57,22 +57,20 @@ class PlanarSolver:
 
 
 def solve_planar_batch(gram: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the global minimisers e (B, 4) of e^T gram e and the minima (B,), both pairs of e of unit norm.
+    """Return the global minimisers e (B, 4) of e^T gram e with (e1, e4) and (e2, e3) of unit norm, and the minima (B,).
 
-    `gram` (B, 4, 4) is rows^T rows of each problem, the rows on (e1, e2, e3, e4). The sign of e is free.
+    `gram` (B, 4, 4) is rows^T rows of each problem, the rows on (e1, e2, e3, e4). The sign of e is arbitrary.
 
     Notes
     -----
-    Newton on the derivative v^T J v of the concave dual, kept inside a bracket; where the smallest eigenvalue is double
-    at the optimum (a kink) the bracket is halved instead, and its two end vectors are combined so that e^T J e = 0. Two
-    Newton steps on (phi, phi - theta) remove what the squared condition of the Gram matrix cost.
+    Newton's method on the derivative v^T J v of the concave dual, safeguarded by a bracket. If the smallest eigenvalue
+    is double at the optimum, the bracket is bisected and its two end vectors are combined so that e^T J e = 0. Two
+    Newton steps on (phi, phi - theta) remove the rounding error due to the squared condition of the Gram matrix.
     """
     G = np.asarray(gram, dtype=np.float64)
     size = np.trace(G, axis1=1, axis2=2)
     G = G / np.where(size > 0.0, size, 1.0)[:, None, None]
-    e = _dual_optimum(G)
-    e = _unit_pairs(e)
-    e = _polished(G, e)
+    e = _polished(G, _unit_pairs(_dual_optimum(G)))
     return e, np.einsum("bi,bij,bj->b", e, G, e) * size
 
 
@@ -80,8 +78,7 @@ def planar_from_two_rows(rows: FloatArray) -> Mat3:
     """Return up to two planar E (B, 2, 3, 3) of rows (B, 2, 4) on the planar entries: e^T J e = 0 in the null space."""
     vt = np.linalg.svd(rows, full_matrices=True)[2]
     a, b = vt[:, 2], vt[:, 3]
-    sign = np.array([1.0, -1.0, -1.0, 1.0])
-    aa, ab, bb = (np.sum(x * sign * y, axis=1) for x, y in ((a, a), (a, b), (b, b)))
+    aa, ab, bb = (np.sum(x * J_SIGN * y, axis=1) for x, y in ((a, a), (a, b), (b, b)))
     # cos^2 aa + 2 sin cos ab + sin^2 bb = m + r cos(2w - w0) = 0.
     mean, radius = 0.5 * (aa + bb), np.hypot(0.5 * (aa - bb), ab)
     real = np.abs(mean) <= radius
@@ -126,7 +123,7 @@ def _dual_optimum(G: FloatArray) -> FloatArray:
 def _both_ends(
     G: FloatArray, low: FloatArray, high: FloatArray, v_low: FloatArray, v_high: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the end vectors, computing those of ends that the iteration never visited."""
+    """Return the eigenvectors at both ends of the bracket; those not visited by the iteration are computed."""
     out = []
     for mu, v in ((low, v_low), (high, v_high)):
         fresh = np.linalg.eigh(G + mu[:, None, None] * np.diag(J_SIGN))[1][:, :, 0]
@@ -154,10 +151,10 @@ def _unit_pairs(e: FloatArray) -> FloatArray:
 
 
 def _polished(G: FloatArray, e: FloatArray) -> FloatArray:
-    """Return e after Newton steps on its two angles, each kept where the cost does not rise."""
+    """Return e after two Newton steps on its two angles, each accepted where the cost does not rise."""
     cost = np.einsum("bi,bij,bj->b", e, G, e)
     for _ in range(2):
-        # d e / d angle: a quarter turn of the pair (e1, e4) and of (e2, e3).
+        # d e / d angle: the pairs (e1, e4) and (e2, e3) rotated by 90 degrees.
         turn = np.zeros((len(e), 2, 4))
         turn[:, 0, 0], turn[:, 0, 3] = -e[:, 3], e[:, 0]
         turn[:, 1, 1], turn[:, 1, 2] = -e[:, 2], e[:, 1]

@@ -1,8 +1,8 @@
-"""Poses from points that all lie on one plane, where the linear epipolar solvers are blind.
+"""Poses from coplanar points, for which the linear epipolar solvers are degenerate.
 
-f2 ~ H f1 with H = R + t n^T / d (plane n . X = d in the frame of camera 1). H comes linearly, two poses from its
-singular vectors (Ma, Soatto, Kosecka, Sastry, "An Invitation to 3-D Vision", 5.3.3). Often both put all points in
-front of both cameras: then one plane does not determine the pose and no algorithm can.
+f2 ~ H f1 with H = R + t n^T / d (plane n . X = d in the frame of camera 1). H is estimated linearly and decomposed into
+two poses (Ma, Soatto, Kosecka, Sastry, "An Invitation to 3-D Vision", 5.3.3). If both put all points in front of both
+cameras, the points do not determine the pose.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights
 
 SAME_POSE = 5e-3
-"""Two poses nearer than this (rad, and share of the baseline) mislead nobody."""
+"""Poses that differ by less (rotation in rad, translation over baseline) count as one."""
 ONE_PLANE_MAX_SIGMAS = 3.0
-"""Points whose homography transfers them within so many sigmas (rms) may lie on one plane."""
+"""Points may lie on one plane if their rms transfer error is at most this many sigmas."""
 AT_REST_SIGMAS = 3.3
-"""A parallax, or one off a plane's, is noise below: one good point in a thousand has more."""
+"""A parallax, or its deviation from that of a plane, is noise below: one inlier in a thousand exceeds it."""
 PLANE_EXPLAINS_SIGMAS = 4.0
-"""A plane whose chi square is no more than this many standard deviations too large explains the matches."""
+"""A plane explains the matches if its chi square exceeds the expected one by fewer standard deviations than this."""
 HOMOGRAPHY_FREEDOM = 8
 MIN_PLANE_POINTS = 4
-"""Fewer determine no homography, and say nothing of a plane."""
+"""Points that determine a homography."""
 NEARLY_ALL = 0.9
-"""Of matches that fit some fit by chance, and of points some are seen on the wrong side of the horizon of a plane."""
+"""Share that counts as all: a few outliers fit by chance, and a few points appear beyond the horizon of their plane."""
 PLANE_ROUNDS = 5
-"""Of weighting anew: where half of the points lie on a plane, each halves what they are off it until that is noise."""
+"""Reweightings: if half of the points lie on a plane, each one halves their median residual until that is noise."""
 
 
 def homography_of_rays(matches: Matches) -> Mat3:
-    """Return H21 (3, 3) with f2 ~ H f1, middle singular value 1, and f2 . H f1 > 0 for most points."""
+    """Return H21 (3, 3), f2 ~ H f1, with middle singular value 1 and f2 . H f1 > 0 for most points."""
     rows = (skew(matches.rays2)[:, :, :, None] * matches.rays1[:, None, None, :]).reshape(-1, 9)
     H = right_singular(rows)[1][-1].reshape(3, 3)
     side = np.sum(matches.rays2 * (matches.rays1 @ H.T), axis=1)
@@ -49,9 +49,9 @@ def homography_of_rays(matches: Matches) -> Mat3:
 
 
 def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
-    """Return the poses (translation in units of the plane's distance) and plane normals of `H21`, up to four.
+    """Return up to four poses (translation in units of the plane's distance) and plane normals of `H21`.
 
-    Nothing for a rotation (all singular values equal): there is no baseline.
+    The result is empty for a rotation (all singular values equal), which has no baseline.
     """
     values, vectors = np.linalg.eigh(H21.T @ H21)
     v3, v2, v1 = vectors.T
@@ -72,14 +72,14 @@ def decompose_homography(H21: Mat3) -> tuple[tuple[Rigid3, FloatArray], ...]:
 
 
 def refuse_planar_ambiguity(matches: Matches, weights: RowWeights) -> None:
-    """Raise DegenerateError if one plane explains what `weights` let count, points and affinities, to within the noise.
+    """Raise DegenerateError if one plane explains the points and affinities with weights to within their noise.
 
-    Affinities of other planes through the same points determine what the points leave open; where they count without a
-    sigma nothing is refused.
+    Affinities that contradict the plane of the points determine the geometry. If affinities have a weight but no sigma,
+    the test is not possible and nothing is raised.
 
     Notes
     -----
-    On a plane F = [t]_x H fits for every t: a linear solver returns one that the noise has chosen.
+    On a plane F = [t]_x H fits for every t: the solution of a linear solver depends on the noise only.
     """
     with_point, with_affinity = weights.points > 0.0, weights.affinities > 0.0
     freedom = 2 * int(with_point.sum()) + 4 * int(with_affinity.sum()) - HOMOGRAPHY_FREEDOM
@@ -112,10 +112,10 @@ def _affinities_of(matches: Matches, H21: Mat3) -> FloatArray:
 
 
 def ambiguous_poses(matches: Matches) -> tuple[Rigid3, ...]:
-    """Return the poses (unit baseline) of the plane that all points may lie on; nothing if they do not lie on one.
+    """Return the poses (unit baseline) of points that may all lie on one plane; none if they do not.
 
-    Only poses with all points on the visible side of the plane's half-space, d > 0, are returned: at most two. Raises
-    DegenerateError where that plane is at infinity: a rotation explains the matches.
+    At most two are returned: those for which the plane is in front of camera 1 at the points. Raises DegenerateError if
+    that plane is at infinity, so that a rotation explains the matches.
     """
     if len(matches) < MIN_PLANE_POINTS:
         return ()
@@ -128,15 +128,15 @@ def ambiguous_poses(matches: Matches) -> tuple[Rigid3, ...]:
 
 
 def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose: Rigid3) -> tuple[Rigid3, ...]:
-    """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; nothing without one.
+    """Return the other poses (unit baseline) of the plane on which most points lie under `pose`; none without a plane.
 
     Parameters
     ----------
-    matches, among : those (N,) that agree with the epipolar geometry of the pose; a few may be wrong all the same.
-    noise : of the matches, in their sigmas.
+    among : (N,) matches that fit the epipolar geometry of the pose; a few may be outliers.
+    noise : actual noise of the matches, in units of their sigmas.
     pose : unit baseline.
 
-    Raises DegenerateError where a rotation alone explains nearly all of them.
+    Raises DegenerateError if a rotation alone explains nearly all of them.
 
     Notes
     -----
@@ -170,14 +170,14 @@ def other_ambiguous_poses(matches: Matches, among: BoolArray, noise: float, pose
 
 
 def compare_poses(first: Rigid3, second: Rigid3) -> tuple[float, bool]:
-    """Return the angle in radians between two rotations, and whether the poses (unit baseline) are the same."""
+    """Return the angle (rad) between the rotations of two poses (unit baseline), and whether these count as one."""
     difference = first @ second.inverse()
     turn = float(rotation_angle(difference.rotation))
     return turn, max(turn, float(np.linalg.norm(difference.translation_mm))) < SAME_POSE
 
 
 def _visible(rays1: Rays, H21: Mat3) -> tuple[Rigid3, ...]:
-    """Return the poses (unit baseline) of `H21` whose plane is in front of camera 1 where the points are."""
+    """Return the poses (unit baseline) of `H21` whose plane is in front of camera 1 at nearly all points."""
     poses = []
     for pose, normal in decompose_homography(H21):
         if np.mean(rays1 @ normal > 0.0) > NEARLY_ALL and np.linalg.norm(pose.translation_mm) > 0.0:

@@ -1,4 +1,4 @@
-"""From an essential matrix to the relative pose, by cheirality along rays."""
+"""The relative pose of an essential matrix, chosen by cheirality along rays."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ def essential_from_pose(cam2_from_cam1: Rigid3) -> Mat3:
 
 
 def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:
-    """Return two rotations (N, 3, 3) and a unit direction (N, 3) with E = [t]x R up to sign and size, E essential.
+    """Return two rotations (N, 3, 3) and a unit direction t (N, 3) with E = [t]x R up to scale, for essential E.
 
-    The rotations differ by half a turn about the baseline.
+    The rotations differ by 180 degrees about the baseline.
 
     Notes
     -----
@@ -46,16 +46,15 @@ def rotations_and_direction(E21: Mat3) -> tuple[Mat3, Mat3, FloatArray]:
 
 
 def decompose_essential(E21: Mat3) -> tuple[Rigid3, ...]:
-    """Return the four poses cam2_from_cam1 (unit baseline) of the essential matrix nearest to `E21` up to sign."""
+    """Return the four poses cam2_from_cam1 (unit baseline) of the essential matrix nearest to `E21` (3, 3)."""
     first, second, t = rotations_and_direction(essential_nearest(E21)[None])
     return Rigid3.stack(np.concatenate([first, first, second, second]), np.concatenate([t, -t, t, -t]))
 
 
 def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) -> tuple[Rigid3, ...]:
-    """Return the poses of `E21` that the pose type allows: four in general.
+    """Return the poses of `E21` that the pose type allows: four in general, else two.
 
-    The second rotation differs from the first by half a turn about the baseline. It is no rotation about the vertical
-    axis if the first one is: planar motion keeps two poses, and without rotation two are kept as well.
+    Of the two rotations, which differ by 180 degrees about the baseline, the one nearest to the pose type is kept.
     """
     poses = decompose_essential(E21)
     if str(pose_type) == PoseType.GENERAL:
@@ -69,13 +68,13 @@ def hypothesis_poses(E21: Mat3, pose_type: PoseType | str = PoseType.GENERAL) ->
 
 
 def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str = PoseType.GENERAL) -> Rigid3:
-    """Return the pose (unit baseline) that puts most points at a positive range along both rays.
+    """Return the pose (unit baseline) for which most points have positive ranges along both rays.
 
-    Raises DegenerateError where no pose puts more than half of the points there, or two do so equally (points at
-    infinity, no baseline).
+    Raises DegenerateError if no pose does so for more than half of the points, or if the best two have equal counts
+    (points at infinity, no baseline).
     """
     poses = hypothesis_poses(E21, pose_type)
-    # The poses come in pairs of opposite translations, which turn the signs of all ranges.
+    # The poses come in pairs with opposite translations, which invert the signs of all ranges.
     counts = [count for pose in poses[::2] for count in _in_front(pose, rays1, rays2)]
     order = sorted(range(len(poses)), key=counts.__getitem__, reverse=True)
     best, second = counts[order[0]], counts[order[1]]
@@ -88,9 +87,9 @@ def choose_pose(E21: Mat3, rays1: Rays, rays2: Rays, pose_type: PoseType | str =
 
 
 def cheirality_margin(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
-    """Return by how many sigmas of parallax each match (N,) is behind a camera; 0 in front of both.
+    """Return the parallax (N,) in sigmas of the matches behind a camera; 0 for those in front of both.
 
-    The nearest point that both cameras can see is then at infinity: that far the pixels would have to move.
+    It is the change of the pixels that would move the point to infinity, the nearest place that both cameras see.
     """
     range1, range2, defined = ray_ranges(matches.rays1, matches.rays2, cam2_from_cam1)
     behind = defined & ((range1 < 0.0) | (range2 < 0.0))
@@ -99,7 +98,7 @@ def cheirality_margin(matches: Matches, cam2_from_cam1: Rigid3) -> FloatArray:
 
 
 def parallax_noise(matches: Matches) -> FloatArray:
-    """Return the standard deviation (N,) in radians of the angle between the rays of each match, along a line."""
+    """Return the standard deviation (N,), rad, of the angle between the rays of each match in a fixed direction."""
     m = matches
     size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(1, 2))) for b in (m.jacobians1, m.jacobians2))
     return np.asarray(np.hypot(m.sigma1_px * size1, m.sigma2_px * size2))
@@ -113,7 +112,8 @@ def _in_front(pose: Rigid3, rays1: Rays, rays2: Rays) -> tuple[int, int]:
 
 
 def translation_basis(direction: FloatArray) -> FloatArray:
-    """Return two unit vectors (..., 2, 3) across `direction` (..., 3), at right angles, the first horizontal."""
+    """Return an orthonormal basis (..., 2, 3) of the plane perpendicular to `direction` (..., 3); the first vector is
+    horizontal."""
     t = np.asarray(direction, dtype=np.float64)
     size = np.hypot(t[..., 0], t[..., 2])[..., None]
     across = np.stack([t[..., 2], np.zeros(t.shape[:-1]), -t[..., 0]], axis=-1)
@@ -122,5 +122,5 @@ def translation_basis(direction: FloatArray) -> FloatArray:
 
 
 def free_directions(pose_type: PoseType | str) -> IntArray:
-    """Return which of (w, b) a pose type leaves free: w the rotation, b the direction along `translation_basis`."""
+    """Return the indices of the free parameters among (w, b): rotation w, direction b along `translation_basis`."""
     return np.array({"general": [0, 1, 2, 3, 4], "planar": [1, 3]}.get(str(pose_type), []), dtype=np.int64)

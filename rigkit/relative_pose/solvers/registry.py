@@ -18,16 +18,15 @@ SOLVERS: dict[str, FundamentalSolver] = {
     "standard-rows": RowsSolver(),
     "forward-roll": FORWARD_WITH_ROLL,
 }
-"""Pose types, and motions that may override them: "translation" has no rotation; "standard-rows" estimates the relation
-of the rows that standard stereo takes as known, "forward-roll" the roll of forward motion."""
+"""Solvers of the pose types and of other motions: "translation" has no rotation; "standard-rows" estimates the relation
+between the images' rows that standard stereo assumes to be known, "forward-roll" the roll of forward motion."""
 
 
 def fundamental_for(pose_type: str, *, motion: str | None = None) -> FundamentalSolver:
     """Return the solver for a pose type.
 
-    `motion` overrides the solver, not the pose type: motion="planar" runs the planar solver on standard and forward
-    pairs too, as the paper does, "standard-rows" and "forward-roll" their own constrained solvers. Raises InputError
-    for an unknown name; "auto" has to be decided first (select).
+    `motion` overrides the choice: motion="planar" uses the planar solver for standard and forward pairs too, as the
+    paper does. Raises InputError for an unknown name; "auto" has to be decided first (`pose_type_evidence`).
 
     >>> fundamental_for("planar").degrees_of_freedom
     2

@@ -5,9 +5,9 @@ With rays f, ray Jacobians B and the affinity A of a match, on the row-major vec
     point      f2 f1^T                                    f2^T E f1 = 0
     affinity j f2 (B1 e_j)^T + (B2 A e_j) f1^T            (A^T n2 + n1)_j = 0
 
-The affinity's rows are the derivative of the point's row along the surface, in the pixel units of image 1: therefore
-their noise is sigma_A |n2|, far from an epipole, where that of the point's row is sqrt(sigma1^2 |n1|^2 + sigma2^2
-|n2|^2). Homogeneous pixels (u, v, 1) with the Jacobian [I; 0] give the equations on F.
+The affinity's rows are the derivatives of the point's row by the pixel of image 1 along the surface. Far from an
+epipole their noise is therefore sigma_A |n2|, while that of the point's row is sqrt(sigma1^2 |n1|^2 + sigma2^2 |n2|^2).
+Homogeneous pixels (u, v, 1) with the Jacobian [I; 0] give the equations on F.
 
 Reference: D. Barath, L. Hajder, "Efficient recovery of essential matrix from two affine correspondences" (2018), A^T n2
 = -n1; I. Eichhardt, D. Barath, "Optimal multi-view correction of local affine frames" (2019), central cameras; L.
@@ -25,8 +25,8 @@ from rigkit.core.matches import Matches
 from rigkit.relative_pose.solvers.weights import RowWeights
 
 PLANAR_ENTRIES = (1, 3, 5, 7)
-"""Entries of the row-major E that planar motion leaves: E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]. Of a rotation by
-theta about y and t = (sin phi, 0, cos phi): e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi)."""
+"""Nonzero entries of the row-major E of planar motion, E = [[0, e1, 0], [e2, 0, e3], [0, e4, 0]]. A rotation by theta
+about y and t = (sin phi, 0, cos phi) give e = (-cos phi, cos(phi - theta), -sin(phi - theta), sin phi)."""
 
 
 def point_rows(rays1: Rays, rays2: Rays) -> FloatArray:
@@ -45,11 +45,12 @@ def affinity_rows(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LinearRows:
-    """The rows of N matches on K unknowns; the weights come later.
+    """The unweighted rows of N matches on K unknowns.
 
     Attributes
     ----------
-    points, affinities : (N, K), and (N, 2, K) or None where there are no affinities.
+    points : (N, K)
+    affinities : (N, 2, K), or None without affinities.
     """
 
     points: FloatArray
@@ -65,7 +66,7 @@ class LinearRows:
         return cls(points, affinities)
 
     def weighted(self, weights: RowWeights) -> FloatArray:
-        """Return the rows that count (M, K), multiplied by their weights."""
+        """Return the rows with a positive weight (M, K), multiplied by it."""
         use, also = weights.points > 0.0, weights.affinities > 0.0
         rows = self.points[use] * weights.points[use, None]
         if self.affinities is None or not also.any():
@@ -84,8 +85,7 @@ def essential_from_planar(e: FloatArray) -> FloatArray:
 def right_singular(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return all singular values (K,), zeros included, and right singular vectors (K, K) of rows (M, K).
 
-    The triangular factor first: the left vectors of thousands of rows are never formed. With fewer rows than columns
-    the last vectors exist only in the full basis.
+    A QR decomposition reduces thousands of rows to K before the singular value decomposition.
     """
     columns = rows.shape[1]
     square = np.linalg.qr(rows, mode="r") if len(rows) > columns else rows

@@ -1,9 +1,9 @@
-"""Standard stereo whose vertical intrinsics are not known: which rows of both images are one row.
+"""Standard stereo with unknown vertical intrinsics: the affine relation between corresponding rows of the two images.
 
 F = [[0, 0, 0], [0, 0, a], [0, b, c]]: the vertical coordinates of the normalised images obey a y2 + b y1 + c = 0. The
 rows on (a, b, c) are [y2, y1, 1] of a point and [a3, 0, 0], [a4, 1, 0] of an affinity A = [[a1, a2], [a3, a4]]: two
-degrees of freedom. For any central camera the affinity's rows are [g2 A, g1, 0] with g = d y / d pixel. Where the
-cameras are known nothing is left to estimate: `family.STANDARD`.
+degrees of freedom. For any central camera the affinity's rows are [g2 A, g1, 0] with g = d y / d pixel. With known
+intrinsics nothing is left to estimate: `family.STANDARD`.
 
 Reference: L. Hajder, "Affine Correspondences in Stereo Vision", standard stereo.
 """
@@ -23,25 +23,25 @@ from rigkit.relative_pose.solvers.rows import right_singular
 from rigkit.relative_pose.solvers.weights import RowWeights, WeightRule
 
 ONE_ROW_RAD = 1e-12
-"""Rows that scatter by less are one row, and its rounding."""
+"""A smaller standard deviation of the vertical coordinates is rounding."""
 UNDETERMINED = 1e-12
-"""Second singular value over the first: what is below is rounding."""
+"""A smaller ratio of the second singular value to the first is rounding."""
 MIN_AHEAD = 0.05
-"""Rays 87 degrees off the axis and more have no place in a perspective image: they are left out."""
+"""Smallest z of a unit ray that is used: rays 87 degrees and more off the axis are not in a perspective image."""
 
 
 @dataclass(frozen=True, slots=True)
 class RowsSolver:
-    """E21 of two images whose rows are parallel, the second's an affine function of the first's."""
+    """E21 of two images whose epipolar lines are rows, with an unknown affine relation between corresponding rows."""
 
     degrees_of_freedom: int = 2
 
     def solve(self, matches: Matches, weights: WeightRule | None = None) -> EpipolarEstimate:
         """Return the epipolar geometry of standard stereo with free rows; see FundamentalSolver.
 
-        F21 obeys the relation of the rows; E21, which cannot have another focal length, is the nearest to it.
+        F21 has the estimated relation of the rows; E21, which cannot represent other intrinsics, is the nearest one.
 
-        Raises DegenerateError where all points lie on one row.
+        Raises DegenerateError if all points lie on one row.
         """
         rows = _Rows.of(matches)
 
@@ -56,14 +56,14 @@ class RowsSolver:
 
 @dataclass(frozen=True, eq=False, slots=True, kw_only=True)
 class _Rows:
-    """Vertical coordinates (N,) of normalised images, and what affinities say of them.
+    """Vertical coordinates (N,) of normalised images and their derivatives.
 
     Attributes
     ----------
-    y1, y2 : vertical coordinates; `ahead` says where they exist.
-    sigma : (N,) standard deviation of a difference of the two.
-    by1, by2 : (N, 2) derivatives of y1, and of y2 through the affinity, by the pixel of image 1; NaN without one.
-    across : (N,) how much y2 changes per pixel of image 2.
+    y1, y2 : vertical coordinates y / z, valid where `ahead`.
+    sigma : (N,) standard deviation of y2 - y1.
+    by1, by2 : (N, 2) derivatives of y1, and of y2 through the affinity, by the pixel of image 1; NaN without affinity.
+    across : (N,) |d y2 / d pixel 2|.
     """
 
     y1: FloatArray
@@ -84,7 +84,7 @@ class _Rows:
         return cls(y1=y1, y2=y2, ahead=ahead1 & ahead2, sigma=sigma, by1=g1, by2=by2, across=size2)
 
     def relation(self, weights: RowWeights) -> Mat3:
-        """Return E (3, 3) on rays with the least squares (a, b, c)."""
+        """Return E (3, 3) on rays of the least squares (a, b, c); raises DegenerateError if it is not determined."""
         point = self.ahead & (weights.points > 0.0)
         affine = self.ahead & (weights.affinities > 0.0)
         if not (point.any() or affine.any()):
@@ -95,7 +95,7 @@ class _Rows:
         shift1, shift2 = float(self.y1[some].mean()), float(self.y2[some].mean())
         spread = float(np.std(self.y1[some]))
         scale = 1.0 / spread if spread > ONE_ROW_RAD else 1.0 / float(self.across[some].mean())
-        # Equal weights: a row a point in units of the spread, two an affinity in pixels of image 1.
+        # Without sigma_A: equal weights of points' rows (in units of the spread) and affinities' rows (per pixel 1).
         known = bool(np.isfinite(weights.sigma_A[affine]).all())
         pixel = 1.0 / float(np.linalg.norm(self.by1[some], axis=1).mean())
         noise = self.sigma[point] * scale if known else np.ones(int(point.sum()))
@@ -113,7 +113,7 @@ class _Rows:
 
 
 def _vertical(rays: Rays, jacobians: RayJacobians) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return y / z (N,) of rays, its derivative (N, 2) by the pixel, and where it exists."""
+    """Return y / z (N,) of rays, its derivative (N, 2) by the pixel, and which are valid."""
     ahead = rays[:, 2] > MIN_AHEAD
     z = np.where(ahead, rays[:, 2], 1.0)
     y = rays[:, 1] / z

@@ -1,12 +1,12 @@
-"""How much a point counts and how much an affinity: by their noise.
+"""Weights of point and affinity rows in linear solvers: the inverse standard deviations of their residuals.
 
-A linear solver sees the residual of a row multiplied by its weight. The residual of a point's row has the standard
-deviation sqrt(sigma1^2 |n1|^2 + sigma2^2 |n2|^2), that of an affinity's rows sigma_A |n2|, and what the pixels add
-(n1, n2: gradients of the epipolar constraint by the pixels). Weights are one over these.
+The residual of a point's row has the standard deviation sqrt(sigma1^2 |n1|^2 + sigma2^2 |n2|^2). That of an affinity's
+rows is sigma_A |n2| plus, in quadrature, the contribution of the pixels' noise (`pixel_share`). n1 and n2 are the
+gradients of the epipolar constraint by the pixels.
 
 Erratum: L. Hajder, "Affine Correspondences in Stereo Vision", expects affinities to improve F, with equal weights in
-normalised coordinates. With more than a few points these make the pose worse than points alone; they are kept as the
-rule "equal" for replication.
+normalised coordinates. With more than a few points these make the pose worse than points alone; the rule "equal"
+exists for replication.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from rigkit.optim.robust_scale import SIGMA_OF_MEDIAN
 
 WeightRule = Literal["noise", "auto", "equal", "points"]
 """noise: from the sigmas of the matches (affinities without a sigma_A are ignored); auto: sigma_A estimated from the
-data; equal: every row counts the same in normalised coordinates; points: affinities ignored."""
+data; equal: equal weights of all rows in normalised coordinates; points: affinities ignored."""
 
 START_SIGMA_A = 0.05
-"""Where nothing is known of the affinities, the estimate starts from here; it is replaced by what the data say."""
+"""Initial sigma_A of the rule "auto", before it is estimated."""
 MIN_SIGMA_A = 1e-6
-"""Exact affinities show none at all, and weights are one over it."""
+"""Lower bound of an estimated sigma_A, for exact affinities: weights are its inverse."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -38,9 +38,9 @@ class RowWeights:
 
     Attributes
     ----------
-    points : (N,) factor of the point's row; 0 leaves the point out.
-    affinities : (N,) factor of the two affinity rows; 0 where there is no affinity or it is not used.
-    sigma_A : (N,) standard deviation of an entry of A21 that was assumed, NaN where unused.
+    points : (N,) factor of the point's row; 0 excludes the point.
+    affinities : (N,) factor of the two affinity rows; 0 if there is no affinity or it is not used.
+    sigma_A : (N,) assumed standard deviation of an entry of A21, NaN if unused.
     """
 
     points: FloatArray
@@ -56,42 +56,39 @@ def usable_affinities(matches: Matches) -> BoolArray:
 
 
 def assumed_sigma_A(matches: Matches, rule: WeightRule) -> FloatArray:
-    """Return the standard deviation (N,) of the affinities that `rule` starts from; NaN where they are not used."""
+    """Return the initial sigma_A (N,) under `rule`; NaN for affinities that are not used."""
     usable = usable_affinities(matches)
-    if rule == "points":
-        return np.full(len(matches), np.nan)
-    if rule == "noise":
-        if matches.sigma_A is None:
-            return np.full(len(matches), np.nan)
+    if rule == "noise" and matches.sigma_A is not None:
         return np.where(usable & (matches.sigma_A > 0.0), matches.sigma_A, np.nan)
+    if rule in ("noise", "points"):
+        return np.full(len(matches), np.nan)
     if rule in ("auto", "equal"):
         return np.where(usable, START_SIGMA_A, np.nan)
     raise InputError(f"weights '{rule}' are unknown; use 'noise', 'auto', 'equal' or 'points'")
 
 
 def initial_weights(matches: Matches, sigma_A: FloatArray) -> RowWeights:
-    """Return weights that need no epipolar geometry yet: n1 and n2 are taken as long as the ray Jacobians."""
+    """Return weights before E is known: |n1| and |n2| are approximated by the rms column norms of the ray Jacobians."""
     size1, size2 = (np.sqrt(0.5 * np.sum(b * b, axis=(-2, -1))) for b in (matches.jacobians1, matches.jacobians2))
     return _weights(matches, size1, size2, sigma_A)
 
 
 def noise_weights(matches: Matches, E21: Mat3, sigma_A: FloatArray) -> RowWeights:
-    """Return one over the standard deviation of each row, at the epipolar geometry `E21`."""
+    """Return the inverse standard deviation of each row at the epipolar geometry `E21`."""
     _, n1, n2 = epipolar_normals(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
     share = None if np.isnan(sigma_A).all() else pixel_share(matches, E21)
     return _weights(matches, np.linalg.norm(n1, axis=-1), np.linalg.norm(n2, axis=-1), sigma_A, share)
 
 
 def pixel_share(matches: Matches, E21: Mat3) -> FloatArray:
-    """Return the variance (N,) that the noise of the pixels adds to a component of A^T n2 + n1 (the mean of the two).
+    """Return the variance (N,) of a component of A^T n2 + n1 (mean of both) due to pixel noise; NaN without A.
 
-    It does not vanish with n2 towards the epipole, where the noise decides how an epipolar line runs. NaN without A.
+    Unlike sigma_A |n2| it does not vanish at the epipole, where noise determines the direction of an epipolar line.
 
     Notes
     -----
-    With M = B2^T E B1 the derivatives of A^T n2 + n1 by the pixels are A^T M and M^T, but for how B1 and B2 change with
-    them. They change along the line of sight, which multiplies the zero A^T n2 + n1, and by the lens's distortion, far
-    less.
+    With M = B2^T E B1 the derivatives of A^T n2 + n1 by the pixels are A^T M and M^T. The derivatives of B1 and B2 are
+    neglected: along the line of sight they multiply A^T n2 + n1 = 0, and those due to lens distortion are far smaller.
     """
     m = matches
     if m.A21 is None:
@@ -102,14 +99,14 @@ def pixel_share(matches: Matches, E21: Mat3) -> FloatArray:
 
 
 def equal_weights(matches: Matches) -> RowWeights:
-    """Return the same weight for all rows, in coordinates where a pixel of image 1 is as large as its ray Jacobian."""
+    """Return equal weights of all rows, affinities' rows divided by the mean size of the ray Jacobians of image 1."""
     usable = usable_affinities(matches)
     size1 = np.sqrt(0.5 * np.sum(matches.jacobians1**2, axis=(-2, -1)))
     return RowWeights(np.ones(len(matches)), np.where(usable, 1.0 / size1.mean(), 0.0), np.full(len(matches), np.nan))
 
 
 def affinity_residuals(matches: Matches, E21: Mat3) -> FloatArray:
-    """Return (A^T n2 + n1) / |n2| (N, 2): what the affinities violate the geometry by, in entries of A; NaN if none."""
+    """Return the residuals (A^T n2 + n1) / |n2| (N, 2) of the affinities, in units of an entry of A; NaN without A."""
     if matches.A21 is None:
         return np.full((len(matches), 2), np.nan)
     _, n1, n2 = epipolar_normals(E21, matches.rays1, matches.rays2, matches.jacobians1, matches.jacobians2)
@@ -119,10 +116,7 @@ def affinity_residuals(matches: Matches, E21: Mat3) -> FloatArray:
 
 
 def affinity_distances(matches: Matches, E21: Mat3) -> FloatArray:
-    """Return |A^T n2 + n1| (N,) in standard deviations of a component, by sigma_A and the pixels' sigmas.
-
-    NaN where there is no affinity, or nothing is known of its noise.
-    """
+    """Return |A^T n2 + n1| (N,) in standard deviations of a component; NaN without an affinity or its sigma_A."""
     m = matches
     if m.A21 is None or m.sigma_A is None:
         return np.full(len(m), np.nan)
@@ -134,10 +128,9 @@ def affinity_distances(matches: Matches, E21: Mat3) -> FloatArray:
 
 
 def estimate_sigma_A(matches: Matches, E21: Mat3) -> float:
-    """Return the standard deviation of an entry of A21 that the epipolar geometry `E21` shows (robust: median).
+    """Return a robust (median) standard deviation of an entry of A21 from its residuals at `E21`; NaN without A21.
 
-    NaN without affinities. Meaningless for affinities that were computed from the epipolar geometry itself (F2UDIR,
-    F3UDIR): they satisfy it by construction and must not be used to estimate it.
+    Meaningless for affinities computed from the epipolar geometry (F2UDIR, F3UDIR): they satisfy it by construction.
     """
     residual = affinity_residuals(matches, E21)
     residual = residual[np.isfinite(residual)]
@@ -148,7 +141,7 @@ def _weights(
     matches: Matches, size1: FloatArray, size2: FloatArray, sigma_A: FloatArray, share: FloatArray | None = None
 ) -> RowWeights:
     of_point = np.sqrt((matches.sigma1_px * size1) ** 2 + (matches.sigma2_px * size2) ** 2)
-    # Near an epipole a row says nothing; the floor keeps its weight finite.
+    # The residual of a point at the epipole has no variance; the floor keeps its weight finite.
     floor = 1e-3 * float(np.median(of_point))
     points = 1.0 / np.maximum(of_point, floor if floor > 0.0 else 1.0)
     used = np.isfinite(sigma_A)
